@@ -9,7 +9,7 @@ from snakesim_hal.model.scenario import Override, RunConfig, load
 from snakesim_hal.programs.preflight import check_plugins
 
 
-def overrides_of(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
+def list_overrides(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
     """Return the values that a caller sets, as overrides of the scenario.
 
     Args:
@@ -43,7 +43,7 @@ def _to_plain(value: Any) -> Any:
     return value
 
 
-def checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
+def load_checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
     """Return the configuration of a run, for which all plugins are there.
 
     Args:

@@ -15,11 +15,11 @@ from snakesim_hal.wire.messages import Description, JointState
 
 JointFunction = Callable[[float, JointState], Sequence[float]]
 """Maps the time since arming in s and the state of the joints to an angle in rad for each joint, tail to head."""
-Given = str | os.PathLike[str] | type[Any] | JointFunction
+ControllerArgument = str | os.PathLike[str] | type[Any] | JointFunction
 TAKES = "a shipped name, a path './file.py:Class', a class, or a function f(time_s, joints) -> angles_rad"
 
 
-def named(controller: Given) -> tuple[str, Any | None]:
+def name_controller(controller: ControllerArgument) -> tuple[str, Any | None]:
     """Return the name of a controller in a configuration, and its class.
 
     Args:

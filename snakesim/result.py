@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim.chart import Chart, framed
-from snakesim_hal.base.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
 from snakesim_operator.results.page.charts import Line, lines
@@ -49,14 +49,14 @@ class Result:
         return table(self.record)
 
     @property
-    def names(self) -> list[str]:
+    def signal_names(self) -> list[str]:
         """The names of all signals and columns."""
         return list(self.arrays | self.columns)
 
     @cached_property
     def units(self) -> dict[str, str]:
         """The SI unit of each signal by its name; "1" for plain numbers."""
-        return {name: unit_of(name, self.record) for name in self.names}
+        return {name: unit_of(name, self.record) for name in self.signal_names}
 
     @property
     def joints(self) -> list[str]:
@@ -83,14 +83,14 @@ class Result:
         return self.summary.command_digest
 
     @property
-    def ended(self) -> str:
+    def status(self) -> str:
         """How the run ended: "complete", or the failure."""
         return self.summary.ended
 
     @property
     def complete(self) -> bool:
         """Whether the robot was armed for the whole duration."""
-        return self.ended == COMPLETE
+        return self.status == COMPLETE
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return a signal.
@@ -101,9 +101,9 @@ class Result:
         Raises:
             ConfigError: There is no such signal.
         """
-        if name not in self.names:
+        if name not in self.signal_names:
             raise ConfigError(
-                f"no signal {short(str(name))!r}; {did_you_mean(str(name), self.names)}there are "
+                f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
                 f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`"
             )
         return self.arrays[name] if name in self.arrays else self.columns[name]

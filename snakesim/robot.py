@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from snakesim_gnc.control.controller import positions
-from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, did_you_mean
-from snakesim_hal.base.process import user_name
-from snakesim_hal.network.commanding import READ, Commanding
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, suggest_word
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
@@ -34,15 +34,15 @@ from snakesim_hal.wire.messages import (
     Message,
     Pose,
     Status,
-    request_to_arm,
+    make_arm_request,
 )
-from snakesim_hal.wire.own_sample import message_of
+from snakesim_hal.wire.own_sample import find_message_type
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots
-from snakesim_operator.recording.process import record
-from snakesim_operator.robot_commands.command import ask_meanwhile
-from snakesim_operator.robot_commands.parameters import Parameter, change, in_force, parameters_of
+from snakesim_operator.recording.process import record_to_file
+from snakesim_operator.robot_commands.command import request_while_driving
+from snakesim_operator.robot_commands.parameters import Parameter, change_parameters, read_parameters, read_settings
 from snakesim_operator.robot_commands.stop import estop
 
 CONNECT_TIMEOUT_S = 5.0  # a robot may be starting
@@ -84,7 +84,7 @@ class Robot:
         self._newest: dict[str, Any] = {}
 
         # The right to command.
-        self._control: Commanding | None = None
+        self._control: CommandingClient | None = None
         self._armed = False  # by this connection
 
         try:
@@ -145,7 +145,7 @@ class Robot:
             self._opened.close()
 
     @property
-    def names(self) -> list[str]:
+    def joint_names(self) -> list[str]:
         """The names of the joints, tail to head."""
         return [joint.name for joint in self.description.joints]
 
@@ -200,13 +200,13 @@ class Robot:
         Raises:
             ConfigError: There is no such key.
         """
-        if self._control is not None and key in READ:
+        if self._control is not None and key in READABLE_KEYS:
             return self._control.read(key)
-        message = keys.message_at(key)
+        message = keys.find_message(key)
         if message is None or "*" in key:
             known = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
-            raise ConfigError(f"no key {key!r} in the key space; {did_you_mean(key, known)}see schemas/keys.md")
-        message = message_of(key, self.description) or message
+            raise ConfigError(f"no key {key!r} in the key space; {suggest_word(key, known)}see schemas/keys.md")
+        message = find_message_type(key, self.description) or message
         may_wait = key not in self._readers and self._control is None
         return self._read_newest(key, message, FIRST_MESSAGE_TIMEOUT_S if may_wait else 0.0)
 
@@ -263,7 +263,7 @@ class Robot:
 
         control.turn_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
         previous_session = self._clock.arm_session
-        self._send_request(request_to_arm(self.description, user_name(), unchecked=unchecked), "armed")
+        self._send_request(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
         control.turn_until(lambda: self._clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed)
         if self._clock.lifecycle != "armed":
             raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")
@@ -275,16 +275,16 @@ class Robot:
         Raises:
             RefusedError: The robot refuses, or does not confirm.
         """
-        self._send_request(LifecycleRequest(action="disarm", who=user_name()), "disarmed")
+        self._send_request(LifecycleRequest(action="disarm", who=get_user_name()), "disarmed")
         self._armed = False
 
-    def clear(self) -> None:
+    def reset_fault(self) -> None:
         """Reset a fault or an emergency stop. The robot is disarmed afterwards.
 
         Raises:
             RefusedError: The cause is still present, or the robot does not confirm.
         """
-        self._send_request(LifecycleRequest(action="clear", who=user_name()), "cleared")
+        self._send_request(LifecycleRequest(action="clear", who=get_user_name()), "cleared")
 
     def estop(self) -> None:
         """Trigger the emergency stop, over the stop port and over the network.
@@ -306,7 +306,7 @@ class Robot:
         Raises:
             NotConnectedError: No controller is running.
         """
-        parameters = parameters_of(in_force(self._session))
+        parameters = read_parameters(read_settings(self._session))
         return {f"control.{parameter.name}": parameter for parameter in parameters}
 
     def set(self, changes: Mapping[str, Any]) -> None:
@@ -317,7 +317,7 @@ class Robot:
             RefusedError: Control refuses a value.
             ControllerError: Control has accepted the values and has ended, for the controller cannot go on with them.
         """
-        change(self._session, changes, user_name())
+        change_parameters(self._session, changes, get_user_name())
 
     @contextmanager
     def record(self, path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -336,7 +336,9 @@ class Robot:
         started = threading.Event()
         link = replace(self._link, max_bytes=MAX_IMAGE_BYTES)
         with ThreadPoolExecutor(1) as executor:
-            recording = executor.submit(record, link, Path(path), lambda: not ended.is_set(), lambda *_: started.set())
+            recording = executor.submit(
+                record_to_file, link, Path(path), lambda: not ended.is_set(), lambda *_: started.set()
+            )
             try:
                 deadline = time.monotonic() + RECORDING_START_TIMEOUT_S
                 while not started.is_set() and not recording.done() and time.monotonic() < deadline:
@@ -348,15 +350,15 @@ class Robot:
                     self._let_time_pass()
                 recording.result()
 
-    def _start_commanding(self) -> Commanding:
+    def _start_commanding(self) -> CommandingClient:
         """Return what sends commands; the first call takes the lease."""
         if self._control is None:
-            self._control = Commanding(self._session, self.description, self.status.clock_mode)
+            self._control = CommandingClient(self._session, self.description, self.status.clock_mode)
         return self._control
 
     def _check_values(self, name: str, values: Sequence[float]) -> None:
         """Raise ConfigError unless there is one finite number for each joint."""
-        count = len(self.names)
+        count = len(self.joint_names)
         expected = f"{name} is {values!r:.80}, must be {count} finite numbers, tail to head"
         if len(values) != count:
             raise ConfigError(f"{expected}; got {len(values)}")
@@ -365,7 +367,7 @@ class Robot:
 
     def _send_request(self, request: LifecycleRequest, done: str) -> None:
         """Send a lifecycle request and wait for its effect, while the lease is renewed."""
-        ask_meanwhile(self._session, request, done, self._link, self._let_time_pass)
+        request_while_driving(self._session, request, done, self._link, self._let_time_pass)
 
     def _let_time_pass(self) -> None:
         """Run one tick if this connection commands the robot, so that its lease stays valid; otherwise sleep."""
@@ -416,7 +418,7 @@ class Robot:
         """Return the reader of a key; the first call subscribes to it."""
         reader = self._readers.get(key)
         if reader is None:
-            row = keys.row_at(key)
+            row = keys.find_row(key)
             if row is not None and row.kind == "latched":
                 reader = self._session.latched_reader(key, message)
             else:
@@ -427,7 +429,7 @@ class Robot:
     def _is_of_this_robot(self, message: Message) -> bool:
         """Whether a message fits the robot's description, as far as the description is known."""
         robot = self._newest.get(keys.DESCRIPTION)
-        return robot is None or mismatch(message, robot) is None
+        return robot is None or find_mismatch(message, robot) is None
 
 
 def _select_robot(endpoint: str | None, name: str | None, session: str | os.PathLike[str] | None) -> RobotSelection:

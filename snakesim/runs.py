@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-from snakesim.configuration import checked, overrides_of
-from snakesim.controllers import Given, named
+from snakesim.configuration import list_overrides, load_checked
+from snakesim.controllers import ControllerArgument, name_controller
 from snakesim.result import Result
-from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, short
-from snakesim_hal.model.plugins import CONTROLLERS, offered
+from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, shorten
+from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import Override, RunConfig
 from snakesim_operator.results.record import SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
@@ -26,7 +26,7 @@ from snakesim_operator.run.run import run as run_processes
 def run(
     scenario: str | os.PathLike[str],
     *,
-    controller: Given | None = None,
+    controller: ControllerArgument | None = None,
     duration: float | None = None,
     seed: int | None = None,
     backend: str | None = None,
@@ -58,19 +58,19 @@ def run(
     """
     if not isinstance(scenario, str | os.PathLike):
         raise ConfigError(f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file")
-    overrides = overrides_of(set, duration_s=duration, seed=seed, backend=backend)
+    overrides = list_overrides(set, duration_s=duration, seed=seed, backend=backend)
     with contextlib.ExitStack() as opened:
         if controller is not None:
-            name, plugin = named(controller)
-            overrides.insert(0, Override("controller", name, f"controller={short(name)}"))
+            name, plugin = name_controller(controller)
+            overrides.insert(0, Override("controller", name, f"controller={shorten(name)}"))
             if plugin is not None:
                 if processes:
                     raise ConfigError(
                         f"controller={name.removeprefix('program:')}: processes of their own cannot reach an object of "
                         "this program; save it in a file, and give its path, such as controller='./mine.py:Mine'"
                     )
-                opened.enter_context(offered(CONTROLLERS, name, plugin))
-        config = checked(os.fspath(scenario), overrides, processes=processes)
+                opened.enter_context(offer_plugin(CONTROLLERS, name, plugin))
+        config = load_checked(os.fspath(scenario), overrides, processes=processes)
         folder = None if out is None else Path(out)
         if processes:
             return _run_in_processes(config, folder)

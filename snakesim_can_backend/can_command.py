@@ -35,12 +35,12 @@ from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import aligned, say
+from snakesim_hal.base.terminal import align_columns, print_line
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.programs.arguments import number
+from snakesim_hal.programs.arguments import number_type
 from snakesim_hal.run_log.black_box import read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX
 
@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
     asked = commands.add_parser("load", help="print the worst-case load of a scenario's buses")
     asked.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
     asked.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value")
-    joints, rate_hz = number(1, LAST_NODE, "joints"), number(float(MIN_RATE_HZ), MAX_RATE_HZ, "Hz")
+    joints, rate_hz = number_type(1, LAST_NODE, "joints"), number_type(float(MIN_RATE_HZ), MAX_RATE_HZ, "Hz")
     asked.add_argument("--joints", type=joints, nargs="+", metavar="N", help="for a robot with this many joints")
     asked.add_argument("--rates", type=rate_hz, nargs="+", metavar="HZ", help="for these control rates")
     asked.set_defaults(act=_load)
@@ -79,9 +79,9 @@ def parser() -> argparse.ArgumentParser:
     )
     answering.add_argument("channel", nargs="+", help="SocketCAN interface such as can0, or slcan:/dev/ttyACM0")
     answering.add_argument(
-        "--bit-rate", type=number(10_000, 1_000_000, "bit/s"), default=BIT_RATE, help="of an adapter (1000000)"
+        "--bit-rate", type=number_type(10_000, 1_000_000, "bit/s"), default=BIT_RATE, help="of an adapter (1000000)"
     )
-    seconds = number(0.001, 3600, "s")
+    seconds = number_type(0.001, 3600, "s")
     answering.add_argument("--seconds", type=seconds, default=1.0, help="how long to listen on each (default: 1)")
     answering.add_argument("--anyway", action="store_true", help="send identify also where others use the bus")
     answering.set_defaults(act=_scan)
@@ -109,11 +109,11 @@ def _load(arguments: argparse.Namespace) -> int:
     if arguments.joints is None and arguments.rates is None:
         lines, all_fit = one(loaded.config, settings)
         for line in lines:
-            say(line)
+            print_line(line)
         return OK if all_fit else FAILED
     config = loaded.config
     for line in table(config, settings, arguments.joints or [config.robot.chain.modules], arguments.rates):
-        say(line)
+        print_line(line)
     return OK
 
 
@@ -162,17 +162,19 @@ def _scan(arguments: argparse.Namespace) -> int:
     found = 0
     for channel in arguments.channel:
         if not arguments.anyway and (others := overheard(channel, arguments.bit_rate)):
-            say(f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway")
+            print_line(
+                f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway"
+            )
             for other in others:
-                say(f"  {other}")
+                print_line(f"  {other}")
             continue
         wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
             rows = scan(wire, arguments.seconds)
         finally:
             wire.close()
-        for line in aligned(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
-            say(line)
+        for line in align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
+            print_line(line)
         found += len(rows)
     return OK if found else FAILED
 
@@ -239,21 +241,21 @@ def _replay(arguments: argparse.Namespace) -> int:
     done.read(log)
     if not done.joints:
         found = f"{done.frames} frames, and no Sync among them: the log of another bus"
-        say(f"{arguments.log}: {found}{looks(done.foreign)}")
+        print_line(f"{arguments.log}: {found}{looks(done.foreign)}")
         return FAILED
-    say(f"{arguments.log}: {done.frames} frames, {len(done.joints)} Syncs")
+    print_line(f"{arguments.log}: {done.frames} frames, {len(done.joints)} Syncs")
     for line in log.report():
-        say(f"  {line}")
+        print_line(f"  {line}")
     for name, silent in zip(layout.joints, done.silent, strict=True):
         if silent:
-            say(f"  {name} did not answer {silent} Syncs in time")
+            print_line(f"  {name} did not answer {silent} Syncs in time")
     for node, count in sorted(done.reading.unknown_nodes.items()):
-        say(f"  {count} frames of node {node}, which is not of this robot")
+        print_line(f"  {count} frames of node {node}, which is not of this robot")
     verdict = compare_with_run_log(done, layout, rows)
     if verdict.first_wrong:
-        say(f"joint states differ from {arguments.run}: {verdict.first_wrong}")
+        print_line(f"joint states differ from {arguments.run}: {verdict.first_wrong}")
         return FAILED
-    say(f"joint states of {verdict.compared} ticks are those of the record, to the bit")
+    print_line(f"joint states of {verdict.compared} ticks are those of the record, to the bit")
     return OK
 
 
@@ -272,5 +274,5 @@ def looks(foreign: Counter[str]) -> str:
 
 def _expand(arguments: argparse.Namespace) -> int:
     write_text(arguments.out, expanded_dbc(), encoding="cp1252")
-    say(str(arguments.out))
+    print_line(str(arguments.out))
     return OK

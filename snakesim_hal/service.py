@@ -11,8 +11,8 @@ from typing import Protocol
 
 import msgspec
 
-from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimError, WireError, raised
-from snakesim_hal.faults.allowed import faults_of_service
+from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimError, WireError, describe_exception
+from snakesim_hal.faults.allowed import create_service_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client
@@ -23,8 +23,10 @@ from snakesim_hal.wire.messages import Clock, Description, Message
 
 SILENCE_S = 1.0  # a clock that is silent for longer has stopped
 MAX_SHOWN_KEYS = 16  # bound of `waits_for` in a process entry
-TRY_S = 2.0  # duration of one attempt to find the robot
-START_LIMIT_S = 600.0  # until every part of a run has started: MuJoCo starts slowly in an emulated, busy machine
+CONNECT_ATTEMPT_S = 2.0  # duration of one attempt to find the robot
+SERVICE_START_LIMIT_S = (
+    600.0  # until every part of a run has started: MuJoCo starts slowly in an emulated, busy machine
+)
 
 
 class Service(Protocol):
@@ -93,7 +95,7 @@ class ServiceLoop:
         robot = _wait_for_robot(client, goes_on)
         with self._errors_named("configure"):
             self.service.configure(robot)
-        self._faults = faults_of_service(name, config, session, robot, lambda: client.newest_clock)
+        self._faults = create_service_faults(name, config, session, robot, lambda: client.newest_clock)
         self._due_ticks = client.ticks(0.0, pauses=True)
 
         # What other processes see of it.
@@ -104,7 +106,7 @@ class ServiceLoop:
         """Announce the service. From now on the robot may be armed, perhaps before the first tick arrives here."""
         clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
-            self._faults.turn(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
+            self._faults.update(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
         self._shown = show_process(self._session, self._entry)
         self._client.announce()
 
@@ -128,10 +130,10 @@ class ServiceLoop:
         self._faults.close()
 
     def _act_on_silence(self) -> None:
-        self._faults.idle()
+        self._faults.answer_requests()
         with self._errors_named("silence"):
             for key, message in self.service.silence():
-                self._client.put(key, message)
+                self._client.publish(key, message)
 
     def _act(self, clock: Clock) -> None:
         """Publish the outputs for a tick, and report it done.
@@ -139,11 +141,11 @@ class ServiceLoop:
         Until the robot is armed, the host sends the same tick again and again, and each time it is answered again.
         """
         if clock.paused:
-            self._faults.idle()
+            self._faults.answer_requests()
             with self._errors_named("pause"):
                 self.service.pause(clock)
             return
-        self._faults.turn(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
+        self._faults.update(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
         robot = self._client.new_description()
         if robot is not None:
             with self._errors_named("configure"):
@@ -155,8 +157,8 @@ class ServiceLoop:
             if outputs is None:
                 return
             for key, message in outputs:
-                self._client.put(key, message)
-        self._client.done(clock.tick)
+                self._client.publish(key, message)
+        self._client.report_done(clock.tick)
 
     def _outputs_before_arming(self, outputs: list[tuple[str, Message]] | None) -> list[tuple[str, Message]] | None:
         """Return the outputs that count before the robot is armed, and show what the service waits for.
@@ -164,7 +166,7 @@ class ServiceLoop:
         A service without joint states has no output, even if it can do without them: they come in every tick, and once
         the robot is armed it would be too late to find out that they do not arrive.
         """
-        missing = self._client.lacks
+        missing = self._client.missing
         if keys.JOINTS in missing:
             outputs = None
         if outputs is None:
@@ -190,14 +192,14 @@ class ServiceLoop:
             raise
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise ServiceError(f"{self._label}: {method}() {raised(error, self._module)}") from error
+            raise ServiceError(f"{self._label}: {method}() {describe_exception(error, self._module)}") from error
 
 
 def _wait_for_robot(client: Client, goes_on: Callable[[], bool]) -> Description:
     """Return the description of the robot. Raises NotConnectedError if there is none and `goes_on` returns False."""
     while True:
         try:
-            return client.description(TRY_S)
+            return client.description(CONNECT_ATTEMPT_S)
         except NotConnectedError:
             if not goes_on():
                 raise

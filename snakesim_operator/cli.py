@@ -12,8 +12,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean, short
-from snakesim_hal.base.terminal import discard, exit_code, print_stderr, report_error, say
+from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
+from snakesim_hal.base.terminal import discard_output, print_line, print_stderr, report_error, run_tool
 from snakesim_operator.monitoring import watching
 from snakesim_operator.playback import arguments as playback
 from snakesim_operator.robot_commands import commanding
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return exit_code("snakesim", lambda: _run_command(words, owns_process=argv is None))
+        return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None))
     except ModuleNotFoundError as error:
         from snakesim_operator.base.extras import explained
 
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         report_error(explanation, "snakesim")
         return BAD_INPUT
     except OSError as error:  # such as a full disk under what is printed
-        discard(sys.stdout)
+        discard_output(sys.stdout)
         return _report_os_error(error)
 
 
@@ -95,12 +95,12 @@ def _find_installed_command(commands: "Commands", name: str) -> Callable[[list[s
     Returns:
         Its main function, if it parses its own arguments; None if the command was added to the parser.
     """
-    from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
+    from snakesim_hal.model.plugins import COMMANDS, find_plugin, list_installed
 
-    if name not in installed(COMMANDS):
+    if name not in list_installed(COMMANDS):
         commands.add_installed()
-        hint = did_you_mean(name, [*commands.commands.choices, *installed(COMMANDS)])
-        raise ConfigError(f"no command {short(name)!r}; {hint}`snakesim` alone lists all")
+        hint = suggest_word(name, [*commands.commands.choices, *list_installed(COMMANDS)])
+        raise ConfigError(f"no command {shorten(name)!r}; {hint}`snakesim` alone lists all")
     plugin = find_plugin(COMMANDS, name)
     if getattr(plugin, "__name__", "") != ADDS:
         return plugin
@@ -111,9 +111,9 @@ def _find_installed_command(commands: "Commands", name: str) -> Callable[[list[s
 def _refuse_unknown_word(word: str, parser: argparse.ArgumentParser) -> NoReturn:
     """Raise ConfigError for an argument that the command does not have."""
     options = [option for action in parser._actions for option in action.option_strings]
-    hint = did_you_mean(word.partition("=")[0], options) if word.startswith("-") else ""
+    hint = suggest_word(word.partition("=")[0], options) if word.startswith("-") else ""
     raise ConfigError(
-        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}; {hint}see `{parser.prog} --help`"
+        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {shorten(word)!r}; {hint}see `{parser.prog} --help`"
     )
 
 
@@ -167,9 +167,9 @@ class Commands(Command):
 
     def format_help(self) -> str:
         """Return the help: the commands by task, and those of installed packages by name."""
-        from snakesim_hal.model.plugins import COMMANDS, installed
+        from snakesim_hal.model.plugins import COMMANDS, list_installed
 
-        others = [name for name in installed(COMMANDS) if name not in self.commands.choices]
+        others = [name for name in list_installed(COMMANDS) if name not in self.commands.choices]
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
@@ -198,7 +198,7 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
 
-        say(f"snakesim {version('snakesim')}")
+        print_line(f"snakesim {version('snakesim')}")
         parser.exit()
 
 
@@ -219,7 +219,7 @@ def _completion(arguments: argparse.Namespace) -> int:
     from snakesim_operator.this_computer.completion import completion
 
     for line in completion(parser(), arguments.shell):
-        say(line)
+        print_line(line)
     return OK
 
 

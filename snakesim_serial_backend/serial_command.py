@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterator, Sequence
 
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.base.terminal import aligned, say
+from snakesim_hal.base.terminal import align_columns, print_line
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
@@ -54,12 +54,12 @@ def _scan(arguments: argparse.Namespace) -> int:
             finally:
                 wire.close()
     if rows:
-        for line in aligned(COLUMNS, rows):
-            say(line)
+        for line in align_columns(COLUMNS, rows):
+            print_line(line)
         return OK
     for failure in dict.fromkeys(failures):  # each once
-        say(failure)
-    say("nobody answers")
+        print_line(failure)
+    print_line("nobody answers")
     return FAILED
 
 

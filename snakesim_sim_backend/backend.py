@@ -9,7 +9,7 @@ from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.fault_plan import check_backend_can
-from snakesim_hal.model.robot import describe
+from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.physics.thermal import Thermal
@@ -61,7 +61,7 @@ class SimBackend:
         Raises:
             ConfigError: the settings do not match the robot or the scene.
         """
-        self._description = describe(
+        self._description = describe_robot(
             config.robot,
             backend=NAME,
             period_ns=config.period_ns,

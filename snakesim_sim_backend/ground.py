@@ -3,7 +3,7 @@
 import mujoco
 
 from snakesim_hal.model.scene import Ground, Heightfield
-from snakesim_hal.physics.hills import hills
+from snakesim_hal.physics.hills import make_heights
 from snakesim_sim_backend.surface import ContactParameters
 
 GROUND = "ground"  # name of the plane's geom
@@ -46,7 +46,7 @@ def _add_plane(spec: mujoco.MjSpec, height_m: float) -> mujoco.MjsGeom:
 
 
 def _add_hills(spec: mujoco.MjSpec, field: Heightfield, lowest_m: float, contact: ContactParameters) -> None:
-    heights_m = hills(field)
+    heights_m = make_heights(field)
     rows = len(heights_m)
     spec.add_hfield(
         name=HILLS,

@@ -17,7 +17,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_hal.model.scenario import RunConfig, place_obstacles
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
@@ -79,7 +79,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
     steps_per_tick = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
     step_s = config.period_ns * 1e-9 / steps_per_tick
     _check_contact_time(settings, step_s)
-    placed = place_all(config)
+    placed = place_obstacles(config)
     yielding = [item for item in placed if item.yields]
     check_yielding(yielding, config.scene.name, step_s)
 

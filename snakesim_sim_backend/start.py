@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
-from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
+from snakesim_hal.model.scenario import RunConfig, StartPose, find_start_pose
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.ground import GROUND_GROUP, PLANE_GROUP
@@ -32,7 +32,7 @@ def place_robot(
     come to rest after `settle_s`, it is stopped.
     """
     model = sim.model
-    pose = start_of(config)
+    pose = find_start_pose(config)
     data.qpos[:2] = pose.position_w
     data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
     angles_rad, _ = of_joints(data, motors.count)

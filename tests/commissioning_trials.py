@@ -24,7 +24,7 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.identify import Identify
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import JointProperty
-from snakesim_hal.model.robot import describe
+from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -118,7 +118,7 @@ def _checked(*sets: str) -> list[JointVerdict]:
         rows = b""
         for _ in run.iterate_ticks():
             imus += reader.drain()
-            rows += box.rows_from(len(rows) // box.layout.row_bytes)[1]
+            rows += box.read_rows(len(rows) // box.layout.row_bytes)[1]
         columns = box.layout.arrays(rows)
         robot = run.host.description
     ticks = columns.pop("tick").tolist()
@@ -231,7 +231,7 @@ def _shaken(
     physics_model = make_physics_model(config, settings, "can")
     joints = config.robot.joint_table
     body = EmulatedBody(SharedPhysics(config, physics_model, truth, None), range(len(joints)))
-    robot = describe(
+    robot = describe_robot(
         config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
     )
     controller = Identify(robot, msgspec.convert(config.control_settings, Identify.Settings))

@@ -19,11 +19,11 @@ GOLDEN: dict[str, str] = json.loads(FILE.read_text()) if FILE.exists() else {}
 
 def main() -> int:
     """Write the file. Exit code 1 when nobody else would get what this computer computes."""
-    if not arithmetic.environment():
+    if not arithmetic.common_environment():
         print("this processor lacks AVX2 and FMA: nothing is written")
         return 1
-    measured = arithmetic.measured()
-    if differing := arithmetic.foreign(measured):
+    measured = arithmetic.measure_arithmetic()
+    if differing := arithmetic.find_differing_parts(measured):
         print(
             f"{' and '.join(differing)} of this computer round otherwise than COMMON in "
             "snakesim_hal/base/arithmetic.py."

@@ -11,7 +11,7 @@ import numpy as np
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
+from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offer_plugin
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -112,7 +112,7 @@ def run(
     """Run a configuration. blind, lost: ticks at which the controller gets no world model, and no trajectory."""
     config = msgspec.structs.replace(config, duration_s=duration_s or config.duration_s)
     watch = _Watch(find_plugin(CONTROLLERS, config.controller), blind, lost)
-    with offered(CONTROLLERS, config.controller, watch):
+    with offer_plugin(CONTROLLERS, config.controller, watch):
         result = simulate(config)
     assert result.summary.ended == "complete", result.summary.ended
     assert len(watch.reports) == len(result.record.time_s)

@@ -27,7 +27,7 @@ from benchmarks.paths.ways import Lab, Way
 from benchmarks.physics import config_of, wire_bytes
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.run_log.host_record import HostRecord
-from snakesim_hal.wire.messages import request_to_arm
+from snakesim_hal.wire.messages import make_arm_request
 
 LOOP = Path(__file__).parents[1] / "peers" / "loop.toml"
 RESULTS = Path(__file__).parents[1] / "PATHS.md"
@@ -80,10 +80,10 @@ def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> N
     """Arm it once, and wait for its end."""
     asked, deadline = False, time.monotonic() + START_LIMIT_S + seconds
     while host.poll() is None:
-        channel.take_in()
+        channel.receive()
         robot, status = channel.description, channel.status
         if robot is not None and status is not None and status.ready_to_arm and not asked:
-            channel.ask(request_to_arm(robot, "paths"))
+            channel.send_request(make_arm_request(robot, "paths"))
             asked = True
         if time.monotonic() > deadline:
             raise TimeoutError(f"not done: {status and status.why}")

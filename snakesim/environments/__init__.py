@@ -12,7 +12,7 @@ Importing this package registers the names; it needs the extra `gym`, and nothin
 
 from snakesim_operator.base import extras
 
-extras.check("gym", "`snakesim.environments`")
+extras.require("gym", "`snakesim.environments`")
 
 from gymnasium.envs.registration import register  # noqa: E402 - after the check
 

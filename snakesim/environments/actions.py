@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean
+from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_hal.wire.messages import Description, Mode
 
 RESIDUAL = "residual:"
@@ -80,7 +80,7 @@ class Commands:
         return f"({count},): {what} in {self.unit} for each joint, {self.names[0]} to {self.names[-1]}"
 
 
-def controller_of(kind: str) -> str | None:
+def corrected_controller(kind: str) -> str | None:
     """Return the controller whose targets an action corrects, or None if an action is itself a target.
 
     Raises:
@@ -89,7 +89,7 @@ def controller_of(kind: str) -> str | None:
     if isinstance(kind, str) and kind.startswith(RESIDUAL) and kind != RESIDUAL:
         return kind.removeprefix(RESIDUAL)
     if kind not in KINDS:
-        hint = did_you_mean(str(kind), KINDS)
+        hint = suggest_word(str(kind), KINDS)
         raise ConfigError(
             f"action={kind!r:.60}: {hint}give 'position', 'velocity', 'torque', or 'residual:' and a controller, such "
             "as 'residual:obstacle_aided'"

@@ -10,7 +10,7 @@ import msgspec
 from snakesim_gnc.control.controller import Action, Controller, View
 from snakesim_gnc.control.service import SENSED
 from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
+from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offer_plugin
 from snakesim_hal.model.scenario import CONTROL, RunConfig
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -47,7 +47,7 @@ class AssistedRobot:
         longer = msgspec.structs.replace(config, controller=name, duration_s=config.duration_s + SPARE_S)
 
         self._service_output = io.StringIO()  # not shown: the reason of a failure is in `failed` of the run
-        with offered(CONTROLLERS, name, plugin), contextlib.ExitStack() as opening:
+        with offer_plugin(CONTROLLERS, name, plugin), contextlib.ExitStack() as opening:
             self._run = opening.enter_context(InProcessRun(longer))
             self._subscribe(opening)
             self._ticks = self._run.iterate_ticks(before_services=True)
@@ -77,7 +77,7 @@ class AssistedRobot:
     @property
     def why(self) -> str:
         """Why the robot is in this state."""
-        return self._run.host.authority.why
+        return self._run.host.authority.reason
 
     @property
     def digest(self) -> str:

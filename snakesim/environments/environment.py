@@ -11,17 +11,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from snakesim.configuration import checked, overrides_of
-from snakesim.environments.actions import Commands, controller_of
+from snakesim.configuration import list_overrides, load_checked
+from snakesim.environments.actions import Commands, corrected_controller
 from snakesim.environments.assisted import AssistedRobot
-from snakesim.environments.rewards import weights_of
+from snakesim.environments.rewards import complete_weights
 from snakesim.environments.stepped import SteppedRobot
 from snakesim_gnc.control.controller import Senses, Task, View
-from snakesim_gnc.control.observations import Observer, chosen
+from snakesim_gnc.control.observations import Observer, select_parts
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.drawn import draws_of
+from snakesim_hal.model.drawn import make_draws
 from snakesim_hal.model.plugins import FILMS, find_plugin
-from snakesim_hal.model.scenario import Override, RunConfig, description_of
+from snakesim_hal.model.scenario import Override, RunConfig, describe_run_robot
 from snakesim_hal.wire.messages import JointState
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
@@ -90,8 +90,8 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             raise ConfigError(f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out")
         if not residual_rad > 0:
             raise ConfigError(f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad")
-        controller = controller_of(action)
-        overrides = overrides_of(set, duration_s=duration)
+        controller = corrected_controller(action)
+        overrides = list_overrides(set, duration_s=duration)
         if controller is not None:
             if not safe:
                 raise ConfigError(f"action={action!r}: a controller commands through the limiter; leave safe=False out")
@@ -100,7 +100,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         # The scenario, and what each seed changes in it.
         self._scenario = os.fspath(scenario)
         self._overrides = overrides
-        self._draws = draws_of(draw)
+        self._draws = make_draws(draw)
         self._new_field = new_field
         self._scenario_config = self._load_config(0)
         self.config: RunConfig = self._scenario_config  # of this episode: `snakesim run` takes it, written to a file
@@ -113,7 +113,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         self._over = True
 
         # Rewards and pictures.
-        self._weights = weights_of(reward)
+        self._weights = complete_weights(reward)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.config.rate_hz / frame_skip}
         self._picture_size = (width, height)
@@ -123,7 +123,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
     def _declare_spaces(self, action: str, residual_rad: float, observe: Sequence[str] | None, flat: bool) -> None:
         """Set the action space and the observation space, and a name and a unit for every number in them."""
-        robot = description_of(self.config)
+        robot = describe_run_robot(self.config)
         self.description = robot
 
         self._commands = Commands.of(robot, action, residual_rad)
@@ -131,7 +131,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         self.action_names = list(self._commands.names)
         self.action_units = [self._commands.unit] * len(self.action_names)
 
-        self.parts = chosen(robot, observe)
+        self.parts = select_parts(robot, observe)
         self.observation_names: list[str] = []
         self.observation_units: list[str] = []
         slices: dict[str, slice] = {}
@@ -324,8 +324,8 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         overrides = [*self._overrides]
         overrides += [Override(key, seed, "seed") for key in seed_keys]
         for draw in self._draws:
-            overrides += draw.on_field(seed, "draw")
-        return checked(self._scenario, overrides, processes=False)
+            overrides += draw.overrides_for_scene(seed, "draw")
+        return load_checked(self._scenario, overrides, processes=False)
 
     def _observe(self) -> Observation:
         """Return what a controller would observe at this tick."""

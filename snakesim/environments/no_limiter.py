@@ -1,7 +1,7 @@
 """What decides on the setpoints of an environment that has no limits."""
 
 from snakesim_hal.backend import SafeSetpoints
-from snakesim_hal.safety.authority import Decision
+from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Mode, Power
 
 
@@ -23,7 +23,7 @@ class NoLimiter:
         return "fault" if self._failure else "armed"
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Why it is in this state."""
         return self._failure or "no limiter"
 
@@ -38,12 +38,12 @@ class NoLimiter:
     def observe_power(self, power: Power, now_ns: int) -> None:
         """Ignore the power samples."""
 
-    def expire(self, now_ns: int, tick: int) -> None:
+    def check_deadlines(self, now_ns: int, tick: int) -> None:
         """Do nothing: there is no lease that could expire."""
 
-    def decide(self, up_to: int | None = None) -> Decision:
+    def decide(self, up_to: int | None = None) -> TickDecision:
         """Return the targets unchanged."""
-        return Decision(SafeSetpoints(self._modes, self._target, self._full_torque_nm), None, {})
+        return TickDecision(SafeSetpoints(self._modes, self._target, self._full_torque_nm), None, {})
 
     def fault(self, fault: Fault) -> None:
         """Remember a fault of the whole robot; a fault of a joint changes nothing."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean, short
+from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ TERMS = {
 }
 
 
-def weights_of(given: Mapping[str, float] | None) -> dict[str, float]:
+def complete_weights(given: Mapping[str, float] | None) -> dict[str, float]:
     """Return the weight of every term.
 
     Args:
@@ -38,8 +38,8 @@ def weights_of(given: Mapping[str, float] | None) -> dict[str, float]:
     weights = {name: float(term.weight) for name, term in TERMS.items()}
     for name, weight in (given or {}).items():
         if name not in TERMS:
-            hint = did_you_mean(str(name), TERMS)
-            raise ConfigError(f"reward={short(str(given))}: no term {name!r}; {hint}there are {', '.join(TERMS)}")
+            hint = suggest_word(str(name), TERMS)
+            raise ConfigError(f"reward={shorten(str(given))}: no term {name!r}; {hint}there are {', '.join(TERMS)}")
         if not isinstance(weight, int | float):
             raise ConfigError(f"reward[{name!r}]={weight!r:.60}: give a number, the reward per {TERMS[name].unit}")
         weights[name] = float(weight)

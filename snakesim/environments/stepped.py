@@ -8,11 +8,11 @@ import msgspec
 from snakesim.environments.no_limiter import NoLimiter
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.base.errors import BackendError, ConfigError, RefusedError
-from snakesim_hal.faults.allowed import Faults, faults_of_host
+from snakesim_hal.faults.allowed import Faults, create_host_faults
 from snakesim_hal.host.control_cycle import ControlCycle
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.fault_plan import parse_planned
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, Service
 from snakesim_hal.network.local_network import LocalNetwork
@@ -28,7 +28,7 @@ from snakesim_hal.wire.messages import (
     LifecycleState,
     Message,
     Mode,
-    request_to_arm,
+    make_arm_request,
 )
 
 REQUESTER = "an environment"
@@ -57,7 +57,7 @@ class SteppedRobot:
         self._faults: Faults | None = None
         if config.faults:
             session = LocalNetwork().session()
-            backend, self._faults = faults_of_host(config, GuardedBackend(backend), session)
+            backend, self._faults = create_host_faults(config, GuardedBackend(backend), session)
         self._backend = backend
         self._authority = Authority(self.description) if safe else None
         self._no_limiter = NoLimiter(self.description)
@@ -88,7 +88,7 @@ class SteppedRobot:
     @property
     def why(self) -> str:
         """Why the robot is in this state."""
-        return self._cycle.safety.why
+        return self._cycle.safety.reason
 
     @property
     def digest(self) -> str:
@@ -132,7 +132,7 @@ class SteppedRobot:
         now_ns = self._tick * self._period_ns
         if self._faults is not None:
             arm_session = 1 if self._authority is None else self._authority.arm_session
-            self._faults.turn(now_ns, arm_session, self.lifecycle)
+            self._faults.update(now_ns, arm_session, self.lifecycle)
         samples = self._cycle.sample(self._tick, now_ns)
         self.newest.update(samples.others)
         self._cycle.observe(samples, now_ns)
@@ -142,7 +142,7 @@ class SteppedRobot:
         """Arm at the present pose."""
         authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
         self._offer(authority, [Mode.POSITION] * len(self._full_torque_nm), list(self.joints.angle_rad))
-        answer = authority.on_lifecycle(request_to_arm(self.description, REQUESTER), 0)
+        answer = authority.on_lifecycle(make_arm_request(self.description, REQUESTER), 0)
         if not answer.ok:
             self._backend.close()
             raise RefusedError(f"not ready to arm: {answer.reason}")
@@ -163,12 +163,12 @@ class SteppedRobot:
             target=target,
             torque_limit_nm=self._full_torque_nm,
         )
-        authority.offer(command, now_ns=self._tick * self._period_ns, tick=self._tick, age_ns=0)
+        authority.offer_command(command, now_ns=self._tick * self._period_ns, tick=self._tick, age_ns=0)
 
 
 def _check_planned_faults(config: RunConfig) -> None:
     """Raise ConfigError for a planned fault that needs a controller."""
-    for injection in planned(config):
+    for injection in parse_planned(config):
         if injection.target_type not in FAULT_TARGETS:
             raise ConfigError(
                 f"fault {str(injection)!r} is one of a {injection.target_type}: without a controller there are "

@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.programs.arguments import number
+from snakesim_hal.programs.arguments import number_type
 
 TASK = "run"  # under which `snakesim --help` lists it
 
@@ -27,16 +27,20 @@ def add_commands(commands: Any) -> None:
         ("--check-fields", 1, 8, "on which the mean of the search is checked"),
         ("--seed", 0, 1, "of the search"),
     ):
-        train.add_argument(flag, type=number(least, 100_000), default=default, metavar="N", help=f"{about} ({default})")
+        train.add_argument(
+            flag, type=number_type(least, 100_000), default=default, metavar="N", help=f"{about} ({default})"
+        )
     train.add_argument("--from", dest="begin", metavar="POLICY", help="begin at its numbers: shipped, or policy.onnx")
     train.add_argument(
         "--spread",
-        type=number(0.01, 10.0),
+        type=number_type(0.01, 10.0),
         default=1.0,
         metavar="X",
         help="times how far the first generation looks (1)",
     )
-    train.add_argument("--duration", type=number(0.1, 3600.0, "s"), metavar="S", help="of an episode (the scenario's)")
+    train.add_argument(
+        "--duration", type=number_type(0.1, 3600.0, "s"), metavar="S", help="of an episode (the scenario's)"
+    )
     train.add_argument(
         "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002; may be repeated"
     )
@@ -44,7 +48,7 @@ def add_commands(commands: Any) -> None:
     train.add_argument(
         "--draw", action="append", default=[], metavar="KEY=LOW:HIGH", help="a number for each field; may be repeated"
     )
-    train.add_argument("--workers", type=number(1, 1000), metavar="N", help="processes (one a core)")
+    train.add_argument("--workers", type=number_type(1, 1000), metavar="N", help="processes (one a core)")
     train.add_argument("--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster, instead")
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of what comes of it")
     train.add_argument("--resume", action="store_true", help="go on with the search that was stopped in --out")
@@ -56,9 +60,9 @@ def _train(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
     for extra in ("train", "gym", "plot", "policy"):
-        extras.check(extra, "`snakesim train`")
+        extras.require(extra, "`snakesim train`")
     if arguments.cluster:
-        extras.check("evaluate", "`snakesim train`")
+        extras.require("evaluate", "`snakesim train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import train
     from snakesim_hal.model.drawn import parse_draw

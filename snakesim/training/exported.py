@@ -10,7 +10,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from snakesim.training.form import FELT_RAD, OBSERVE, RAMP_PER_S, Policy
-from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, opened
+from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, load_model
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import exported
 
@@ -46,7 +46,7 @@ def learned_by(policy: str) -> dict[str, float]:
     Raises:
         ConfigError: There is no such policy, or another program has written it.
     """
-    _, metadata = opened(policy)
+    _, metadata = load_model(policy)
     try:
         return msgspec.json.decode(metadata.get(LEARNED, ""), type=dict[str, float])
     except msgspec.MsgspecError:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.errors import ConfigError
 
 FILE = "search.jsonl"
@@ -73,7 +73,7 @@ def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[Ke
         generations = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, b"".join(msgspec.json.encode(line) + b"\n" for line in (header, *generations)))
+        write_atomically(path, b"".join(msgspec.json.encode(line) + b"\n" for line in (header, *generations)))
         handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
     except OSError as error:
         raise ConfigError(f"--out {folder}: {error.strerror}; choose another folder") from None

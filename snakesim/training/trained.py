@@ -14,7 +14,7 @@ from snakesim.training.exported import export, learned_by
 from snakesim.training.form import Policy
 from snakesim.training.search import Effort, Generation, Step, search
 from snakesim_hal.base.process import stop_signals_raise
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_operator.run.conclusion import INTERRUPTED
 
 FRAME_SKIP = 5  # ticks: at 100 Hz, 20 decisions a second
@@ -63,11 +63,11 @@ def train(
             ):
                 known = len(kept.generations)
                 if resume:
-                    say(f"{known} of {effort.generations + 1} generations are done already")
+                    print_line(f"{known} of {effort.generations + 1} generations are done already")
                 for step in search(episodes, form, effort, start, kept.generations):
                     curve.append(step.row)
                     if len(curve) > known:
-                        say(_describe(step.row))
+                        print_line(_describe(step.row))
                         policy = Policy.of(step.best, episodes.axes, episodes.sizes)
                         export(out / POLICY, policy, step.best, FRAME_SKIP, again)
                         write_curve(out, curve)
@@ -78,7 +78,7 @@ def train(
             return INTERRUPTED
     assert newest is not None, "a search has at least its last check"
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    say(
+    print_line(
         f"{out / POLICY}: reward {newest.best_reward:.2f} on fields that it was checked on; {newest.row.episodes} "
         f"episodes in {time.monotonic() - began_s:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of processor time"
     )
@@ -87,9 +87,9 @@ def train(
 
 def _say_stopped(newest: Step | None, out: Path) -> None:
     if newest is None:
-        say("stopped before the first generation was done; nothing is kept")
+        print_line("stopped before the first generation was done; nothing is kept")
         return
-    say(
+    print_line(
         f"stopped after generation {newest.row.generation}: {out / POLICY} is the best policy until then, reward "
         f"{newest.best_reward:.2f} on fields that it was checked on; the same command goes on with --resume"
     )

@@ -21,7 +21,7 @@ from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, 
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
-from snakesim_hal.base.errors import BackendError, ConfigError, did_you_mean
+from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
 LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
 FD = ("socketcan", "kvaser", *LOCAL)  # interfaces through which this driver supports CAN FD
@@ -90,7 +90,7 @@ def split_channel(channel: str) -> tuple[str, str]:
     if interface not in can.VALID_INTERFACES:
         known = sorted(can.VALID_INTERFACES)
         raise ConfigError(
-            f"channel {channel!r}: python-can has no interface {interface!r}; {did_you_mean(interface, known)}it has "
+            f"channel {channel!r}: python-can has no interface {interface!r}; {suggest_word(interface, known)}it has "
             f"{', '.join(known)}"
         )
     if not name:

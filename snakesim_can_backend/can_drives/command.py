@@ -16,7 +16,7 @@ from snakesim_drivers.emulation.emulated_body import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
-from snakesim_hal.base.terminal import exit_code, say
+from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
 from snakesim_hal.programs.preflight import backend_settings
 
@@ -45,7 +45,7 @@ def run(backend: type[CanDriveBackend], command: str, argv: Sequence[str] | None
     arguments = parser.parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    return exit_code(f"snakesim {command}", lambda: serve(backend, command, arguments))
+    return run_tool(f"snakesim {command}", lambda: serve(backend, command, arguments))
 
 
 def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Namespace) -> int:
@@ -75,7 +75,7 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
 def _print_load(backend: type[CanDriveBackend], config: RunConfig, settings: Any) -> None:
     bus_load = backend.compute_load(config.rate_hz, settings, config.robot.joint_table)
     rates = backend.describe_rates(settings)
-    say(
+    print_line(
         f"{bus_load.drives} {backend.plural_noun} at {config.rate_hz:g} Hz on {rates}: "
         f"{bus_load.share:.0%} at worst-case stuffing; {MAX_LOAD:.0%} are allowed, so up to {bus_load.fits_hz} Hz"
     )

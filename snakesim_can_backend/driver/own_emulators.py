@@ -17,8 +17,8 @@ from snakesim_hal.base.process import child_environment, python_command
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import KINDS, Injection
 from snakesim_hal.model.fault_plan import check_backend_can
-from snakesim_hal.model.scenario import RunConfig, write
-from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.model.scenario import RunConfig, write_config
+from snakesim_hal.service import SERVICE_START_LIMIT_S
 
 READY = "modules ready"  # a child prints it when its modules are on the bus
 STOP_LIMIT_S = 5.0  # after which a child that ignores SIGTERM is killed
@@ -126,7 +126,7 @@ class EmulatorProcess:
 
     def _start(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
         config_path = Path(self._folder.name, "config.json")
-        write(config, config_path)
+        write_config(config, config_path)
         module = "snakesim_can_backend.emulator.command"
         with self._output.open("wb") as output:
             return subprocess.Popen(
@@ -140,7 +140,7 @@ class EmulatorProcess:
 
     def _await_ready(self) -> None:
         """Wait until the child prints READY. Raises BackendError."""
-        end_s = time.monotonic() + START_LIMIT_S
+        end_s = time.monotonic() + SERVICE_START_LIMIT_S
         while time.monotonic() < end_s:
             with contextlib.suppress(OSError):
                 if READY in self._output.read_text(encoding="utf-8", errors="replace"):

@@ -17,7 +17,7 @@ from snakesim_drivers.mounting import Mounting
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import tangents
-from snakesim_hal.model.measured_force import FeltForce
+from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, Message, Power, SensorDescription
@@ -61,7 +61,7 @@ class SampleBuilder:
         self._health_lifetime_syncs = round(HEALTH_LIFETIME_S * config.rate_hz)
 
         contact_period_s = max(reports.contact_every, 1) * config.period_ns * 1e-9
-        self._mean_force = FeltForce(contact_period_s)
+        self._mean_force = MeasuredForce(contact_period_s)
 
         # One step of each raw number, and the signals of a Health report.
         layouts = load_layouts()

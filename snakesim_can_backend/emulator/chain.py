@@ -35,7 +35,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import build_config, build_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import Mounting, joint_target
-from snakesim_hal.model.fault_kinds import Change, Injection, Plan
+from snakesim_hal.model.fault_kinds import Change, Injection, InjectionPlan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.physics_model import PhysicsModel
@@ -108,7 +108,7 @@ class ModuleChain:
 
         # Injected faults.
         self.fault_log: list[str] = []  # each begin and end
-        self._plan = Plan(parse_fault(text, self.module_count) for text in settings.faults)
+        self._plan = InjectionPlan(parse_fault(text, self.module_count) for text in settings.faults)
         self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
 
         # Motion capture.
@@ -189,7 +189,7 @@ class ModuleChain:
 
     def _heat_motors(self) -> None:
         """Update the temperatures of all motors, and poll the modules at once if one is too hot."""
-        self.thermal.pass_time(HEAT_EVERY * self.physics_model.step_s, self.motors.take_heat())
+        self.thermal.pass_time(HEAT_EVERY * self.physics_model.step_s, self.motors.pop_mean_square_torque())
         self._derate_motors()
         if (self.thermal.winding_c >= self.thermal.stop_at_c).any():
             self._due_us = -inf
@@ -357,7 +357,7 @@ class ModuleChain:
         torque_limit_nm = inf
         if demand.mode != Mode.PASSIVE:
             torque_limit_nm = min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * gear
-        self.motors.drive(
+        self.motors.set_demand(
             slot.joint,
             demand.mode,
             joint_target(drive, demand.mode, demand.target),

@@ -23,7 +23,7 @@ from snakesim_drivers.emulation.emulated_body import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.base.terminal import exit_code, say
+from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    return exit_code("snakesim modules", lambda: _serve(arguments))
+    return run_tool("snakesim modules", lambda: _serve(arguments))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -104,10 +104,10 @@ def _serve(arguments: argparse.Namespace) -> int:
         loop = Loop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
         on_stop_signal(loop.stop)
         tune_garbage_collector()
-        say(f"modules ready: {module_count} on {', '.join(settings.channels)}")
+        print_line(f"modules ready: {module_count} on {', '.join(settings.channels)}")
         loop.run()
         for line in loop.summary():
-            say(line)
+            print_line(line)
         return 0
 
 
@@ -217,7 +217,7 @@ class Loop:
         loads: list[str] = []
         for wire, bus_before, bus_after in zip(self._server.wires, before, after, strict=True):
             loads.append(f"{wire.channel} {bus_after.load_since(bus_before):.1%}")
-        say(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}")
+        print_line(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}")
         return after
 
     def _read_terminal(self) -> None:
@@ -234,7 +234,7 @@ class Loop:
         try:
             fault, begins = parse_typed_fault(line, self._chain.module_count, now_s)
         except ConfigError as error:
-            say(str(error))
+            print_line(str(error))
         else:
             self._chain.inject(fault, begins=begins)
 

@@ -31,7 +31,7 @@ def parse_fault(text: str, joints: int) -> Injection:
     Raises:
         ConfigError: the text has another form, or modules of this robot do not support the fault.
     """
-    return check_fault(injection.parse(text), joints)
+    return check_fault(injection.parse_injection(text), joints)
 
 
 def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, bool]:
@@ -51,7 +51,7 @@ def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, 
     if match is None:
         kinds = ", ".join(FAULT_DESCRIPTIONS)
         raise ConfigError(f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {kinds}")
-    fault = injection.checked(Injection(match["kind"], match["joint"], now_s), text.strip())
+    fault = injection.check_injection(Injection(match["kind"], match["joint"], now_s), text.strip())
     begins = match["off"] is None
     return check_fault(fault, joints), begins
 

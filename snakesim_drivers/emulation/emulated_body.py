@@ -13,11 +13,11 @@ from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import joint_target
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import on_stop_signal, tune_garbage_collector
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.model.plugins import PLANTS, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import PHYSICS_MODELS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.backlash import BacklashPlant, without_rotors
+from snakesim_hal.physics.backlash import BacklashModel, without_rotors
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.physics.thermal import Thermal
@@ -33,7 +33,7 @@ FAULTS = ("mute", "reboot", "overheat", "undervoltage", "duplicate")  # that can
 
 def make_physics_model(config: RunConfig, settings: Any, backend: str) -> PhysicsModel:
     """The physics model that a backend's settings name, moved by motors as they are in truth. Raises ConfigError."""
-    factory: Any = find_plugin(PLANTS, settings.physics_model)
+    factory: Any = find_plugin(PHYSICS_MODELS, settings.physics_model)
     source, where = f"physics_model {settings.physics_model!r}", f"backends.{backend}.physics_model_settings"
     own = plugin_settings(factory, settings.physics_model_settings, source, where)
     truth = build_config(config, settings.mounted)
@@ -42,7 +42,7 @@ def make_physics_model(config: RunConfig, settings: Any, backend: str) -> Physic
         return factory(truth, own)
     joints = build_joints(config.robot, settings.mounted)
     physics_model = factory(without_rotors(truth, joints, backlash_rad), own)
-    return BacklashPlant(physics_model, joints, backlash_rad, config.seed)
+    return BacklashModel(physics_model, joints, backlash_rad, config.seed)
 
 
 def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callable[[float], object]) -> None:
@@ -50,7 +50,7 @@ def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callab
     running = [True]
     on_stop_signal(running.clear)
     tune_garbage_collector()
-    say(ready)
+    print_line(ready)
     while running:
         emulator()
         wait(POLL_S)
@@ -109,7 +109,7 @@ class SharedPhysics:
                 self._send_pose(msgspec.json.encode(sample))
 
     def _warm(self) -> None:
-        self.thermal.pass_time(HEAT_EVERY * self.physics_model.step_s, self.motors.take_heat())
+        self.thermal.pass_time(HEAT_EVERY * self.physics_model.step_s, self.motors.pop_mean_square_torque())
         if (remaining_fraction := self.thermal.remaining_fraction()) is not None:
             self.motors.derate(remaining_fraction)
 
@@ -162,7 +162,7 @@ class EmulatedBody:
         gear = drive.gear
         target = joint_target(drive, mode, target)
         kp, kd, speed_rad_s = stiffness * gear**2, damping * gear**2, speed_rad_s / gear
-        self.motors.drive(self._at[i], mode, target, limit_nm * gear, kp, kd, speed_rad_s)
+        self.motors.set_demand(self._at[i], mode, target, limit_nm * gear, kp, kd, speed_rad_s)
 
     def read_shaft(self, i: int) -> tuple[float, float, float]:
         """Angle, velocity and torque of a drive's shaft."""

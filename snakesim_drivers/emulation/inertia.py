@@ -11,7 +11,7 @@ from msgspec import Meta
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.scenario import RunConfig, start_of
+from snakesim_hal.model.scenario import RunConfig, find_start_pose
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import from_zero
@@ -48,7 +48,7 @@ class InertiaModel:
         self._rubbed_off = self._speed_per_nm * dry_nm
         self._least = np.array([joint.limits.lower_rad for joint in joints])
         self._most = np.array([joint.limits.upper_rad for joint in joints])
-        self._angle: Floats = np.array(start_of(config).angles_rad, dtype=np.float64)
+        self._angle: Floats = np.array(find_start_pose(config).angles_rad, dtype=np.float64)
         self._velocity = np.zeros(len(self._angle))
         self._torque = np.zeros(len(self._angle))
         self._change = np.zeros(len(self._angle))

@@ -19,8 +19,8 @@ from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.model.robot import identified
-from snakesim_hal.model.scenario import RunConfig, description_of
+from snakesim_hal.model.robot import with_serials
+from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Message, Mode, SensorDescription
 
@@ -110,7 +110,7 @@ class DriveBackend:
             self.close()
             raise
         description = self._make_description(config, name, hardware)
-        self._description = identified(description, self._readings.serials, self._readings.firmware)
+        self._description = with_serials(description, self._readings.serials, self._readings.firmware)
 
     def describe(self) -> Description:
         """Return the robot of the robot file, with the sensors and serial numbers of its drives."""
@@ -248,7 +248,7 @@ class DriveBackend:
             raise BackendError("the buses are closed; open a new backend")
 
     def _make_description(self, config: RunConfig, name: str, hardware: str) -> Description:
-        description = description_of(config, name, emulated=self._drives.emulated)
+        description = describe_run_robot(config, name, emulated=self._drives.emulated)
         pose_sensor = config.robot.sensors.pose
         pose_delay_s = None
         if self._mocap is not None and pose_sensor is not None:

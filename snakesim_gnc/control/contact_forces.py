@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.model.measured_force import FELT_OVER_S
+from snakesim_hal.model.measured_force import FORCE_WINDOW_S
 from snakesim_hal.wire.messages import World, WorldContact
 
 JAM_FORCE_RATIO = 0.5  # contacts that push backward with more than this ratio of the forward push jam the body
@@ -46,7 +46,7 @@ class MeasuredContacts:
         if self._samples and timestamp_ns == self._samples[-1][0]:
             return
         self._samples.append((timestamp_ns, world.contacts))
-        while not 0 <= timestamp_ns - self._samples[0][0] < round(FELT_OVER_S * 1e9):
+        while not 0 <= timestamp_ns - self._samples[0][0] < round(FORCE_WINDOW_S * 1e9):
             self._samples.popleft()
 
     def mean_sizes_n(self, obstacles: Sequence[str | None]) -> list[float | None]:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import msgspec
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, start_of
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, find_start_pose
 from snakesim_hal.wire.messages import Description, JointState, Message, Mode, Trajectory, World, WorldContact
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
@@ -28,7 +28,7 @@ class Task:
     @staticmethod
     def of(config: RunConfig) -> "Task":
         """That of a run."""
-        start = start_of(config)
+        start = find_start_pose(config)
         x, y = start.position_w
         return Task((x, y, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad), config.mission.goal)
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from snakesim_hal.model.scenario import SENSOR, RunConfig, Service
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.freshness import oldest_state_ns
+from snakesim_hal.wire.freshness import max_state_age_ns
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
 MISSED_SAMPLES = 3  # in a row that are tolerated; the fourth means that the publisher has stopped
@@ -50,7 +50,7 @@ class AgeLimits:
         navigation_cycle_s = navigation.decimation * period_s
         planned_s = guidance_cycle_s + guidance_latency_s + navigation.latency_ticks * period_s
         return AgeLimits(
-            joints_s=max_age.joints_s or oldest_state_ns(robot) * 1e-9,
+            joints_s=max_age.joints_s or max_state_age_ns(robot) * 1e-9,
             world_s=max_age.world_s or guidance_latency_s + _margin_s(guidance_cycle_s),
             trajectory_s=max_age.trajectory_s or planned_s + _margin_s(navigation_cycle_s),
             sensors_s=_sensor_limits_s(config, robot, guidance_cycle_s, guidance_latency_s),

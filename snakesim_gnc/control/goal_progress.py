@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from snakesim_gnc.control.controller import Task
-from snakesim_hal.model.kinematics import nodes_w
+from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose
 
@@ -68,7 +68,7 @@ class GoalProgress:
     def _locate_body(self, joints: JointState) -> None:
         """Compute head, center of mass, height and heading of the body from its pose and joint angles."""
         position_w, wxyz = self.pose
-        nodes = nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
+        nodes = find_nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
         tail_w = nodes[0, :2]
         self._head_w = nodes[-1, :2]
 

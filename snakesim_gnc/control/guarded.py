@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
-from snakesim_hal.base.errors import ControllerError, raised
+from snakesim_hal.base.errors import ControllerError, describe_exception
 from snakesim_hal.wire.messages import Description, JointDescription, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
 from snakesim_hal.wire.setpoints import RequestedSetpoints
@@ -62,7 +62,7 @@ class GuardedController:
             raise self.make_error(str(error)) from error.__cause__
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise self.make_error(f"{method}() {raised(error, self._module)}") from error
+            raise self.make_error(f"{method}() {describe_exception(error, self._module)}") from error
 
 
 def check(action: Action, described: Sequence[JointDescription]) -> None:
@@ -98,7 +98,7 @@ def _check_modes(modes: Any, described: Sequence[JointDescription], joints: Sequ
             raise ValueError(
                 f"RequestedSetpoints.mode[{i}] ({joints[i]}) is {_format_value(mode)}, must be one of {MODES}"
             )
-        if not described[i].has(mode):
+        if not described[i].supports_mode(mode):
             available = ", ".join(f"Mode.{known.name}" for known in described[i].modes)
             found = f"RequestedSetpoints.mode[{i}] is Mode.{mode.name}"
             raise ValueError(f"{found}, which {joints[i]} does not have; it has {available}")

@@ -17,7 +17,7 @@ from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Question
+from snakesim_hal.network.session import Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE, Decoder
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, Description, SettingsRequest
@@ -49,9 +49,9 @@ class LiveSettings:
         self._published_change = -1  # number of the change that was published last
 
         # Requests and publications.
-        self._waiting: Mailbox[Question] = Mailbox((MAX_WAITING_REQUESTS,))
+        self._waiting: Mailbox[Query] = Mailbox((MAX_WAITING_REQUESTS,))
         self._decoder = Decoder(SettingsRequest)
-        client.session.on_question(keys.SETTINGS, self._waiting.put)
+        client.session.on_query(keys.SETTINGS, self._waiting.put)
         self._publisher = client.session.latched_publisher(keys.SETTINGS_IN_FORCE, ControlSettings)
 
     @property
@@ -84,7 +84,7 @@ class LiveSettings:
             self._publish(clock)
         return self._change_count != count_before
 
-    def _answer_request(self, question: Question) -> Answer:
+    def _answer_request(self, question: Query) -> Answer:
         """Put the settings of a request in force if the controller accepts them."""
         try:
             request = self._decoder.decode(question.payload, question.encoding)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.goal_progress import GoalProgress
-from snakesim_hal.base.errors import ConfigError, did_you_mean
+from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Message, Pose
 
@@ -107,7 +107,7 @@ def _pose_parts() -> dict[str, ObservationPart]:
 DEFAULT = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n")
 
 
-def chosen(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
+def select_parts(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
     """Return parts of an observation by their names.
 
     Args:
@@ -126,7 +126,7 @@ def chosen(robot: Description, observe: Sequence[str] | None) -> dict[str, Obser
         raise ConfigError(f"observe={observe!r:.60}: give a sequence of names, such as ('angle_rad', 'contact_n')")
     for name in observe:
         if name not in parts:
-            hint = did_you_mean(str(name), parts)
+            hint = suggest_word(str(name), parts)
             raise ConfigError(f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}")
         if name not in observable:
             raise ConfigError(f"observe: {name!r} needs {parts[name].sensor}, which robot {robot.robot!r} has not")

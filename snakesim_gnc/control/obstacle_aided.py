@@ -33,7 +33,7 @@ from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.controller import Action, Report, View
-from snakesim_gnc.control.progress import Located, Progress, SpeedFilter
+from snakesim_gnc.control.progress import Located, PathProgress, SpeedFilter
 from snakesim_gnc.control.push import PushFilter, Touches, UnitPush, find_touches, push_forward
 from snakesim_gnc.control.push_report import explain_push_standstill, push_points
 from snakesim_gnc.control.undulation import LateralUndulation
@@ -153,12 +153,12 @@ class ObstacleAided:
         # Models and estimators.
         self._body = PlanarBody(robot)
         self._climb = Climb(robot)
-        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._progress = PathProgress(self._body, speed_filter_s=settings.speed_filter_s)
         self._contacts = MeasuredContacts()
         # Joints.
         self._bends = self._body.bends  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._has_torque_mode = all(robot.joints[i].has(Mode.TORQUE) for i in self._bends)
+        self._has_torque_mode = all(robot.joints[i].supports_mode(Mode.TORQUE) for i in self._bends)
         self._bumpless = BumplessReference(robot, settings.blend_s)
         self._holding = False  # the joints hold a pose; the next reference may jump
         # Look-ahead.
@@ -342,7 +342,7 @@ class ObstacleAided:
         touches = find_touches(
             nodes_w,
             self._body.radius_m,
-            Outlines.of(obstacles),
+            Outlines.from_obstacles(obstacles),
             reach_m=config.reach_m,
             friction=located.trajectory.peg_friction,
         )

@@ -14,7 +14,7 @@ from typing import Annotated
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.controller import Action, Report, View
-from snakesim_gnc.control.progress import Progress, SpeedFilter
+from snakesim_gnc.control.progress import PathProgress, SpeedFilter
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
@@ -39,7 +39,7 @@ class PathFollowing:
         self._set = settings
         self._body = PlanarBody(robot)
         self._climb = Climb(robot)
-        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._progress = PathProgress(self._body, speed_filter_s=settings.speed_filter_s)
         self._bumpless = BumplessReference(robot, settings.blend_s)
         self._reference_s_m = 0.0  # s_ref
 

@@ -14,9 +14,9 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_gnc.control.observations import ObservationPart, Observer, chosen, make_parts
-from snakesim_hal.base.errors import ConfigError, did_you_mean, short
-from snakesim_hal.model.files import SHIPPED, FileStruct, expanded
+from snakesim_gnc.control.observations import ObservationPart, Observer, make_parts, select_parts
+from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
+from snakesim_hal.model.files import SHIPPED, FileStruct, expand_home
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.wire.messages import Description, Mode
@@ -58,7 +58,7 @@ class Model:
         Raises:
             ConfigError: the model does not fit; the error names the file, the field, its value and what is expected.
         """
-        self._session, properties = opened(file)
+        self._session, properties = load_model(file)
         metadata = _Metadata(file, properties)
 
         # What the model observes and returns.
@@ -90,8 +90,8 @@ def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts:
         allowed = f"{joint_count}, the number of joints of robot {robot.robot!r}"
         raise metadata.make_error(JOINTS, expected_count, allowed)
     for joint in robot.joints:
-        if not joint.has(MODES[action]):
-            available = [name for name, mode in MODES.items() if joint.has(mode)]
+        if not joint.supports_mode(MODES[action]):
+            available = [name for name, mode in MODES.items() if joint.supports_mode(mode)]
             raise metadata.make_error(ACTION, action, f"what {joint.name} can do: {', '.join(available)}")
         if "torque_nm" in parts and "torque" not in joint.measures:
             allowed = f"without torque_nm: {joint.name} measures none"
@@ -168,7 +168,7 @@ class _Metadata:
     """Reads and checks the metadata properties of a model, which are texts. Its methods raise ConfigError."""
 
     def __init__(self, file: str, properties: Mapping[str, str]) -> None:
-        self._file = short(file)
+        self._file = shorten(file)
         self._properties = properties
 
     def read_parts(self, robot: Description) -> dict[str, ObservationPart]:
@@ -182,9 +182,9 @@ class _Metadata:
         if has_unknown_names or has_repeated_names:
             raise self.make_error(OBSERVATIONS, text, allowed)
         try:
-            return chosen(robot, names)
+            return select_parts(robot, names)
         except ConfigError as error:
-            raise ConfigError(f"{self._file}: metadata `{OBSERVATIONS}` is {short(text)!r}: {error}") from None
+            raise ConfigError(f"{self._file}: metadata `{OBSERVATIONS}` is {shorten(text)!r}: {error}") from None
 
     def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
         """Return a text that is one of the choices."""
@@ -213,13 +213,13 @@ class _Metadata:
 
     def make_error(self, field: str, value: object, allowed: str) -> ConfigError:
         """Return an error that names the file, the field, its value and what is allowed."""
-        return ConfigError(f"{self._file}: metadata `{field}` is {short(str(value))!r}, must be {allowed}")
+        return ConfigError(f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}")
 
     def _read_text(self, field: str, allowed: str) -> str:
         if field not in self._properties:
             available = ", ".join(sorted(self._properties)) or "no metadata"
             raise ConfigError(
-                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {short(available, 200)}"
+                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {shorten(available, 200)}"
             )
         return self._properties[field]
 
@@ -231,17 +231,17 @@ def _find_model_file(name: str) -> Path:
         ConfigError: no shipped policy has this name.
     """
     if "/" in name or name.endswith(SUFFIX):
-        return expanded(name)
+        return expand_home(name)
     shipped = sorted(path.stem for path in POLICIES.glob(f"*{SUFFIX}"))
     if name not in shipped:
         raise ConfigError(
-            f"no policy called {short(name)!r}; {did_you_mean(name, shipped)}shipped are {', '.join(shipped)}. For a "
-            f"file of your own give its path, such as ./{short(name)}{SUFFIX}"
+            f"no policy called {shorten(name)!r}; {suggest_word(name, shipped)}shipped are {', '.join(shipped)}. For a "
+            f"file of your own give its path, such as ./{shorten(name)}{SUFFIX}"
         )
     return POLICIES / f"{name}{SUFFIX}"
 
 
-def opened(file: str) -> tuple[Any, Mapping[str, str]]:
+def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     """Load a model.
 
     Args:
@@ -264,7 +264,7 @@ def opened(file: str) -> tuple[Any, Mapping[str, str]]:
     try:
         session = RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many classes that share no base class
-        raise ConfigError(f"{short(file)}: cannot be loaded as an ONNX model: {short(str(error), 300)}") from error
+        raise ConfigError(f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}") from error
     return session, session.get_modelmeta().custom_metadata_map
 
 
@@ -284,9 +284,9 @@ def _check_tensor(kind: str, tensors: Sequence[Any], width: int, meaning: str, f
     if len(tensors) == 1 and _has_width(tensors[0], width):
         return tensors[0].name
     descriptions = [f"{tensor.name} {tensor.type} {tuple(tensor.shape)}" for tensor in tensors]
-    available = short("; ".join(descriptions) or "none", 200)
+    available = shorten("; ".join(descriptions) or "none", 200)
     raise ConfigError(
-        f"{short(file)}: {kind} is {available}, must be one tensor(float), that is float32, of shape (1, {width}): "
+        f"{shorten(file)}: {kind} is {available}, must be one tensor(float), that is float32, of shape (1, {width}): "
         f"{meaning}"
     )
 

@@ -42,7 +42,7 @@ class Located:
     trajectory: Trajectory
 
 
-class Progress:
+class PathProgress:
     """Tracks the body along the path with an alpha-beta filter over poses, each with the joint angles of its instant.
 
     Only the yaw joints bend; all others count as straight. Between poses the arc length is extrapolated at the last

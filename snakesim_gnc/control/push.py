@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import cross
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import SHARES, Outlines, nearest_on_chain
+from snakesim_hal.model.outlines import LINK_FRACTIONS, Outlines, nearest_on_chain
 
 MAX_NORMAL_ALONG_BODY = 0.6  # |n . t| of a contact; above it, the obstacle stands in front of the head
 MAX_RESIDUAL = 0.05  # unbalanced fraction of the force up to which contacts count as able to push
@@ -118,13 +118,13 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     samples, nearest_w, distances_m = nearest_on_chain(nodes_w.T, outlines)
     near = np.flatnonzero(distances_m - radius_m < reach_m)
     center_w = nearest_w[near]  # (k, 2) on the center line
-    link, share = np.divmod(samples[near], len(SHARES))
+    link, share = np.divmod(samples[near], len(LINK_FRACTIONS))
     run_w = np.diff(nodes_w, axis=1).T  # (n_links, 2)
     lengths_m = np.hypot(*run_w.T)
-    distance_m, normal = outlines.towards(center_w, near)
+    distance_m, normal = outlines.distance_and_normal(center_w, near)
     tangent = (run_w / lengths_m[:, None])[link]
     link_start_m = np.concatenate(([0.0], np.cumsum(lengths_m)[:-1]))
-    body_s_m = link_start_m[link] + SHARES[share] * lengths_m[link]
+    body_s_m = link_start_m[link] + LINK_FRACTIONS[share] * lengths_m[link]
     direction = normal - friction * tangent
     beside = np.flatnonzero(np.abs(np.einsum("ij,ij->i", normal, tangent)) < MAX_NORMAL_ALONG_BODY)
     return Touches(

@@ -18,7 +18,7 @@ from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander, Feed
-from snakesim_hal.programs.preflight import what_it_lacks
+from snakesim_hal.programs.preflight import describe_missing_capability
 from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -84,7 +84,7 @@ class Control(Service):
 
     def configure(self, robot: Description) -> None:
         """Prepare to command this robot. Raises ControllerError if the robot lacks what the controller needs."""
-        missing = what_it_lacks(robot.joints, self._settings.plugin, self._config.controller)
+        missing = describe_missing_capability(robot.joints, self._settings.plugin, self._config.controller)
         if missing is not None:
             raise ControllerError(f"robot {robot.robot!r}: {missing}")
         self._settings.configure(robot)
@@ -108,7 +108,7 @@ class Control(Service):
         if joints is None:
             return None
         is_armed = clock.lifecycle == "armed"
-        holds_lease = self._commander.holds(clock)
+        holds_lease = self._commander.ensure_lease(clock)
         if not (is_armed and holds_lease):
             self._controller = None
         if not holds_lease:
@@ -120,7 +120,7 @@ class Control(Service):
             return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why_late))
         if not is_armed:
             self._log_late_streams(clock)
-            self._commander.send(clock, joints, self._commander.stay(joints))
+            self._commander.send(clock, joints, self._commander.hold_position(joints))
             return _state_messages(self._reports.make_state(clock))
         return self._run_controller(clock, joints)
 
@@ -180,7 +180,7 @@ class Control(Service):
             except ValueError as error:
                 raise controller.make_error(str(error)) from None
         except ControllerError as error:
-            self._client.put(keys.CONTROL_STATE, self._reports.make_failure(clock, str(error)))
+            self._client.publish(keys.CONTROL_STATE, self._reports.make_failure(clock, str(error)))
             raise
         return _state_messages(state)
 

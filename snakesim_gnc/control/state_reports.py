@@ -7,7 +7,7 @@ from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.controller import Report
 from snakesim_gnc.control.states import locomotion_state
 from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
-from snakesim_hal.wire.outgoing import what_is_wrong
+from snakesim_hal.wire.outgoing import find_wrong_value
 
 TELEMETRY_S = 0.05  # period of the messages while the state does not change
 MAX_REASON = 500  # characters, as the wire allows
@@ -139,4 +139,4 @@ class StateReports:
             # Encoded and decoded, because a Struct checks its fields only when it is decoded.
             return self._decoder.decode(msgspec.msgpack.encode(message))
         except (TypeError, msgspec.ValidationError) as error:
-            raise ValueError(what_is_wrong(message, "Report") or str(error)) from None
+            raise ValueError(find_wrong_value(message, "Report") or str(error)) from None

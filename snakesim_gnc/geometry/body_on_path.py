@@ -108,14 +108,14 @@ class BodyOnPath:
     def _lay_body(self, tail_s_m: float) -> Floats:
         """Compute a pose, node by node from the tail."""
         s_m = tail_s_m
-        x, y = self.route.at(s_m)
+        x, y = self.route.point_at(s_m)
         node_s_m = [s_m]
         node_x = [x]
         node_y = [y]
         headings_rad: list[float] = []
         for length_m in self.segments_m:
             s_m = self._find_ahead_s_m(s_m, length_m)
-            next_x, next_y = self.route.at(s_m)
+            next_x, next_y = self.route.point_at(s_m)
             headings_rad.append(math.atan2(next_y - y, next_x - x))
             x, y = next_x, next_y
             node_s_m.append(s_m)
@@ -150,7 +150,7 @@ class BodyOnPath:
         level_m = length_m
         if climb_m:
             level_m = math.sqrt(length_m**2 - min(climb_m**2, 0.5 * length_m**2))
-        return next_on_route(self.route, self.route.at(s_m), s_m, level_m)
+        return next_on_route(self.route, self.route.point_at(s_m), s_m, level_m)
 
 
 def chain_nodes(

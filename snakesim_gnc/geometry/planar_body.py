@@ -10,7 +10,7 @@ import numpy as np
 
 from snakesim_gnc.geometry.body_on_path import BodyPose, chain_nodes, compute_heading_rad
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import nodes_w
+from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
@@ -60,7 +60,7 @@ class PlanarBody:
         """
         if not self._all_bend:
             # A link that is pitched up is shorter, as seen from above.
-            chain_w = nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
+            chain_w = find_nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
             return chain_w[self._node_rows, :2].T
         bend_angles_rad = [angles_rad[i] for i in self.bends]
         heading_rad = compute_heading_rad(world.base_orientation_wxyz)

@@ -46,7 +46,7 @@ class Anchors:
     """The known obstacles, which correct the pose of one robot."""
 
     def __init__(self, robot: Description, known: Sequence[Obstacle]) -> None:
-        self._outlines = Outlines.of(known)
+        self._outlines = Outlines.from_obstacles(known)
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._radii_m = np.array([link.radius_m for link in robot.links])
         self._ratios = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK  # of each link's length
@@ -68,7 +68,7 @@ class Anchors:
         nearest_point = gaps_m.argmin(axis=0)  # of each obstacle
         smallest_gap_m = gaps_m.min(axis=0)
         near = np.flatnonzero((smallest_gap_m < MAX_GAP_M) & (smallest_gap_m > -MAX_DEPTH_M))
-        _, normals_w = self._outlines.towards(axis_w[nearest_point[near]], near)
+        _, normals_w = self._outlines.distance_and_normal(axis_w[nearest_point[near]], near)
 
         rows: list[Floats] = []
         measured_gaps_m: list[float] = []

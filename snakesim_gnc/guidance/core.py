@@ -38,7 +38,7 @@ class WorldModel:
         self._mass_ratios = masses_kg / masses_kg.sum()
         # The map.
         self._known = list(known)
-        self._outlines = Outlines.of(known)
+        self._outlines = Outlines.from_obstacles(known)
         self._reach_m = reach_m
 
     def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:

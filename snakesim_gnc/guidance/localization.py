@@ -14,7 +14,7 @@ import numpy as np
 from snakesim_gnc.guidance.body_history import Base, BodyHistory, rotation_about_z, wrap_angle
 from snakesim_gnc.guidance.odometry import Odometry, OdometryStep
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
+from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, Pose
 
 MessageT = TypeVar("MessageT", Contacts, Imu)
@@ -95,7 +95,7 @@ class Localizer:
         if then is None:
             return
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
-        yaw_rad = yaw_of(rotation)
+        yaw_rad = yaw_from_rotation(rotation)
         measured_w = np.array([*pose.position_w[:2], yaw_rad])
         jump = measured_w - then.planar_w
         if is_first:

@@ -18,8 +18,8 @@ from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.reckoned_pose import ReckonedPose
 from snakesim_gnc.guidance.scan import Look, Noise
 from snakesim_hal.base.terminal import print_stderr
-from snakesim_hal.model.scenario import RunConfig, start_of, surveyed
-from snakesim_hal.model.sensors import DepthCamera, Looking
+from snakesim_hal.model.scenario import RunConfig, find_start_pose, survey_obstacles
+from snakesim_hal.model.sensors import DepthCamera, DistanceSensor
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
@@ -85,7 +85,7 @@ class _SurveyedSource:
         sensors = config.robot.sensors
         self._client = client
         self._config = config
-        self._known: Sequence[Obstacle] = surveyed(config)
+        self._known: Sequence[Obstacle] = survey_obstacles(config)
 
         # Subscriptions.
         self._joints = client.subscribe(keys.JOINTS, JointState)
@@ -163,8 +163,8 @@ class _PerceivedSource:
         self._pose = client.subscribe(keys.POSE, Pose) if uses_pose else None
         self._looks: list[tuple[Any, Noise]] = []  # subscription to a ranging sensor, and its noise
         for key, sensor in robot.sensors.mounted():
-            message_type = keys.message_at(key)
-            if isinstance(sensor, Looking) and message_type is not None and message_type in get_args(Look):
+            message_type = keys.find_message(key)
+            if isinstance(sensor, DistanceSensor) and message_type is not None and message_type in get_args(Look):
                 self._looks.append((client.subscribe(key, message_type), _range_noise(sensor)))
 
         self._model: PerceivedWorld | None = None
@@ -203,11 +203,11 @@ class _PerceivedSource:
 
 def _start_pose(config: RunConfig) -> Base:
     """Return the pose of the base at the start of the run."""
-    start = start_of(config)
+    start = find_start_pose(config)
     return Base(np.array([*start.position_w, start.yaw_rad]), config.robot.module.radius_m, np.eye(3))
 
 
-def _range_noise(sensor: Looking) -> Noise:
+def _range_noise(sensor: DistanceSensor) -> Noise:
     """Return the noise that the robot's file declares, or a minimum."""
     per_m2 = sensor.noise_m_per_m2 if isinstance(sensor, DepthCamera) else 0.0
     return Noise(max(sensor.noise_m, MIN_NOISE_M), per_m2)

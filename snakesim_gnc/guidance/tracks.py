@@ -184,7 +184,7 @@ def make_outlines(tracks: Sequence[Track]) -> Outlines:
     half_m = np.array([track.half_m for track in tracks], dtype=np.float64).reshape(-1, 2)
     return Outlines(
         center_w=np.array([track.center_w for track in tracks], dtype=np.float64).reshape(-1, 2),
-        turn=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
+        direction=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
         half_m=np.where(is_box[:, None], half_m, 0.0),
         rounding_m=np.where(is_box, 0.0, [track.radius_m for track in tracks]),
     )

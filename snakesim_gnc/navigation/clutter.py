@@ -341,7 +341,7 @@ class ClutterPlanner:
 
 def _describe_shapes_near(head_w: Floats, obstacles: Sequence[Obstacle]) -> Floats:
     """Return center, half size and rounding of the obstacles around the head, (k, 5) in m."""
-    outlines = Outlines.of(obstacles)
+    outlines = Outlines.from_obstacles(obstacles)
     offset = outlines.center_w - head_w
     is_near = np.hypot(offset[:, 0], offset[:, 1]) < MAP_RADIUS_M
     return np.column_stack([outlines.center_w, outlines.half_m, outlines.rounding_m])[is_near]

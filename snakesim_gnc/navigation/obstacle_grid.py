@@ -52,7 +52,7 @@ class ObstacleGrid:
 
     def _fill(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
         self.obstacles = list(obstacles)
-        self.outlines = Outlines.of(self.obstacles)
+        self.outlines = Outlines.from_obstacles(self.obstacles)
         if not self.obstacles:
             self._fill_empty()
             return
@@ -85,7 +85,7 @@ class ObstacleGrid:
         x = self._low_w[0] + CELL_M * np.arange(first[0], last[0])
         y = self._low_w[1] + CELL_M * np.arange(first[1], last[1])
         cells_w = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-        to_obstacle_m, _ = self.outlines.towards(cells_w, np.full(cells_w.shape[:2], index))
+        to_obstacle_m, _ = self.outlines.distance_and_normal(cells_w, np.full(cells_w.shape[:2], index))
         window = (slice(first[0], last[0]), slice(first[1], last[1]))
         is_nearer = to_obstacle_m < distance_m[window]
         distance_m[window][is_nearer] = to_obstacle_m[is_nearer]
@@ -109,7 +109,7 @@ class ObstacleGrid:
         has_obstacle = obstacle >= 0
         if has_obstacle.any():
             points_w = np.stack([x[has_obstacle], y[has_obstacle]], axis=-1)
-            distances_m, normals_w = self.outlines.towards(points_w, obstacle[has_obstacle])
+            distances_m, normals_w = self.outlines.distance_and_normal(points_w, obstacle[has_obstacle])
             distance_m[has_obstacle] = distances_m
             normal_w[has_obstacle] = normals_w
         return NearestObstacles(obstacle, distance_m, normal_w)

@@ -17,7 +17,7 @@ class PlatformRises:
     """Finds the rises of the present path, once for each path."""
 
     def __init__(self, platforms: Sequence[Obstacle]) -> None:
-        self._outlines = Outlines.of(platforms)
+        self._outlines = Outlines.from_obstacles(platforms)
         self._tops_m = np.array([platform.position_w[2] + 0.5 * platform.height_m for platform in platforms])
         self._path_id = -1
         self._rises: list[Rise] = []

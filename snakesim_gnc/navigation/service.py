@@ -12,9 +12,9 @@ from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_gnc.navigation.platform_rises import PlatformRises
 from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, start_of, surveyed
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, find_start_pose, survey_obstacles
 from snakesim_hal.model.scenario import Service as Schedule
-from snakesim_hal.model.scene import route_of
+from snakesim_hal.model.scene import make_route
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
@@ -44,7 +44,7 @@ class Navigation(Service):
     def configure(self, robot: Description) -> None:
         """Create the planners for a robot, whose position is unknown again."""
         config = self._config
-        known = surveyed(config)
+        known = survey_obstacles(config)
         self._intents.start_over()
         self._body = PlanarBody(robot)
         self._recent_angles = RecentAngles()
@@ -104,15 +104,15 @@ def _find_platforms(config: RunConfig, robot: Description) -> Sequence[Obstacle]
     can_pitch = any(joint.axis == "pitch" for joint in robot.joints)
     if config.mission.map != "known" or not can_pitch:
         return []
-    platforms = surveyed(config, walkable=True)
+    platforms = survey_obstacles(config, walkable=True)
     return [platform for platform in platforms if platform.height_m <= config.mission.max_climb_m]
 
 
 def _make_known_path(config: RunConfig, known: Sequence[Obstacle]) -> KnownPath:
     """Return the path along the scene's route, or straight ahead from the start if it has none."""
-    route = route_of(config.scene)
+    route = make_route(config.scene)
     if route is None:
-        start = start_of(config)
+        start = find_start_pose(config)
         ahead = np.array([np.cos(start.yaw_rad), np.sin(start.yaw_rad)]) * NO_ROUTE_LENGTH_M
         route = Route(np.array([start.position_w, start.position_w + ahead]))
     return KnownPath(route, known, config.mission.peg_friction)

@@ -43,7 +43,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 
 @cache
-def environment() -> dict[str, str]:
+def common_environment() -> dict[str, str]:
     """Return variables that make a process compute in the common arithmetic; none for a processor that cannot."""
     if os.uname().machine != "x86_64":
         return {}
@@ -69,7 +69,7 @@ def pin(*, one_thread: bool = False) -> None:
     """
     if "numpy" in sys.modules:
         return
-    os.environ.update(environment())
+    os.environ.update(common_environment())
     if one_thread:
         os.environ.update(ONE_THREAD)
 
@@ -79,13 +79,13 @@ def is_pinned() -> bool:
 
     True also where nothing could make it do so: then a child process would not either.
     """
-    if environment().items() <= os.environ.items():
+    if common_environment().items() <= os.environ.items():
         return True
-    differing = foreign(measured())
+    differing = find_differing_parts(measure_arithmetic())
     return "BLAS" not in differing and "NumPy" not in differing
 
 
-def foreign(parts: Mapping[str, str]) -> list[str]:
+def find_differing_parts(parts: Mapping[str, str]) -> list[str]:
     """Name the parts of a measured arithmetic that differ from the common one, such as "BLAS", "BLAS of NumPy 2.5"."""
     differing: list[str] = []
     for part, digest in COMMON.items():
@@ -97,7 +97,7 @@ def foreign(parts: Mapping[str, str]) -> list[str]:
     return differing
 
 
-def digest_text(digest: str, differing: Sequence[str]) -> str:
+def format_digest(digest: str, differing: Sequence[str]) -> str:
     """Return a run's digest for people.
 
     Args:
@@ -116,7 +116,7 @@ def digest_text(digest: str, differing: Sequence[str]) -> str:
 
 
 @cache
-def measured() -> dict[str, str]:
+def measure_arithmetic() -> dict[str, str]:
     """Return the arithmetic of this process: for each part a hash of its results. Takes about 10 ms, once."""
     from threadpoolctl import threadpool_limits
 

@@ -11,7 +11,7 @@ from pathlib import Path
 PARTIAL = ".partial"  # suffix of a file that is not complete yet
 
 
-def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
+def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> None:
     """Replace a file atomically, and keep its permissions. Raises OSError; then the earlier file is unchanged.
 
     A symbolic link at `path` is replaced, not followed: this is for files of this program, whose folder another user
@@ -52,7 +52,7 @@ def write_through(path: Path, content: bytes, *, durable: bool = False) -> None:
         target = path.resolve(strict=True)  # a link to nowhere is a mistake of the user, not a wish for a new file
         if not target.is_file():
             raise OSError(errno.EINVAL, "its symbolic link does not lead to a file", str(path))
-    write_whole(target, content, durable=durable)
+    write_atomically(target, content, durable=durable)
 
 
 def _permissions(path: Path) -> int | None:
@@ -65,7 +65,7 @@ def _permissions(path: Path) -> int | None:
 
 
 @contextlib.contextmanager
-def replaced(path: Path) -> Iterator[Path]:
+def replace_atomically(path: Path) -> Iterator[Path]:
     """Yield another path, for a library to write a file or a folder there; then it takes the place of `path`.
 
     The other path has the same suffix, by which libraries choose a format. If anything is raised, `path` is unchanged

@@ -67,7 +67,7 @@ OUR_PACKAGES = frozenset(
 INSTALLED_IN = ("site-packages", "dist-packages")  # the second one is Debian's
 
 
-def raised(error: BaseException, plugin: str = "") -> str:
+def describe_exception(error: BaseException, plugin: str = "") -> str:
     """Describe an exception of a plugin in one line: what it is, and the line of the plugin that led to it.
 
     Args:
@@ -102,14 +102,14 @@ def _line_of_plugin(error: BaseException, package: str) -> tuple[str, int]:
     return file, line
 
 
-def short(text: str, most: int = 120) -> str:
+def shorten(text: str, most: int = 120) -> str:
     """Return a text of a user for quoting in a message: at most `most` characters."""
     if len(text) <= most:
         return text
     return text[: most - 3] + "..."
 
 
-def nearest(word: str, known: Iterable[str]) -> str | None:
+def find_nearest_word(word: str, known: Iterable[str]) -> str | None:
     """Return the known word that a mistyped one may mean; None if no word is near."""
     import difflib  # imported only for a mistake: `snakesim estop` must start at once
 
@@ -117,7 +117,7 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def suggest_word(word: str, known: Iterable[str]) -> str:
     """Return the question for a message, with a space behind it; empty if no known word is near."""
-    close = nearest(word, known)
+    close = find_nearest_word(word, known)
     return f"did you mean `{close}`? " if close else ""

@@ -18,7 +18,7 @@ from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.base.terminal import print_stderr
 
 # SIGHUP means that the terminal or the ssh session was closed.
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SEARCH_PATH = "PYTHONPATH"
 SAFE_PATH = "PYTHONSAFEPATH"  # the variable that stands for Python's option -P
 # Numbers of the Linux kernel, from <linux/prctl.h>, <linux/capability.h> and <bits/mman-linux.h>.
@@ -35,7 +35,7 @@ SERVICE_PRIORITY = 19
 MAX_USER_NAME_LENGTH = 64  # characters, as `quantities.Name` allows
 
 
-def user_name() -> str:
+def get_user_name() -> str:
     """Return the name of the user who runs this process, for status and logs."""
     try:
         return getpass.getuser()[:MAX_USER_NAME_LENGTH]
@@ -90,12 +90,12 @@ def die_with_parent(parent_pid: int | None = None) -> None:
 def stop_signals() -> tuple[signal.Signals, ...]:
     """Return the stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    return tuple(number for number in STOPS if not (ignored and number == signal.SIGHUP))
+    return tuple(number for number in STOP_SIGNALS if not (ignored and number == signal.SIGHUP))
 
 
 def accept_interrupts() -> None:
     """Receive stop signals from now on. Children start with these signals blocked, until they can handle them."""
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
 
 
 def restart_process() -> NoReturn:
@@ -103,7 +103,7 @@ def restart_process() -> NoReturn:
 
     A stop that comes meanwhile waits until the program can handle it. Close everything before.
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, sys.orig_argv)

@@ -39,7 +39,7 @@ class Pulse:
         """Note that no step is going on."""
         TWO_TIMES.pack_into(self._memory, 0, 0.0, 0.0)
 
-    def step_s(self) -> tuple[float, float] | None:
+    def read_step_times(self) -> tuple[float, float] | None:
         """Return when the present step began and when it is due; None between steps."""
         began_s, due_s = TWO_TIMES.unpack_from(self._memory, 0)
         if not began_s:
@@ -142,7 +142,7 @@ class StepLimit:
         return self._grace_s is not None and now_s >= max(began_s, self._hurried_s) + self._grace_s
 
 
-def place_of(error: StepTooLongError) -> str:
+def describe_interrupted_line(error: StepTooLongError) -> str:
     """Return where a step was when it was interrupted: `update() (wave.py line 12)`."""
     innermost = traceback.extract_tb(error.__traceback__)[-1]
     return f"{innermost.name}() ({innermost.filename.rpartition('/')[2]} line {innermost.lineno})"

@@ -13,10 +13,10 @@ from typing import Any, TextIO
 
 from snakesim_hal.base.errors import ConfigError, SnakesimError
 
-Say = Callable[[str], None]
+PrintLine = Callable[[str], None]
 
 
-def printable(text: str, keep: str = "") -> str:
+def escape_invisible(text: str, keep: str = "") -> str:
     """Return the text with every invisible character escaped as `\\u001b`; except spaces, and characters in `keep`."""
     if text.isprintable():
         return text
@@ -33,13 +33,13 @@ def _escape(char: str) -> str:
     return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """Print one line, at once."""
-    print(printable(line), flush=True)
+    print(escape_invisible(line), flush=True)
 
 
 @contextmanager
-def output_may_fail() -> Iterator[None]:
+def tolerate_failed_output() -> Iterator[None]:
     """Make failed writes harmless within, because a robot moves: a closed pipe or terminal, a full disk."""
     with redirect_stdout(_FailSafeStream(sys.stdout)), redirect_stderr(_FailSafeStream(sys.stderr)):
         yield
@@ -57,14 +57,14 @@ class _FailSafeStream(io.TextIOBase):
         except UnicodeEncodeError:
             return self.write(text.encode("ascii", "backslashreplace").decode())
         except OSError:
-            discard(self._stream)
+            discard_output(self._stream)
             return len(text)
 
     def flush(self) -> None:
         try:
             self._stream.flush()
         except OSError:
-            discard(self._stream)
+            discard_output(self._stream)
 
     def isatty(self) -> bool:
         return self._stream.isatty()
@@ -73,14 +73,14 @@ class _FailSafeStream(io.TextIOBase):
         return self._stream.fileno()
 
 
-def discard(stream: TextIO) -> None:
+def discard_output(stream: TextIO) -> None:
     """Throw away what is printed to a stream from now on, and what is still in its buffer."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
 
 
-def say_json(value: Any, say: Say = say) -> None:
+def print_json(value: Any, say: PrintLine = print_line) -> None:
     """Print a value, such as a Struct, as one line of JSON: for scripts. NaN and infinity become null."""
     import msgspec  # most commands print none
 
@@ -89,10 +89,10 @@ def say_json(value: Any, say: Say = say) -> None:
 
 def print_stderr(line: str) -> None:
     """Print one line to stderr."""
-    print(printable(line), file=sys.stderr, flush=True)
+    print(escape_invisible(line), file=sys.stderr, flush=True)
 
 
-def exit_code(tool: str, act: Callable[[], int]) -> int:
+def run_tool(tool: str, act: Callable[[], int]) -> int:
     """Run a program and return its exit code. An error is printed: 2 means wrong input, 1 any other error.
 
     Args:
@@ -116,7 +116,7 @@ def report_error(error: SnakesimError, tool: str) -> None:
         print_stderr(line)
 
 
-def aligned(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> Iterator[str]:
+def align_columns(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> Iterator[str]:
     """Yield the lines of a table with a heading. Each row has a text for each column."""
     heading = {column: column for column in columns}
     lines = [heading, *rows]
@@ -134,7 +134,7 @@ def overwrite_line(line: str, most: int, before: int) -> int:
         most: maximum number of characters; the rest is cut off.
         before: length of the previous line.
     """
-    shown = printable(line)[:most]
+    shown = escape_invisible(line)[:most]
     print("\r" + shown.ljust(before), end="", flush=True)
     return len(shown)
 
@@ -147,7 +147,7 @@ def overwrite_lines(lines: list[str], before: int) -> int:
     import shutil
 
     size = shutil.get_terminal_size()
-    shown = [printable(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
+    shown = [escape_invisible(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
     text = ""
     if before:
         text = f"\x1b[{before}A"  # moves the cursor up

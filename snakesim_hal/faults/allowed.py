@@ -10,9 +10,9 @@ from typing import Protocol
 from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import HAL
-from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.fault_plan import parse_planned
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Question, Session
+from snakesim_hal.network.session import Query, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, Description, LifecycleState
 
@@ -23,16 +23,16 @@ class Faults(Protocol):
     """The injected faults of one part. The part's own thread makes every call, once in each cycle of its loop."""
 
     @property
-    def on(self) -> Sequence[str]:
+    def active(self) -> Sequence[str]:
         """Return the active faults as texts."""
         ...
 
     @property
-    def noted(self) -> Sequence[str]:
+    def notes(self) -> Sequence[str]:
         """Return the begin and the end of each fault as texts, with the tick."""
         ...
 
-    def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
+    def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
         """Begin and end the faults that are due at a tick, answer requests, and hang if a fault says so.
 
         Args:
@@ -45,7 +45,7 @@ class Faults(Protocol):
         """
         ...
 
-    def idle(self) -> None:
+    def answer_requests(self) -> None:
         """Answer requests while no tick comes."""
         ...
 
@@ -57,8 +57,8 @@ class Faults(Protocol):
 class NoFaults:
     """Refuses every request."""
 
-    on: Sequence[str] = ()
-    noted: Sequence[str] = ()
+    active: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
     def __init__(self, part: str, config: RunConfig, session: Session) -> None:
         """Declare the part's key for requests.
@@ -66,28 +66,28 @@ class NoFaults:
         Raises:
             ConfigError: the run plans a fault of this part.
         """
-        if any(injection.part == part for injection in planned(config)):
+        if any(injection.part == part for injection in parse_planned(config)):
             raise ConfigError(f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out")
         self._lifecycle: LifecycleState = "disarmed"
-        session.on_question(keys.fault(part), self._refuse)
+        session.on_query(keys.fault_key(part), self._refuse)
 
-    def turn(self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
+    def update(self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
         self._lifecycle = lifecycle
         return ()
 
-    def idle(self) -> None:
+    def answer_requests(self) -> None:
         """Do nothing: Zenoh's thread refuses requests as they arrive."""
 
     def close(self) -> None:
         """Do nothing: no message is delayed."""
 
-    def _refuse(self, question: Question) -> None:
+    def _refuse(self, question: Query) -> None:
         """Refuse a request, in Zenoh's thread."""
         why = f"fault injection is not allowed: {HOW_TO_ALLOW}"
         question.reply(Answer(ok=False, reason=why, refusal="not_allowed", lifecycle=self._lifecycle))
 
 
-def faults_of_host(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, Faults]:
+def create_host_faults(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, Faults]:
     """Return the backend that the host should use, and the faults of the host.
 
     Raises:
@@ -101,7 +101,7 @@ def faults_of_host(config: RunConfig, backend: Backend, session: Session) -> tup
     return faults.backend, faults
 
 
-def faults_of_service(
+def create_service_faults(
     name: str, config: RunConfig, session: Session, robot: Description, newest: Callable[[], Clock | None]
 ) -> Faults:
     """Return the faults of a service.

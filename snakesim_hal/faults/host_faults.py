@@ -23,11 +23,11 @@ class HostFaults(Injector):
         self._tick = 0
         super().__init__(HAL, config, session, carry_out=self.backend.inject)
 
-    def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
+    def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """Keep the tick for the record, then do what every part does."""
         self._tick = timestamp_ns // self._period_ns
-        return super().turn(timestamp_ns, arm_session, lifecycle)
+        return super().update(timestamp_ns, arm_session, lifecycle)
 
     def _note(self, text: str, now_s: float) -> None:
-        if len(self.noted) < MAX_NOTES:
-            self.noted.append(f"tick {self._tick}: {text}")
+        if len(self.notes) < MAX_NOTES:
+            self.notes.append(f"tick {self._tick}: {text}")

@@ -17,10 +17,10 @@ import msgspec
 from snakesim_hal.base.errors import BackendError, ConfigError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.faults.message_faults import MessageFaults
-from snakesim_hal.model.fault_kinds import Change, Injection, Plan, checked
-from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.fault_kinds import Change, Injection, InjectionPlan, check_injection
+from snakesim_hal.model.fault_plan import parse_planned
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Question, Session
+from snakesim_hal.network.session import Query, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
@@ -71,27 +71,27 @@ class Injector:
         self._carry_out = carry_out
         self._newest = newest
         self._print_note = note
-        self.noted: list[str] = []  # the host's have their tick
+        self.notes: list[str] = []  # the host's have their tick
         # Faults.
-        self._planned = Plan(injection for injection in planned(config) if injection.part == part)
+        self._planned = InjectionPlan(injection for injection in parse_planned(config) if injection.part == part)
         self._refused: list[str] = []  # planned, and not possible; reported by the next `turn`
         self._ends: list[tuple[float, Injection]] = []  # robot time in s at which each requested fault ends
         self._active: dict[tuple[str, str], Injection] = {}  # by kind and target
         # Requests.
         self._decoder = Decoder(FaultRequest)
-        self._questions: SimpleQueue[Question] = SimpleQueue()
+        self._questions: SimpleQueue[Query] = SimpleQueue()
         # The robot.
         self._first_armed_s: float | None = None
         self._lifecycle: LifecycleState = "disarmed"
         self._has_ticked = False
-        session.on_question(keys.fault(part), self._questions.put)
+        session.on_query(keys.fault_key(part), self._questions.put)
 
     @property
-    def on(self) -> list[str]:
+    def active(self) -> list[str]:
         """Return the active injected faults as texts."""
         return [str(injection) for injection in self._active.values()]
 
-    def turn(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
+    def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """Begin and end the faults that are due at a tick, answer requests, and hang if a fault says so.
 
         Args:
@@ -107,7 +107,7 @@ class Injector:
         if arm_session and self._first_armed_s is None:
             self._first_armed_s = now_s
             if not self._has_ticked:  # restarted while the robot was armed
-                self._planned = Plan()
+                self._planned = InjectionPlan()
         self._has_ticked = True
         self._apply_changes(now_s)
         if self._hangs():
@@ -116,7 +116,7 @@ class Injector:
         self._refused = []
         return refused
 
-    def idle(self) -> None:
+    def answer_requests(self) -> None:
         """Answer requests while no tick comes."""
         self._answer_all(self._newest_s(0.0))
 
@@ -177,7 +177,7 @@ class Injector:
             answer = self._answer_question(question, now_s)
             question.reply(msgspec.structs.replace(answer, lifecycle=self._lifecycle))
 
-    def _answer_question(self, question: Question, now_s: float) -> Answer:
+    def _answer_question(self, question: Query, now_s: float) -> Answer:
         """Decode a request and carry it out; every error becomes a refusal."""
         try:
             request = self._decoder.decode(question.payload, question.encoding)
@@ -195,7 +195,9 @@ class Injector:
         """
         start_s = self._since_arming_s(now_s)
         duration_s = NEVER_S if request.for_s is None else request.for_s
-        injection = checked(Injection(request.kind, request.target, start_s, start_s + duration_s, request.amount))
+        injection = check_injection(
+            Injection(request.kind, request.target, start_s, start_s + duration_s, request.amount)
+        )
         name = f"{injection.kind} of {injection.target}"
         if injection.part != self.part:
             return _refuse(f"{name} is carried out by {injection.part}", refusal="wrong_part")
@@ -210,7 +212,7 @@ class Injector:
         name = f"{injection.kind} of {injection.target}"
         active = self._active.get((injection.kind, injection.target))
         if active is None:
-            names = ", ".join(self.on) or "nothing"
+            names = ", ".join(self.active) or "nothing"
             return _refuse(f"{name} is not active; active: {names}", refusal="wrong_state")
         self._end(active, now_s)
         return Answer(ok=True, reason=f"{name} has ended")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.host.outbox import Sender
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.safety.cables import TURN_RAD, CableJoint, Cables
@@ -33,7 +33,7 @@ NO_STOPS = (
 )
 
 
-class KeptCable(msgspec.Struct, frozen=True, kw_only=True):
+class StoredCable(msgspec.Struct, frozen=True, kw_only=True):
     """The stored state of one joint."""
 
     angle_rad: float  # counted
@@ -78,45 +78,45 @@ class CableFile:
         self.cables = Cables(wanted, seen_rad, unknown)
         self._writer = Sender("cables")
 
-    def take(self, joints: JointState) -> None:
+    def update(self, joints: JointState) -> None:
         """Count on with a joint state, and store the angles when that is due."""
-        self.cables.take(joints)
-        self._keep(self.cables.to_keep())
+        self.cables.follow(joints)
+        self._keep(self.cables.take_angles_to_save())
 
     def close(self) -> None:
         """Store the present angles, and wait for the disk unless it hangs."""
-        self._keep(self.cables.to_keep(all_of_it=True))
+        self._keep(self.cables.take_angles_to_save(all_of_it=True))
         self._writer.close()
 
     def _keep(self, angles_rad: dict[str, float] | None) -> None:
         if angles_rad is not None:
-            self._writer.do(partial(self._write, angles_rad))
+            self._writer.queue(partial(self._write, angles_rad))
 
     def _write(self, angles_rad: dict[str, float]) -> None:
         """Write the file, in the `Sender` thread."""
-        content: dict[str, KeptCable] = {}
+        content: dict[str, StoredCable] = {}
         for name, (drive, unwound) in self._owners.items():
             angle_rad = angles_rad.get(name)
             if angle_rad is not None:
-                content[name] = KeptCable(angle_rad=round(angle_rad, 4), drive=drive, unwound=unwound)
+                content[name] = StoredCable(angle_rad=round(angle_rad, 4), drive=drive, unwound=unwound)
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(self._path, msgspec.json.encode(content), durable=True)
-            self.cables.not_kept = ""
+            write_atomically(self._path, msgspec.json.encode(content), durable=True)
+            self.cables.save_problem = ""
         except OSError as error:
-            self.cables.not_kept = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
+            self.cables.save_problem = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
 
-    def _read(self) -> Mapping[str, KeptCable] | str:
+    def _read(self) -> Mapping[str, StoredCable] | str:
         """Return the stored joints by name, or the reason why there are none."""
         try:
-            return msgspec.json.decode(self._path.read_bytes(), type=dict[str, KeptCable])
+            return msgspec.json.decode(self._path.read_bytes(), type=dict[str, StoredCable])
         except FileNotFoundError:
             return f"no host before this one has kept it in {self._path}"
         except (OSError, *UNDECODABLE):
             return f"{self._path} cannot be read"
 
 
-def kept_at(folder: Path, joints: Sequence[Joint], robot: Description) -> CableFile | None:
+def open_cable_file(folder: Path, joints: Sequence[Joint], robot: Description) -> CableFile | None:
     """Return the file of a robot; None if it has no joints without end stops, or if nothing real moves."""
     if robot.emulated or all(joint.limits.cable_turns is None and not _goes_round(joint) for joint in joints):
         return None
@@ -128,7 +128,7 @@ def _goes_round(joint: Joint) -> bool:
     return joint.limits.upper_rad - joint.limits.lower_rad > TURN_RAD - END_STOP_RAD
 
 
-def _find_angle(kept: Mapping[str, KeptCable] | str, joint: Joint, owner: str, now_s: float) -> float | str:
+def _find_angle(kept: Mapping[str, StoredCable] | str, joint: Joint, owner: str, now_s: float) -> float | str:
     """Return the angle at which a joint was last stored in rad, or the reason why it is not known."""
     declared = joint.limits.cable_unwound
     if isinstance(kept, str):

@@ -16,7 +16,7 @@ Every step may raise BackendError. The caller decides what follows from it.
 from typing import Generic, Protocol, TypeVar
 
 from snakesim_hal.backend import Backend, Samples
-from snakesim_hal.safety.authority import Decision
+from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Power
 
@@ -37,11 +37,11 @@ class SafetyCore(Protocol):
         """Take the newest power sample."""
         ...
 
-    def expire(self, now_ns: int, tick: int) -> None:
+    def check_deadlines(self, now_ns: int, tick: int) -> None:
         """Turn an expired lease, an implausible joint state and a power fault into faults."""
         ...
 
-    def decide(self, up_to: int | None = None) -> Decision:
+    def decide(self, up_to: int | None = None) -> TickDecision:
         """Return the setpoints of the next period."""
         ...
 
@@ -76,7 +76,7 @@ class ControlCycle(Generic[SafetyCoreT]):
         if isinstance(power, Power):
             self.safety.observe_power(power, now_ns)
 
-    def decide(self, now_ns: int, tick: int, newest_command_tick: int | None = None) -> Decision:
+    def decide(self, now_ns: int, tick: int, newest_command_tick: int | None = None) -> TickDecision:
         """Return the setpoints of the next period.
 
         Args:
@@ -84,10 +84,10 @@ class ControlCycle(Generic[SafetyCoreT]):
             tick: The present tick, which faults are stamped with.
             newest_command_tick: In lockstep, the newest tick whose command counts; None: the newest command counts.
         """
-        self.safety.expire(now_ns, tick)
+        self.safety.check_deadlines(now_ns, tick)
         return self.safety.decide(newest_command_tick)
 
-    def enact(self, decision: Decision) -> None:
+    def enact(self, decision: TickDecision) -> None:
         """Hand the decided setpoints to the motors."""
         self.backend.enact(decision.setpoints, self.safety.state)
 

@@ -16,12 +16,12 @@ from typing import Any, TypeVar
 
 from snakesim_hal.backend import Backend, Injectable, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
-from snakesim_hal.base.step_limit import StepTooLongError, place_of
+from snakesim_hal.base.step_limit import StepTooLongError, describe_interrupted_line
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState
-from snakesim_hal.wire.outgoing import checked, packed
-from snakesim_hal.wire.own_sample import OwnKind, own_kinds
+from snakesim_hal.wire.outgoing import encode_checked, encode_unchecked
+from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
@@ -37,7 +37,9 @@ def _guarded(method: MethodT) -> MethodT:
             raise
         except StepTooLongError as error:
             where = f"{self.name}.{method.__name__}"
-            raise BackendError(f"{where} did not return in time: it was in {place_of(error)}") from error
+            raise BackendError(
+                f"{where} did not return in time: it was in {describe_interrupted_line(error)}"
+            ) from error
         except (Exception, SystemExit) as error:  # third-party code, which must not end the host
             where = f"{self.name}.{method.__name__}"
             raise BackendError(f"{where} failed: {type(error).__name__}: {error}") from error
@@ -53,7 +55,7 @@ class GuardedBackend:
         self._inner = inner
         self.name = type(inner).__name__
         self._sensor_keys: list[str] | None = None  # None: not read yet
-        self._own_kinds: dict[str, OwnKind] = {}  # custom messages, by key
+        self._own_kinds: dict[str, CustomMessage] = {}  # custom messages, by key
 
     @_guarded
     def describe(self) -> Description:
@@ -66,12 +68,12 @@ class GuardedBackend:
         encoded: dict[str, bytes] = {}
         key = keys.JOINTS  # of the message in work, for the error
         try:
-            packed(samples.joints)  # the host judges joint by joint whether the values are plausible
+            encode_unchecked(samples.joints)  # the host judges joint by joint whether the values are plausible
             for key, message in samples.others.items():
                 if key not in self._find_sensor_keys():
                     known = ", ".join(self._find_sensor_keys())
                     raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
-                encoded[key] = checked(key, message, self._own_kinds.get(key))
+                encoded[key] = encode_checked(key, message, self._own_kinds.get(key))
         except WireError as error:
             raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
         return replace(samples, encoded=encoded)
@@ -101,6 +103,6 @@ class GuardedBackend:
         """Return the keys of the described sensors. The description is read at the first call."""
         if self._sensor_keys is None:
             robot = self._inner.describe()
-            self._own_kinds = own_kinds(robot)
+            self._own_kinds = find_custom_messages(robot)
             self._sensor_keys = [sensor.key for sensor in robot.sensors]
         return self._sensor_keys

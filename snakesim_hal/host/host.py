@@ -19,7 +19,7 @@ from math import inf
 import msgspec
 
 from snakesim_hal.backend import Backend, Samples
-from snakesim_hal.base.arithmetic import measured
+from snakesim_hal.base.arithmetic import measure_arithmetic
 from snakesim_hal.base.errors import BackendError, WireError
 from snakesim_hal.faults.allowed import Faults, NoFaults
 from snakesim_hal.host.cable_file import CableFile
@@ -34,13 +34,13 @@ from snakesim_hal.host.participants import Participants
 from snakesim_hal.host.readiness import Readiness
 from snakesim_hal.host.request_handler import Reply, Request, RequestHandler
 from snakesim_hal.host.run_statistics import RunStatistics
-from snakesim_hal.host.status_messages import applied_message
+from snakesim_hal.host.status_messages import make_applied_command
 from snakesim_hal.host.status_reporter import StatusReporter
 from snakesim_hal.host.timing import BackendTime, PublishTimes
 from snakesim_hal.model.fault_kinds import HAL
-from snakesim_hal.model.scenario import RunConfig, written
+from snakesim_hal.model.scenario import RunConfig, encode_config
 from snakesim_hal.network.private_channel import HostEnd, HostMessage
-from snakesim_hal.network.run_key import own_run_key, proven
+from snakesim_hal.network.run_key import add_proof, own_run_key
 from snakesim_hal.network.session import Session
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.run_log.host_record import Ending
@@ -116,8 +116,10 @@ class Host:
         self._latch = options.latch or EstopLatch(None)
         starter = options.starter or HostEnd(None)
 
-        description = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8), arithmetic=measured())
-        self.description: Description = proven(description, own_run_key())
+        description = msgspec.structs.replace(
+            backend.describe(), host=secrets.token_hex(8), arithmetic=measure_arithmetic()
+        )
+        self.description: Description = add_proof(description, own_run_key())
         self.black_box = BlackBox(self.description)
         self._state = HostState(
             config=config,
@@ -145,13 +147,15 @@ class Host:
         self._ended_ns = 0
 
         self._restore_estop()
-        self._outbox = Outbox(session, self.description, written(config), lockstep=config.clock_mode == "lockstep")
+        self._outbox = Outbox(
+            session, self.description, encode_config(config), lockstep=config.clock_mode == "lockstep"
+        )
         readiness = Readiness(config, self._state.participants, session)
         self._status = StatusReporter(self._state, readiness, self._outbox, starter, options.realtime_warnings)
         self._requests = RequestHandler(self._state, readiness, self._status, self._latch, self._outbox)
         self._inbox = Inbox(session, self, config.services, self._outbox.answer)
         self._network_watch = NetworkWatch(self._state, session, self._outbox)
-        starter.say(HostMessage(description=self.description))
+        starter.send(HostMessage(description=self.description))
         starter.serve(self.submit_request)
 
     # --- for the process that runs the host ------------------------------------------------------------------
@@ -268,9 +272,9 @@ class Host:
     def _inject_faults(self) -> None:
         """Begin and end the injected faults that are due, where faults are allowed."""
         state = self._state
-        refusals = state.faults.turn(state.clock.timestamp_ns, state.authority.arm_session, state.authority.state)
+        refusals = state.faults.update(state.clock.timestamp_ns, state.authority.arm_session, state.authority.state)
         for refusal in refusals:
-            state.authority.note(Fault(tick=state.clock.tick, what="injection_refused", cause=refusal))
+            state.authority.record_fault(Fault(tick=state.clock.tick, what="injection_refused", cause=refusal))
 
     def _sample(self, last: Samples | None) -> Samples | None:
         """Return the samples of this tick; None when the backend failed. At tick 0 the same samples are used again."""
@@ -283,7 +287,7 @@ class Host:
         except BackendError as error:
             self._on_backend_failure(error)
             return None
-        took_ns = self._state.backend_time.read(started_ns)
+        took_ns = self._state.backend_time.record_read(started_ns)
         if self.authority.state == "armed":
             self.statistics.times.read.add(took_ns / 1000)
         return samples
@@ -291,7 +295,7 @@ class Host:
     def _publish_samples(self, samples: Samples) -> None:
         """Publish all samples of this tick, and then the clock."""
         clock = self._state.clock
-        outgoing: list[Outgoing] = [(keys.JOINTS, self.authority.readable(samples.joints), None)]
+        outgoing: list[Outgoing] = [(keys.JOINTS, self.authority.replace_unreadable(samples.joints), None)]
         for key, message in samples.others.items():
             outgoing.append((key, message, samples.encoded[key]))
         for key, _, _ in outgoing:
@@ -301,8 +305,8 @@ class Host:
 
         clock_message = self._clock_message(clock.tick)
         self._published_arm_session = self.authority.arm_session
-        self._published.put(clock.tick, clock.safety_ns(), time.monotonic_ns())
-        self._outbox.put(*outgoing, (keys.CLOCK, clock_message, None))
+        self._published.record(clock.tick, clock.safety_ns(), time.monotonic_ns())
+        self._outbox.publish(*outgoing, (keys.CLOCK, clock_message, None))
 
     def _clock_message(self, tick: int, *, paused: bool = False) -> Clock:
         clock = self._state.clock
@@ -329,7 +333,7 @@ class Host:
         """Let the safety core judge new samples, before any answer to them is handled; services compute meanwhile."""
         now_ns = self._state.clock.safety_ns()
         if self._options.cables is not None:
-            self._options.cables.take(samples.joints)
+            self._options.cables.update(samples.joints)
         self._cycle.observe(samples, now_ns)
 
     def _finish_tick(self, samples: Samples) -> None:
@@ -351,11 +355,11 @@ class Host:
         started_ns = time.monotonic_ns()
         try:
             self._cycle.enact(decision)
-            self._outbox.put((keys.APPLIED, applied_message(self.description, clock.tick, decision), None))
+            self._outbox.publish((keys.APPLIED, make_applied_command(self.description, clock.tick, decision), None))
             self._cycle.advance()
         except BackendError as error:
             self._on_backend_failure(error)
-        took_ns = state.backend_time.written(started_ns)
+        took_ns = state.backend_time.record_write(started_ns)
         if self.authority.state == "armed":
             self.statistics.times.write.add(took_ns / 1000)
 
@@ -390,12 +394,12 @@ class Host:
 
     def _is_paused(self) -> bool:
         """Return whether the next tick has to wait. Tick 0 of lockstep is shown also in a pause."""
-        return self._state.clock.simulated.stands and not self._awaits_first_arming()
+        return self._state.clock.simulated.is_paused and not self._awaits_first_arming()
 
     def _wait_while_paused(self) -> None:
         """Show that the host is there, and handle input. Physics and robot time do not advance."""
         if self._published.last_tick is not None:
-            self._outbox.put((keys.CLOCK, self._clock_message(self._published.last_tick, paused=True), None))
+            self._outbox.publish((keys.CLOCK, self._clock_message(self._published.last_tick, paused=True), None))
         self._status.publish()
         self._tick_began_ns = None
         until_ns = time.monotonic_ns() + PAUSED_PERIOD_NS
@@ -421,10 +425,10 @@ class Host:
         state = self._state
         clock = state.clock
         write_ns = WRITE_MARGIN_FACTOR * state.backend_time.write_ns + WRITE_MARGIN_NS
-        give_up_ns = clock.deadlines.of(clock.tick + 1) - write_ns
+        give_up_ns = clock.deadlines.start_ns(clock.tick + 1) - write_ns
         if clock.simulated.speed > 1.0 and self.authority.state == "armed":
             # If need be, a faster robot waits as long as one at speed 1.
-            give_up_ns = max(give_up_ns, self._published.of(clock.tick)[1] + clock.period_ns)
+            give_up_ns = max(give_up_ns, self._published.times_of_tick(clock.tick)[1] + clock.period_ns)
         while state.newest_answered_tick < clock.tick and not state.ending.requested:
             left_ns = give_up_ns - time.monotonic_ns()
             if left_ns <= 0 or not self._inbox.handle_next(left_ns * 1e-9):
@@ -453,7 +457,7 @@ class Host:
         tick = self._state.clock.tick
         self.participants[service].given_up = True
         cause = f"{service} is {self._config.stall_limit_s:g} s late with tick {tick}; no longer waited for"
-        self.authority.note(Fault(tick=tick, what="service_stalled", cause=cause))
+        self.authority.record_fault(Fault(tick=tick, what="service_stalled", cause=cause))
 
     def _wait_for_next_tick(self) -> None:
         """Wait in real time until the next tick is due, and count how this one kept time."""
@@ -461,7 +465,7 @@ class Host:
         is_armed = self.authority.state == "armed"
         late_ns: int | None = None
         if clock.clock_mode == "realtime":
-            due_ns = clock.deadlines.of(clock.tick)
+            due_ns = clock.deadlines.start_ns(clock.tick)
             if clock.deadlines.missed(clock.tick):
                 self.statistics.overruns += is_armed
             else:
@@ -483,9 +487,9 @@ class Host:
         state = self._state
         if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arm_session(command):
             self.on_done(self.authority.lease.holder, command.tick)
-        published_safety_ns, published_ns = self._published.of(command.tick)
+        published_safety_ns, published_ns = self._published.times_of_tick(command.tick)
         now_ns = state.clock.safety_ns(monotonic_ns)
-        refusal = self.authority.offer(
+        refusal = self.authority.offer_command(
             command, now_ns=now_ns, tick=state.clock.tick, age_ns=now_ns - published_safety_ns
         )
         if refusal is None and command.tick > state.newest_answered_tick:
@@ -496,11 +500,11 @@ class Host:
     def on_done(self, service: str | None, tick: int) -> None:
         """Note that a service has completed a tick."""
         if tick <= self._state.clock.tick:
-            self.participants.delivered(service, tick)
+            self.participants.mark_done(service, tick)
 
     def on_undecodable(self, error: WireError) -> Answer:
         """Count a message that cannot be decoded, and return the answer for the case that it was a query."""
-        self.authority.reject(error.reason)
+        self.authority.count_rejection(error.reason)
         return self._state.answer(ok=False, reason=str(error), refusal=error.reason)
 
     def on_request(self, request: Request, reply: Reply) -> None:
@@ -510,23 +514,23 @@ class Host:
     def on_presence(self, service: str, present: bool) -> None:
         """Note that a service's liveliness token has appeared or vanished."""
         if present:
-            self.participants.came(service)
+            self.participants.mark_present(service)
             return
-        if not self.participants.went(service):
+        if not self.participants.mark_absent(service):
             return
         is_holder = self.authority.lease.holder == service
         if self.authority.arm_session and not self._state.ending.requested:
             cause = f"{service} is gone: its process ended or its connection broke"
             fault = Fault(tick=self._state.clock.tick, what="service_lost", cause=cause)
-            self.authority.note(fault, precedes_stop=self.authority.state == "armed" and is_holder)
+            self.authority.record_fault(fault, precedes_stop=self.authority.state == "armed" and is_holder)
         if is_holder:
-            self.authority.holder_gone(f"{service} is gone")
+            self.authority.on_holder_gone(f"{service} is gone")
 
     # --- faults and the end ----------------------------------------------------------------------------------
 
     def _restore_estop(self) -> None:
         """Begin in `estop` if an earlier host of this robot was stopped and the stop was not cleared."""
-        latched = self._latch.found
+        latched = self._latch.left_by_earlier_host
         if latched is not None:
             request = EstopRequest(who=f"{latched.who[:40]}, before this host")
             self.authority.on_estop(request, max(latched.tick, 0))
@@ -562,7 +566,7 @@ class Host:
         elif max_ticks is not None and not self._options.stay and self.black_box.ticks >= max_ticks:
             ending.request("failed", "the time was over before the requested armed time was reached")
         elif self._has_rested_after_fault():
-            ending.request("failed", self.authority.why)
+            ending.request("failed", self.authority.reason)
         return ending.requested
 
     def _has_rested_after_fault(self) -> bool:

@@ -14,7 +14,7 @@ from typing import Protocol
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.host.request_handler import Reply, Request
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, Question, Session
+from snakesim_hal.network.session import Arrival, Query, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (
@@ -86,7 +86,7 @@ class _Done:
 
     def deliver(self, receiver: Receiver) -> None:
         done = self.decoder.decode(self.arrival.payload, self.arrival.encoding)
-        receiver.on_done(keys.service_of(self.arrival.key), done.tick)
+        receiver.on_done(keys.parse_service(self.arrival.key), done.tick)
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,9 @@ class _LocalRequest:
 class _Query:
     """A request that came over Zenoh."""
 
-    question: Question
+    question: Query
     decoder: Decoder[LeaseRequest] | Decoder[LifecycleRequest] | Decoder[EstopRequest] | Decoder[SimulatorRequest]
-    send_answer: Callable[[Question, Answer], None]
+    send_answer: Callable[[Query, Answer], None]
 
     def deliver(self, receiver: Receiver) -> None:
         try:
@@ -134,7 +134,7 @@ class Inbox:
         session: Session,
         receiver: Receiver,
         services: Collection[str],
-        send_answer: Callable[[Question, Answer], None],
+        send_answer: Callable[[Query, Answer], None],
     ) -> None:
         """Declare all subscriptions of the host.
 
@@ -158,7 +158,7 @@ class Inbox:
         session.on_urgent_arrival(keys.DONE_ALL, lambda arrival: self._put_sample(_Done(arrival, done_decoder)))
 
         estop_decoder = Decoder(EstopRequest)
-        session.on_question(
+        session.on_query(
             keys.ESTOP,
             lambda question: self._lanes.put(_Query(question, estop_decoder, send_answer), STOPS),
         )
@@ -167,7 +167,7 @@ class Inbox:
             (keys.LIFECYCLE, Decoder(LifecycleRequest)),
             (keys.SIMULATOR, Decoder(SimulatorRequest)),
         ):
-            session.on_question(
+            session.on_query(
                 key,
                 lambda question, decoder=decoder: self._put_request(_Query(question, decoder, send_answer)),
             )
@@ -224,6 +224,6 @@ class Inbox:
         self._lanes.put(item, SAMPLES)
 
     def _put_presence(self, key: str, present: bool) -> None:
-        service = keys.service_of(key)
+        service = keys.parse_service(key)
         if service in self._services:
             self._lanes.put(_Presence(service, present), PRESENCE)

@@ -16,7 +16,7 @@ from queue import SimpleQueue
 
 import msgspec
 
-from snakesim_hal.base.atomic_write import sync_folder, write_whole
+from snakesim_hal.base.atomic_write import sync_folder, write_atomically
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.workers import start_worker
 from snakesim_hal.network.local_registry import state_folder
@@ -44,8 +44,10 @@ class EstopLatch:
             folder: of the file; None: no file, the latch lives as long as the host.
         """
         self._path = None if folder is None else folder / ESTOP
-        self.found = None if self._path is None else _read(self._path)  # left by an earlier host
-        self._is_stored = self.found is not None and self.found.tick >= 0  # False: the file cannot be read
+        self.left_by_earlier_host = None if self._path is None else _read(self._path)  # left by an earlier host
+        self._is_stored = (
+            self.left_by_earlier_host is not None and self.left_by_earlier_host.tick >= 0
+        )  # False: the file cannot be read
         # Queues of the two threads; None ends them.
         self._requests: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._unanswered: SimpleQueue[_Once | None] = SimpleQueue()
@@ -94,7 +96,7 @@ class EstopLatch:
             return
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(self._path, msgspec.json.encode(latched), durable=True)
+            write_atomically(self._path, msgspec.json.encode(latched), durable=True)
             self._is_stored = True
             then(None)
         except OSError as error:
@@ -124,12 +126,12 @@ def _read(path: Path) -> Latched | None:
         return Latched(who=f"unknown ({ESTOP} cannot be read)", tick=-1)
 
 
-def stops_kept() -> list[Path]:
+def find_latched_stops() -> list[Path]:
     """Return the file of every emergency stop that is latched on this computer, for this user."""
     return sorted((state_folder() / "robots").glob(f"*/{ESTOP}"))
 
 
-def forget_stop(path: Path) -> str:
+def remove_latched_stop(path: Path) -> str:
     """Remove the latched stop of a robot whose host does not run, and return a description of it.
 
     Raises:
@@ -159,7 +161,7 @@ class _Once:
             self._then(failure)
 
 
-def replying(reply: Callable[[Answer], None], answer: Answer) -> Callable[[str | None], None]:
+def make_reply(reply: Callable[[Answer], None], answer: Answer) -> Callable[[str | None], None]:
     """Return a `then` for the latch that sends an answer, together with the reason if the stop is not stored."""
 
     def on_stored(failure: str | None) -> None:

@@ -22,19 +22,19 @@ class NetworkWatch:
 
     def note_problems(self) -> None:
         """Record each problem once, when it begins."""
-        is_held_up = self._can_be_held_up and self._outbox.held_up_s() * 1e9 > self._state.config.lease_ns
+        is_held_up = self._can_be_held_up and self._outbox.blocked_s() * 1e9 > self._state.config.lease_ns
         if not (is_held_up or self._other_hosts or self._noted_causes):
             return
         problems = {f"another HAL host has this robot's name: {host}": "second_host" for host in set(self._other_hosts)}
         if is_held_up:
             problems["the network accepts no message: it is congested, or under attack"] = "network_held_up"
         for cause in problems.keys() - self._noted_causes:
-            self._state.authority.note(Fault(tick=self._state.clock.tick, what=problems[cause], cause=cause))
+            self._state.authority.record_fault(Fault(tick=self._state.clock.tick, what=problems[cause], cause=cause))
         self._noted_causes = set(problems)
 
     def _on_host_presence(self, key: str, present: bool) -> None:
         """Runs in a Zenoh thread: a host process of this robot's name has appeared or vanished."""
-        host = keys.service_of(key)
+        host = keys.parse_service(key)
         if host == self._own_host:
             return
         if present:

@@ -15,7 +15,7 @@ from typing import Any
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Publisher, Question, Session
+from snakesim_hal.network.session import Publisher, Query, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
@@ -38,11 +38,11 @@ class Sender:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def do(self, action: Callable[[], None]) -> None:
+    def queue(self, action: Callable[[], None]) -> None:
         """Queue an action; never waits."""
         self._waiting.put(action)
 
-    def held_up_s(self) -> float:
+    def busy_s(self) -> float:
         """Return for how long the present action has been running; 0 if there is none."""
         began_ns = self._began_ns  # read once: the sender's thread changes it
         if not began_ns:
@@ -84,7 +84,7 @@ class Outbox:
         # Threads. Without a camera, no thread for images is needed.
         self._streams = Sender("streams")
         self._answers = Sender("answers")
-        has_camera = any(keys.message_at(sensor.key) in IMAGES for sensor in description.sensors)
+        has_camera = any(keys.find_message(sensor.key) in IMAGES for sensor in description.sensors)
         self._images = Sender("images", IMAGES_WAITING_LIMIT) if has_camera else self._streams
         # Latched messages and liveliness tokens.
         session.latched_publisher(keys.DESCRIPTION, Description).put(description)
@@ -93,9 +93,9 @@ class Outbox:
             session.latched_publisher(keys.CONFIG, Configuration).put(effective)
         session.declare_alive(HAL)
         if description.host is not None:
-            session.declare_token(keys.host(description.host))
+            session.declare_token(keys.host_key(description.host))
 
-    def put(self, *messages: Outgoing) -> None:
+    def publish(self, *messages: Outgoing) -> None:
         """Publish messages in this order. In real time images have a thread of their own, because they take long."""
         if self._lockstep:
             self._publish(messages)
@@ -103,25 +103,25 @@ class Outbox:
         if self._images is not self._streams:
             images = [outgoing for outgoing in messages if isinstance(outgoing[1], IMAGES)]
             if images:
-                self._images.do(lambda: self._publish(images))
+                self._images.queue(lambda: self._publish(images))
                 messages = tuple(outgoing for outgoing in messages if outgoing not in images)
-        self._streams.do(lambda: self._publish(messages))
+        self._streams.queue(lambda: self._publish(messages))
 
     def _publish(self, messages: Sequence[Outgoing]) -> None:
         for key, message, encoded in messages:
             self._publisher(key, type(message)).put(message, encoded)
 
-    def answer(self, question: Question, answer: Answer) -> None:
+    def answer(self, question: Query, answer: Answer) -> None:
         """Answer a query. The requester may be slow."""
-        self._answers.do(lambda: question.reply(answer))
+        self._answers.queue(lambda: question.reply(answer))
 
     def log(self, text: str) -> None:
         """Write a line to the process's log. A disk may be slow."""
-        self._answers.do(lambda: print_stderr(text))
+        self._answers.queue(lambda: print_stderr(text))
 
-    def held_up_s(self) -> float:
+    def blocked_s(self) -> float:
         """Return for how long the network has been blocked, in s."""
-        return self._streams.held_up_s()
+        return self._streams.busy_s()
 
     def close(self) -> None:
         """Send queued messages for at most FLUSH_S."""

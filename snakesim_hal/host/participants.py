@@ -36,7 +36,7 @@ class Participants(dict[str, Participant]):
         """Return the services for which the end of `tick` has to wait."""
         return [name for name, participant in self.items() if participant.behind(tick)]
 
-    def awaited(self, tick: int) -> str:
+    def describe_awaited(self, tick: int) -> str:
         """Return, as text, which service's answer to which tick the end of `tick` has to wait for."""
         answers: list[str] = []
         for name in self.behind(tick):
@@ -61,20 +61,20 @@ class Participants(dict[str, Participant]):
         """Return the connected services, sorted by name."""
         return sorted(name for name, participant in self.items() if participant.present)
 
-    def delivered(self, service: str | None, tick: int) -> None:
+    def mark_done(self, service: str | None, tick: int) -> None:
         """Note that a service has published all its output for a tick."""
         participant = self.get(service or "")
         if participant is not None:
             participant.done_tick = max(participant.done_tick, tick)
 
-    def came(self, service: str) -> None:
+    def mark_present(self, service: str) -> None:
         """Note that a service's liveliness token has appeared."""
         participant = self.get(service)
         if participant is not None:
             participant.present = True
             participant.given_up = False
 
-    def went(self, service: str) -> bool:
+    def mark_absent(self, service: str) -> bool:
         """Note that a service's token has vanished. Returns whether it is a service of the run."""
         participant = self.get(service)
         if participant is None:

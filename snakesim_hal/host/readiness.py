@@ -1,7 +1,7 @@
 """Which services a host waits for before it can be armed."""
 
 from snakesim_hal.host.participants import Participants
-from snakesim_hal.host.status_messages import waiting_for
+from snakesim_hal.host.status_messages import describe_wait
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
 from snakesim_hal.network.session import Session
@@ -23,9 +23,9 @@ class Readiness:
 
     def differing_processes(self) -> list[str]:
         """Return how the processes of awaited services differ from this host, or lack a description."""
-        return self._processes.against(self._own_entry, self._participants)
+        return self._processes.find_problems(self._own_entry, self._participants)
 
     def describe_missing(self, services: list[str]) -> list[str]:
         """Return one text per missing service, with the messages that it has not received."""
         missing_keys = self._processes.waits()
-        return [waiting_for(service, missing_keys.get(service, ())) for service in services]
+        return [describe_wait(service, missing_keys.get(service, ())) for service in services]

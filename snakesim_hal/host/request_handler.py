@@ -5,7 +5,7 @@ from collections.abc import Callable
 import msgspec
 
 from snakesim_hal.host.host_state import HostState
-from snakesim_hal.host.latch import EstopLatch, replying
+from snakesim_hal.host.latch import EstopLatch, make_reply
 from snakesim_hal.host.outbox import Outbox
 from snakesim_hal.host.readiness import Readiness
 from snakesim_hal.host.simulated_time import Refusal
@@ -75,12 +75,12 @@ class RequestHandler:
         answer = self._with_host(answer)
         self._log_request(request, answer)
         self._status.publish()
-        self._latch.engage(request.who, tick, replying(reply, answer))
+        self._latch.engage(request.who, tick, make_reply(reply, answer))
 
     def _handle_lease(self, request: LeaseRequest, reply: Reply) -> None:
         state = self._state
         now_ns = state.clock.safety_ns()
-        state.authority.expire(now_ns, state.clock.tick)  # first, because an expired lease is a fault
+        state.authority.check_deadlines(now_ns, state.clock.tick)  # first, because an expired lease is a fault
         answer = state.authority.on_lease(request, now_ns)
         self._status.publish()
         reply(self._with_host(answer))
@@ -108,13 +108,13 @@ class RequestHandler:
         self._log_request(request, answer)
         self._status.publish()
         if isinstance(request, LifecycleRequest) and request.action == "clear" and answer.ok:
-            self._latch.release(replying(reply, answer))
+            self._latch.release(make_reply(reply, answer))
         else:
             reply(answer)
 
     def _change_simulated_time(self, request: SimulatorRequest) -> Answer:
         state = self._state
-        outcome = state.clock.simulated.take(request, state.clock.tick)
+        outcome = state.clock.simulated.carry_out(request, state.clock.tick)
         if isinstance(outcome, Refusal):
             return state.answer(ok=False, reason=outcome.why, refusal=outcome.word)
 

@@ -42,13 +42,13 @@ class SimulatedTime:
         self.paused_by: str | None = None
         self._steps = 0  # ticks until it pauses again
         # As measured.
-        self.factor: float | None = None  # robot time per wall time, while it passes
+        self.real_time_factor: float | None = None  # robot time per wall time, while it passes
         self._measured_since = (clock(), 0)  # monotonic ns, tick
         # Where the present rate of safety time began.
         self._base = (0, 0, 0)  # safety ns, monotonic ns, tick
 
     @property
-    def stands(self) -> bool:
+    def is_paused(self) -> bool:
         """Return whether robot time is paused: no tick begins."""
         return self.paused_by is not None and self._steps == 0
 
@@ -63,14 +63,14 @@ class SimulatedTime:
         if self._clock_mode == "lockstep":
             return tick * period_ns
         since_ns, since_monotonic_ns, since_tick = self._base
-        if self.stands:
+        if self.is_paused:
             return since_ns
         if self.speed != 1.0:
             return since_ns + (tick - since_tick) * period_ns
         at_ns = monotonic_ns or self._clock()
         return since_ns + max(at_ns - since_monotonic_ns, 0)
 
-    def take(self, request: SimulatorRequest, tick: int) -> str | Refusal:
+    def carry_out(self, request: SimulatorRequest, tick: int) -> str | Refusal:
         """Carry out a request at a tick. The caller carries out a `reset`.
 
         Returns:
@@ -125,17 +125,17 @@ class SimulatedTime:
             self._rebase(tick)  # before it pauses, because safety time passes until now
         self._steps = max(self._steps - 1, 0)
 
-    def slow(self) -> list[str]:
+    def find_slowness(self) -> list[str]:
         """Return a text that the wanted speed is not reached; empty if it is, or if no other speed than 1 is wanted."""
-        if self.speed == 1.0 or self.factor is None or self.factor >= MIN_SPEED_RATIO * self.speed:
+        if self.speed == 1.0 or self.real_time_factor is None or self.real_time_factor >= MIN_SPEED_RATIO * self.speed:
             return []
-        return [f"speed {self.speed:g} is wanted, {self.factor:.2g} reached"]
+        return [f"speed {self.speed:g} is wanted, {self.real_time_factor:.2g} reached"]
 
     def _rebase(self, tick: int) -> None:
         """Begin another rate of safety time, and another measurement, at this tick."""
         now_ns = self._clock()
         self._base = (self.safety_ns(tick, now_ns), now_ns, tick)
-        self.factor = None
+        self.real_time_factor = None
         self._measured_since = (now_ns, tick)
 
     def _measure_factor(self, tick: int) -> None:
@@ -143,5 +143,5 @@ class SimulatedTime:
         now_ns = self._clock()
         since_ns, since_tick = self._measured_since
         if now_ns - since_ns >= MEASURED_OVER_NS:
-            self.factor = (tick - since_tick) * self._description.period_ns / (now_ns - since_ns)
+            self.real_time_factor = (tick - since_tick) * self._description.period_ns / (now_ns - since_ns)
             self._measured_since = (now_ns, tick)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from snakesim_hal.safety.authority import Decision
+from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description
 
@@ -10,7 +10,7 @@ from snakesim_hal.wire.messages import AppliedCommand, Description
 WAYS_OUT = {keys.POSE: "mission.localization=dead_reckoning does without, and so does a robot without [sensors.pose]"}
 
 
-def applied_message(description: Description, tick: int, decision: Decision) -> AppliedCommand:
+def make_applied_command(description: Description, tick: int, decision: TickDecision) -> AppliedCommand:
     """Return the message with the applied setpoints of a tick."""
     setpoints = decision.setpoints
     return AppliedCommand(
@@ -24,7 +24,7 @@ def applied_message(description: Description, tick: int, decision: Decision) -> 
     )
 
 
-def waiting_for(service: str, lacks: Sequence[str]) -> str:
+def describe_wait(service: str, lacks: Sequence[str]) -> str:
     """Return the text that the host waits for a service, and which messages the service is missing."""
     if not lacks:
         return f"waiting for {service}"

@@ -63,8 +63,8 @@ class StatusReporter:
         self._published_mark = mark
         self._due_ns = now_ns + STATUS_PERIOD_NS
         status = self.build()
-        self._outbox.put((keys.STATUS, status, None))
-        self._starter.say(HostMessage(status=status))
+        self._outbox.publish((keys.STATUS, status, None))
+        self._starter.send(HostMessage(status=status))
 
     def build(self) -> Status:
         """Return the present status of the robot."""
@@ -75,10 +75,10 @@ class StatusReporter:
         simulated = clock.simulated
         missing = self._readiness.missing_services()
         differing = self._readiness.differing_processes()
-        refusals = authority.against_arming(clock.safety_ns())
+        refusals = authority.list_unmet_conditions(clock.safety_ns())
         slow_backend = state.backend_time.too_slow() if clock.clock_mode == "realtime" else []
 
-        why = authority.why
+        why = authority.reason
         if authority.state == "disarmed" and (refusals or missing or differing):
             waits = self._readiness.describe_missing(missing)
             why = "; ".join([why, *slow_backend, *differing, *waits, *refusals])[:500]
@@ -92,27 +92,27 @@ class StatusReporter:
             host=robot.host,
             clock_mode=clock.clock_mode,
             rate_hz=1e9 / robot.period_ns,
-            paused_by=simulated.paused_by if simulated.stands else None,
+            paused_by=simulated.paused_by if simulated.is_paused else None,
             speed=simulated.speed,
-            real_time_factor=simulated.factor,
+            real_time_factor=simulated.real_time_factor,
             # The lifecycle.
             lifecycle=authority.state,
             why=why,
             ready_to_arm=not refusals and not missing and not differing,
             unchecked=authority.unchecked[:500],
-            derated=authority.derated,
-            isolated=authority.isolated,
+            derated=authority.derated_joints,
+            isolated=authority.isolated_joints,
             # Faults.
             faults=authority.faults,
-            faults_left_out=authority.since_clear.left_out,
-            injected=list(state.faults.on),
+            faults_left_out=authority.faults_since_clear.left_out,
+            injected=list(state.faults.active),
             # Commands.
             lease_holder=authority.lease.holder,
             lease_epoch=authority.lease.epoch,
-            commands_accepted=authority.accepted,
-            commands_standby=authority.standby,
-            commands_rejected=dict(authority.rejected),
-            commands_limited=dict(authority.limited),
+            commands_accepted=authority.accepted_count,
+            commands_standby=authority.standby_count,
+            commands_rejected=dict(authority.rejected_counts),
+            commands_limited=dict(authority.limited_counts),
             # Services.
             alive=state.participants.present(),
             waiting_for=missing,
@@ -120,7 +120,7 @@ class StatusReporter:
             # Timing.
             overruns=state.statistics.overruns,
             tick_times=state.statistics.times.timings(),
-            realtime_warnings=[*self._realtime_warnings, *slow_backend, *simulated.slow()],
+            realtime_warnings=[*self._realtime_warnings, *slow_backend, *simulated.find_slowness()],
         )
 
     def _mark(self) -> _Mark:
@@ -129,7 +129,7 @@ class StatusReporter:
             lifecycle=state.authority.state,
             lease_epoch=state.authority.lease.epoch,
             fault_count=len(state.authority.faults),
-            is_paused=state.clock.simulated.stands,
+            is_paused=state.clock.simulated.is_paused,
             speed=state.clock.simulated.speed,
         )
 
@@ -150,4 +150,4 @@ class StatusReporter:
         if waited_ns < HELD_UP_AFTER_NS:
             return ""
         tick = state.clock.tick
-        return f"tick {tick} waits for {state.participants.awaited(tick)}, for {waited_ns * 1e-9:.1f} s"
+        return f"tick {tick} waits for {state.participants.describe_awaited(tick)}, for {waited_ns * 1e-9:.1f} s"

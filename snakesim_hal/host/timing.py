@@ -34,13 +34,13 @@ class Deadlines:
             self._period_ns = round(self._robot_period_ns / speed)
         self._anchor_ns = time.monotonic_ns() - tick * self._period_ns
 
-    def of(self, tick: int) -> int:
+    def start_ns(self, tick: int) -> int:
         """Return the start time of a tick in ns, which is the end of the previous one."""
         return self._anchor_ns + tick * self._period_ns
 
     def missed(self, tick: int) -> bool:
         """Return whether a tick begins too late. If it is much too late, all later deadlines are shifted."""
-        late_ns = time.monotonic_ns() - self.of(tick)
+        late_ns = time.monotonic_ns() - self.start_ns(tick)
         if late_ns > REANCHOR_PERIODS * self._period_ns:
             self._anchor_ns += late_ns
         return late_ns > 0
@@ -57,14 +57,14 @@ class BackendTime:
         self.write_ns = 0.0
         self._ticks = 0
 
-    def read(self, since_ns: int) -> int:
+    def record_read(self, since_ns: int) -> int:
         """Note that the backend has been sampled, since a monotonic time. Returns the duration in ns."""
         took_ns = time.monotonic_ns() - since_ns
         self.read_ns += SMOOTHING * (took_ns - self.read_ns)
         self._ticks += 1
         return took_ns
 
-    def written(self, since_ns: int) -> int:
+    def record_write(self, since_ns: int) -> int:
         """Note that the backend has taken setpoints and advanced, since a monotonic time. Returns as `read` does."""
         took_ns = time.monotonic_ns() - since_ns
         self.write_ns += SMOOTHING * (took_ns - self.write_ns)
@@ -99,13 +99,13 @@ class PublishTimes:
             return None
         return self._rows[-1][0]
 
-    def put(self, tick: int, safety_ns: int, monotonic_ns: int) -> None:
+    def record(self, tick: int, safety_ns: int, monotonic_ns: int) -> None:
         """Record when a tick was published. If it is the newest one again, its times are replaced."""
         if self.last_tick == tick:
             self._rows.pop()
         self._rows.append((tick, safety_ns, monotonic_ns))
 
-    def of(self, tick: int) -> tuple[int, int]:
+    def times_of_tick(self, tick: int) -> tuple[int, int]:
         """Return the safety time and the monotonic time of a tick, in ns; LONG_AGO_NS for an unknown tick."""
         last_tick = self.last_tick
         if last_tick is None:

@@ -23,7 +23,7 @@ PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)  # those that a 
 JointNames = Annotated[list[Words], Meta(max_length=MAX_JOINTS)]
 
 
-class Checked(FileStruct, frozen=True, kw_only=True):
+class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
     """The section [checked], which `snakesim joints check` writes."""
 
     # Who checked what, and when.
@@ -57,7 +57,7 @@ def mounting_digest(joints: Sequence[Joint]) -> str:
     return hashlib.sha256(encoded).hexdigest()[:16]
 
 
-def why_unchecked(checked: Checked | None, joints: Sequence[Joint], robot: Description) -> str:
+def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], robot: Description) -> str:
     """Return why this robot counts as not checked, in words; empty if it is checked, or if nothing real moves.
 
     Args:
@@ -90,7 +90,7 @@ def why_unchecked(checked: Checked | None, joints: Sequence[Joint], robot: Descr
     return ""
 
 
-def _replaced_drives(checked: Checked, robot: Description) -> list[str]:
+def _replaced_drives(checked: StartCheckRecord, robot: Description) -> list[str]:
     """Return a sentence for each joint whose drive has another serial number than at the check."""
     checked_serials = checked.serials or [""] * len(robot.joints)
     sentences: list[str] = []

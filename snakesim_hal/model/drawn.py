@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import Override
 
@@ -25,7 +25,7 @@ class Draw(FileStruct, frozen=True, kw_only=True):
         if not are_finite or self.low > self.high:
             raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
 
-    def on_field(self, field: int, origin: str = "[[draw]]") -> list[Override]:
+    def overrides_for_scene(self, field: int, origin: str = "[[draw]]") -> list[Override]:
         """Return the value of every key for one random scene.
 
         Only the number of the scene and the first key seed the value, so that an additional `Draw` does not change the
@@ -41,7 +41,7 @@ class Draw(FileStruct, frozen=True, kw_only=True):
         return [Override(key, value, origin) for key in self.set]
 
 
-def draws_of(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
+def make_draws(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
     """Return the distributions of `{"key": (low, high)}`; keys that a comma separates get the same value.
 
     Raises:
@@ -55,7 +55,7 @@ def draws_of(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
             draws.append(Draw(set=key_list, low=low, high=high))
         except (TypeError, ValueError):
             raise ConfigError(
-                f"draw {keys}: {short(str(bounds))}: give the lowest and the highest number, both finite"
+                f"draw {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite"
             ) from None
     return draws
 
@@ -68,5 +68,5 @@ def parse_draw(text: str) -> tuple[str, list[str]]:
     """
     keys, equals, bounds = (part.strip() for part in text.partition("="))
     if not (keys and equals and bounds):
-        raise ConfigError(f"--draw {short(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4")
+        raise ConfigError(f"--draw {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4")
     return keys, bounds.split(":")

@@ -168,7 +168,7 @@ class Injection:
             case "process":
                 return HAL if self.target == "host" else self.target
             case "writer":
-                return writer_of(self.target)
+                return find_writer(self.target)
             case _:
                 return HAL
 
@@ -196,18 +196,18 @@ def target_type(target: str) -> TargetType:
 OUTSIDE = ("operator", "preview")  # writers that are no part of a run
 
 
-def writer_of(key: str) -> str:
+def find_writer(key: str) -> str:
     """Return the part of a run that writes a key.
 
     Raises:
         ConfigError: No part of a run writes the key.
     """
-    row = keys.row_at(key)
+    row = keys.find_row(key)
     if row is None or not _is_written_by_run(row):
         streams = [row.key for row in keys.SPACE if _is_written_by_run(row)]
         raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
     if row.key == keys.DONE_ALL:
-        return keys.service_of(key)
+        return keys.parse_service(key)
     match row.writer:
         case "HAL":
             return HAL
@@ -217,12 +217,12 @@ def writer_of(key: str) -> str:
             return service
 
 
-def _is_written_by_run(row: keys.Row) -> bool:
+def _is_written_by_run(row: keys.KeyRow) -> bool:
     """Return whether a part of a run publishes messages under the keys of a row."""
     return row.kind in ("stream", "latched") and row.writer not in OUTSIDE
 
 
-def parse(text: str) -> Injection:
+def parse_injection(text: str) -> Injection:
     """Return the injected fault that a text describes, such as `mute:joint_3@2-3.5`.
 
     Raises:
@@ -243,10 +243,10 @@ def parse(text: str) -> Injection:
         raise ConfigError(f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3") from None
     if end_s <= start_s:
         raise ConfigError(f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s")
-    return checked(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
+    return check_injection(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
 
 
-def checked(injection: Injection, given_text: str | None = None) -> Injection:
+def check_injection(injection: Injection, given_text: str | None = None) -> Injection:
     """Return the injected fault with the default of its amount filled in, if it is allowed.
 
     Args:
@@ -261,7 +261,7 @@ def checked(injection: Injection, given_text: str | None = None) -> Injection:
     if kind is None:
         raise _unknown_kind_error(injection, text)
     if injection.target_type == "key":
-        writer_of(injection.target)  # raises for a key without a writer
+        find_writer(injection.target)  # raises for a key without a writer
     if kind.amount is None:
         if injection.amount is not None:
             raise ConfigError(f"fault {text!r}: {injection.kind} takes no amount; leave out ={injection.amount:g}")
@@ -350,7 +350,7 @@ class Change:
     begins: bool
 
 
-class Plan:
+class InjectionPlan:
     """The beginnings and ends of injected faults, in the order of time."""
 
     def __init__(self, injections: Iterable[Injection] = ()) -> None:
@@ -376,7 +376,7 @@ class Plan:
         return due
 
 
-def explain() -> str:
+def explain_kinds() -> str:
     """Return a list of every kind, for a command's help."""
     lines: list[str] = []
     for sort, kinds in KINDS.items():

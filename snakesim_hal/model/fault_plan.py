@@ -3,14 +3,14 @@
 from collections.abc import Collection
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import HAL, RUN, Injection, check_targets, parse
+from snakesim_hal.model.fault_kinds import HAL, RUN, Injection, check_targets, parse_injection
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8
 
 
-def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
+def parse_planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
     """Return the injected faults of a configuration.
 
     Args:
@@ -23,7 +23,7 @@ def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
     injections: list[Injection] = []
     for i, text in enumerate(config.faults):
         try:
-            injections.append(parse(text))
+            injections.append(parse_injection(text))
         except ConfigError as error:
             raise ConfigError(f"{_place(config, i, table)}: {error}") from None
     return injections
@@ -57,7 +57,7 @@ def check_without_run(config: RunConfig, table: Table | None = None) -> None:
     Raises:
         ConfigError: A planned fault needs it.
     """
-    for i, injection in enumerate(planned(config, table)):
+    for i, injection in enumerate(parse_planned(config, table)):
         if injection.part == RUN:
             raise ConfigError(
                 f"{_place(config, i, table)} = {str(injection)!r}: only `snakesim run` does that; for a host by itself "
@@ -71,7 +71,7 @@ def check_planned(config: RunConfig, table: Table | None = None, buses: int = MA
     Raises:
         ConfigError: A text is not valid, or the run has no such process, key, joint or bus.
     """
-    injections = planned(config, table)
+    injections = parse_planned(config, table)
     for i, injection in enumerate(injections):
         try:
             check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)

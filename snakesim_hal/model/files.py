@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean, nearest, short
+from snakesim_hal.base.errors import ConfigError, find_nearest_word, shorten, suggest_word
 from snakesim_hal.model.field_types import Violation, first_violation, in_words, unit_of
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
@@ -71,7 +71,7 @@ class Table:
             section = section.setdefault(name, {})
             if not isinstance(section, dict | list):
                 raise ConfigError(
-                    f"{origin}: `{path}` is the value {short(repr(section))}, not a section; "
+                    f"{origin}: `{path}` is the value {shorten(repr(section))}, not a section; "
                     f"`{dotted}` cannot be set inside it"
                 )
         return section
@@ -145,7 +145,7 @@ def read_table(path: Path) -> Table:
     return Table(values, str(path), _origins(values, str(path)))
 
 
-def find(name: str, kind: str, beside: Path | None = None) -> Path:
+def find_file(name: str, kind: str, beside: Path | None = None) -> Path:
     """Return the path of a robot, scene or scenario file.
 
     Args:
@@ -157,25 +157,28 @@ def find(name: str, kind: str, beside: Path | None = None) -> Path:
         ConfigError: There is no shipped file of that name.
     """
     if name.endswith((".toml", ".json")) or "/" in name:
-        path = expanded(name)
+        path = expand_home(name)
         if path.is_absolute() or beside is None:
             return path
         return beside / path
-    if name not in shipped(kind):
-        raise ConfigError(f"no {kind[:-1]} called {short(name)!r}{_hint_for_unknown(name, kind)}")
+    if name not in list_shipped(kind):
+        raise ConfigError(f"no {kind[:-1]} called {shorten(name)!r}{_hint_for_unknown(name, kind)}")
     return SHIPPED / kind / f"{name}.toml"
 
 
 def _hint_for_unknown(name: str, kind: str) -> str:
     """Return what the user may mean by a name that no shipped file of a kind has, and what to do."""
     if kind == "scenarios" and name.endswith(".py"):
-        return f": it is Python. A controller of your own: --controller ./{short(name)}:CLASS, behind a scenario's name"
+        return (
+            f": it is Python. A controller of your own: --controller ./{shorten(name)}:CLASS, behind a scenario's name"
+        )
     for other in ("robots", "scenes"):
-        if kind == "scenarios" and name in shipped(other):
+        if kind == "scenarios" and name in list_shipped(other):
             return f": it is a {other[:-1]}. Give a scenario, and --set {other[:-1]}={name}"
     return (
-        f"; {did_you_mean(name, shipped(kind))}shipped are {', '.join(shipped(kind))}. For a file of your own give its "
-        f"path, such as ./{short(name)}.toml"
+        f"; {suggest_word(name, list_shipped(kind))}shipped are {', '.join(list_shipped(kind))}. For a file "
+        "of your own give its "
+        f"path, such as ./{shorten(name)}.toml"
     )
 
 
@@ -191,7 +194,7 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
     Raises:
         ConfigError: A file is missing or not valid, or files extend each other.
     """
-    path = find(name, kind, beside)
+    path = find_file(name, kind, beside)
     if path.resolve() in extended:
         raise ConfigError(f"{path}: `extends` leads back to this file, so that none says what the robot or scene is")
     table = read_table(path)
@@ -199,7 +202,7 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
     if base is None:
         return table
     if not isinstance(base, str):
-        raise ConfigError(f"{path}: `extends` = {short(repr(base))} must be the name or the path of another file")
+        raise ConfigError(f"{path}: `extends` = {shorten(repr(base))} must be the name or the path of another file")
     whole = read_part(base, kind, path.parent, extended=(*extended, path.resolve()))
     for dotted, value in _settings(table.values):
         whole.put(dotted, value, str(path))
@@ -215,15 +218,15 @@ def _settings(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", value
 
 
-def expanded(name: str) -> Path:
+def expand_home(name: str) -> Path:
     """Return a path in which `~` is replaced by the home folder. Raises ConfigError if there is no such home."""
     try:
         return Path(name).expanduser()
     except RuntimeError as error:
-        raise ConfigError(f"{short(name)}: {error}") from None
+        raise ConfigError(f"{shorten(name)}: {error}") from None
 
 
-def shipped(kind: str) -> list[str]:
+def list_shipped(kind: str) -> list[str]:
     """Return the names of the shipped files of a kind: `robots`, `scenes` or `scenarios`."""
     return sorted(path.stem for path in (SHIPPED / kind).glob("*.toml"))
 
@@ -258,7 +261,7 @@ def _explain(violation: Violation, table: Table, under: str) -> str:
         *steps, name = [under, *violation.steps]
     else:
         *steps, name = violation.steps or [""]
-    dotted = ".".join([*steps, short(name)])
+    dotted = ".".join([*steps, shorten(name)])
     match violation.kind:
         case "unknown":
             full_key = ".".join([*steps, name])
@@ -282,8 +285,8 @@ def _explain_unknown(violation: Violation, table: Table, dotted: str, full_key: 
         full_key: the whole key of the field.
     """
     name = violation.steps[-1]
-    elsewhere = [short(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(full_key)]
-    suggestion = nearest(name, violation.known)
+    elsewhere = [shorten(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(full_key)]
+    suggestion = find_nearest_word(name, violation.known)
     if not suggestion and elsewhere:
         suggestion = elsewhere[0]
     hint = f"did you mean `{suggestion}`?" if suggestion else f"known fields: {', '.join(sorted(violation.known))}."
@@ -306,12 +309,12 @@ def _explain_wrong(violation: Violation, table: Table, dotted: str) -> str:
 
     info = msgspec.inspect.type_info(violation.wanted)
     unit = unit_of(info)
-    shown = short(_repr(value))
+    shown = shorten(_repr(value))
     if unit and isinstance(value, int | float):
         shown += f" {unit}"
     reason = ""
     if not why.startswith(("Expected `int", "Expected `float")):  # the expected range says more
-        reason = f": {short(_lower_first(why))}"
+        reason = f": {shorten(_lower_first(why))}"
     return f"{origin}: `{dotted}` = {shown} is not allowed{reason}; expected {in_words(info)}."
 
 

@@ -22,7 +22,7 @@ def spacing_m(robot: RobotFile) -> float | None:
     return max(between_joints_m, default=None)
 
 
-def fitted(scene: SceneFile, robot: RobotFile, is_given: Callable[[str], bool]) -> dict[str, Any]:
+def fit_scene(scene: SceneFile, robot: RobotFile, is_given: Callable[[str], bool]) -> dict[str, Any]:
     """Return the values of a scene that differ for this robot, by dotted key below `scene`.
 
     Args:

@@ -209,7 +209,7 @@ class Joint:
         return self.limits.torque_nm if self.motor.rated_nm is None else self.motor.rated_nm
 
 
-def table(
+def make_joints(
     axes: Sequence[Axis],
     exceptions: Mapping[str, JointExceptions],
     limits: Limits,

@@ -67,7 +67,7 @@ def quaternions_from_rotations(rotations: Floats) -> Floats:
     return multiples / np.linalg.norm(multiples, axis=1, keepdims=True)
 
 
-def yaw_of(rotation: Floats) -> float:
+def yaw_from_rotation(rotation: Floats) -> float:
     """Return the heading of a frame's x axis on the ground, in rad."""
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
@@ -113,7 +113,9 @@ def link_frames(
     return origins, rotations
 
 
-def nodes_w(robot: Description, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats) -> Floats:
+def find_nodes_w(
+    robot: Description, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats
+) -> Floats:
     """Return tail end, joints and head end of one pose in the world, (joints + 2, 3).
 
     Args:

@@ -7,10 +7,10 @@ bounces off it within milliseconds. The impulse is what the contact does to the 
 from collections import deque
 from collections.abc import Mapping
 
-FELT_OVER_S = 0.05  # duration of the mean
+FORCE_WINDOW_S = 0.05  # duration of the mean
 
 
-class FeltForce:
+class MeasuredForce:
     """Moving averages of contact forces over FELT_OVER_S; before the first sample all forces were 0."""
 
     def __init__(self, every_s: float) -> None:
@@ -19,7 +19,7 @@ class FeltForce:
         Args:
             every_s: time between two samples.
         """
-        self._count = max(round(FELT_OVER_S / every_s), 1)
+        self._count = max(round(FORCE_WINDOW_S / every_s), 1)
         self._samples: deque[Mapping[object, float]] = deque()
 
     def add(self, forces_n: Mapping[object, float]) -> None:

@@ -18,7 +18,7 @@ from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 # Positions along a link, as fractions of its length, at which its distance to obstacles is computed.
-SHARES = (np.arange(5) + 0.5) / 5
+LINK_FRACTIONS = (np.arange(5) + 0.5) / 5
 
 # Corners and edge middles of a rectangle, in units of its half length and half width.
 CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
@@ -38,12 +38,12 @@ class Outlines:
     """The outlines of m obstacles as arrays, so that distances to all of them are computed at once."""
 
     center_w: Floats  # (m, 2), m
-    turn: Floats  # (m, 2): cosine and sine of the rectangle's yaw
+    direction: Floats  # (m, 2): cosine and sine of the rectangle's yaw
     half_m: Floats  # (m, 2): half of the rectangle's length and width
     rounding_m: Floats  # (m,)
 
     @classmethod
-    def of(cls, obstacles: Sequence[Obstacle]) -> Self:
+    def from_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
         """Return the outlines of obstacles, in their order."""
         is_box = np.array([obstacle.shape == "box" for obstacle in obstacles], dtype=bool)
         center_w = np.array([obstacle.position_w[:2] for obstacle in obstacles], dtype=np.float64)
@@ -52,13 +52,13 @@ class Outlines:
         radius_m = [obstacle.radius_m for obstacle in obstacles]
         return cls(
             center_w=center_w.reshape(-1, 2),
-            turn=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
+            direction=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
             half_m=np.where(is_box[:, None], half_m.reshape(-1, 2), 0.0),
             rounding_m=np.where(is_box, 0.0, radius_m),
         )
 
     @classmethod
-    def of_segments(cls, from_w: Floats, to_w: Floats, rounding_m: float = 0.0) -> Self:
+    def from_segments(cls, from_w: Floats, to_w: Floats, rounding_m: float = 0.0) -> Self:
         """Return the outlines of straight segments.
 
         Args:
@@ -72,7 +72,7 @@ class Outlines:
         half_m = np.column_stack([0.5 * length, np.zeros_like(length)])
         return cls(
             center_w=0.5 * (from_w + to_w),
-            turn=np.where(length[:, None] > 0, direction, [1.0, 0.0]),
+            direction=np.where(length[:, None] > 0, direction, [1.0, 0.0]),
             half_m=half_m,
             rounding_m=np.full(len(run), rounding_m),
         )
@@ -91,8 +91,8 @@ class Outlines:
         local = CORNERS * self.half_m[:, None, :]
         x = local[..., 0]
         y = local[..., 1]
-        cosine = self.turn[:, None, 0]
-        sine = self.turn[:, None, 1]
+        cosine = self.direction[:, None, 0]
+        sine = self.direction[:, None, 1]
         rotated = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return self.center_w[:, None, :] + rotated
 
@@ -108,7 +108,7 @@ class Outlines:
         outside = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
         return outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m
 
-    def towards(self, points_w: Floats, which: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    def distance_and_normal(self, points_w: Floats, which: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return the distance of each point from one outline, and the outward normal there.
 
         The normal points away from the nearest point of the rectangle; inside of the rectangle, out of its nearest
@@ -121,8 +121,8 @@ class Outlines:
         Returns:
             Distances (...) in m, negative inside, and unit normals (..., 2) in the world.
         """
-        cosine = self.turn[which, 0]
-        sine = self.turn[which, 1]
+        cosine = self.direction[which, 0]
+        sine = self.direction[which, 1]
         dx = points_w[..., 0] - self.center_w[which, 0]
         dy = points_w[..., 1] - self.center_w[which, 1]
         local_x = cosine * dx + sine * dy
@@ -148,8 +148,8 @@ class Outlines:
         """Return x and y of points (..., 2) in the frame of every rectangle, each (..., m)."""
         offset_x = points_w[..., None, 0] - self.center_w[:, 0]
         offset_y = points_w[..., None, 1] - self.center_w[:, 1]
-        cosine = self.turn[:, 0]
-        sine = self.turn[:, 1]
+        cosine = self.direction[:, 0]
+        sine = self.direction[:, 1]
         local_x = cosine * offset_x + sine * offset_y
         local_y = cosine * offset_y - sine * offset_x
         return local_x, local_y
@@ -174,7 +174,7 @@ def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.in
     """
     rear = nodes_w[:-1, None]
     run = np.diff(nodes_w, axis=0)[:, None]
-    points = (rear + SHARES[:, None] * run).reshape(-1, 2)
+    points = (rear + LINK_FRACTIONS[:, None] * run).reshape(-1, 2)
     distances = outlines.distance_m(points)
     nearest = distances.argmin(axis=0)
     return nearest, points[nearest], distances[nearest, np.arange(len(outlines))]

@@ -16,8 +16,8 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean, short
-from snakesim_hal.model.files import Table, decode, expanded
+from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
+from snakesim_hal.model.files import Table, decode, expand_home
 from snakesim_hal.model.sibling_modules import find_siblings_of
 from snakesim_hal.model.textfiles import read_bytes
 
@@ -26,14 +26,14 @@ BACKENDS = "snakesim.backends"
 COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
 FILMS = "snakesim.films"
-PLANTS = "snakesim.physics_models"
+PHYSICS_MODELS = "snakesim.physics_models"
 SENSORS = "snakesim.sensors"
 SERVICES = "snakesim.services"
 _offered: dict[tuple[str, str], Any] = {}
 
 
 @contextlib.contextmanager
-def offered(group: str, name: str, plugin: Any) -> Iterator[None]:
+def offer_plugin(group: str, name: str, plugin: Any) -> Iterator[None]:
     """Let a name stand for an object, even if a plugin of that name is installed.
 
     This holds in this process, and as long as the context is open.
@@ -57,7 +57,7 @@ def anything_offered() -> bool:
     return bool(_offered)
 
 
-def installed(group: str) -> list[str]:
+def list_installed(group: str) -> list[str]:
     """Return the names of all installed plugins of a group."""
     return sorted({entry.name for entry in _installed(*sys.path).select(group=group)})
 
@@ -98,8 +98,9 @@ def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
     entries = list(_installed(*sys.path).select(group=group, name=name))
     if not entries:
         raise ConfigError(
-            f"no {kind} called {short(name)!r} is installed; {did_you_mean(name, installed(group))}installed are "
-            f"{', '.join(installed(group)) or 'none'}. "
+            f"no {kind} called {shorten(name)!r} is installed; "
+            f"{suggest_word(name, list_installed(group))}installed are "
+            f"{', '.join(list_installed(group)) or 'none'}. "
             f"A package adds one by an entry point in the group {group!r}"
         )
     different_objects = {entry.value for entry in entries}
@@ -166,11 +167,11 @@ def _parse_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
     """Return the file, the class name, and the parsed code, which is not run. Raises ConfigError."""
     path_text, attribute = _split_name(name)
     try:
-        path = expanded(path_text).absolute()
+        path = expand_home(path_text).absolute()
         tree = ast.parse(read_bytes(path), str(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{kind} {short(name)!r} cannot be loaded: {why}") from None
+        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}") from None
     if not attribute:
         raise _missing_class_error(name, kind, tree)
     return path, attribute, tree
@@ -187,7 +188,7 @@ def _missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
     else:
         example = f"{path}:Class"
         available = "there is no class in it"
-    return ConfigError(f"{kind} {short(name)!r}: {problem}, as in {short(example)}; {short(available, 400)}")
+    return ConfigError(f"{kind} {shorten(name)!r}: {problem}, as in {shorten(example)}; {shorten(available, 400)}")
 
 
 def _names(tree: ast.Module) -> Iterator[str]:
@@ -213,7 +214,7 @@ def _from_file(name: str, kind: str) -> Any:
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{kind} {short(name)!r} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}") from error
     if not hasattr(module, attribute):
         raise _missing_class_error(name, kind, tree)
     return getattr(module, attribute)

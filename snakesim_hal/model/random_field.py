@@ -11,7 +11,7 @@ from numpy.random import Generator
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, block, made_of, peg
+from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, make_block, make_peg, material_fields
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
@@ -50,7 +50,7 @@ class RandomField(Solid, frozen=True, kw_only=True):
         return round(self.density_per_m2 * area_m2)
 
 
-def solids_of(field: RandomField, index: int, count: int) -> list[Upright]:
+def make_solids(field: RandomField, index: int, count: int) -> list[Upright]:
     """Return the material and the random lean of every obstacle of a field.
 
     Args:
@@ -60,13 +60,13 @@ def solids_of(field: RandomField, index: int, count: int) -> list[Upright]:
     """
     random = np.random.default_rng([field.seed, index, LEANING])
     leans = random.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
-    material = made_of(field)
+    material = material_fields(field)
     return [
         Upright(**material, lean_rad=lean_rad, lean_towards_rad=towards_rad) for lean_rad, towards_rad in leans.tolist()
     ]
 
 
-def random_obstacles(
+def place_random_obstacles(
     field: RandomField,
     where: str,
     index: int,
@@ -91,18 +91,18 @@ def random_obstacles(
     random = np.random.default_rng([field.seed, index])
     free_areas = _areas_to_keep_free(field, route, keep_clear)
     placed: list[Obstacle] = []
-    others = Outlines.of(standing)
+    others = Outlines.from_obstacles(standing)
     for _ in range(TRIES * field.wanted):
         if len(placed) == field.wanted:
             return placed
         candidate = _random_obstacle(field, random, f"random_{index}_{len(placed)}")
-        outline = Outlines.of([candidate])
+        outline = Outlines.from_obstacles([candidate])
         if len(others) and gaps_m(outline, others).min() < field.clearance_m:
             continue
         if any(gaps_m(outline, area).min() < 0.0 for area in free_areas):
             continue
         placed.append(candidate)
-        others = Outlines.of([*standing, *placed])
+        others = Outlines.from_obstacles([*standing, *placed])
     if len(placed) < field.wanted:
         raise ConfigError(
             f"{where}: only {len(placed)} of {field.wanted} pegs fit; lower `density_per_m2` = "
@@ -118,9 +118,9 @@ def _areas_to_keep_free(field: RandomField, route: Route | None, snake: Sequence
         rear_w = np.array([link.rear_m for link in snake])
         front_w = np.array([link.front_m for link in snake])
         radius_m = max(link.radius_m for link in snake)
-        areas.append(Outlines.of_segments(rear_w, front_w, radius_m + field.clearance_m))
+        areas.append(Outlines.from_segments(rear_w, front_w, radius_m + field.clearance_m))
     if route is not None and field.route_clearance_m is not None:
-        areas.append(Outlines.of_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+        areas.append(Outlines.from_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
     return areas
 
 
@@ -152,7 +152,7 @@ def _random_obstacle(field: RandomField, random: Generator, name: str) -> Obstac
     x, y = random.uniform(field.min_corner_m, field.max_corner_m).tolist()
     radius_m = float(random.uniform(*field.radius_m))
     if field.box_fraction == 0 or random.uniform() >= field.box_fraction:
-        return peg(name, (x, y), radius_m, field.height_m)
+        return make_peg(name, (x, y), radius_m, field.height_m)
     length_m, width_m = random.uniform(*field.box_size_m, size=2).tolist()
     yaw_rad = float(random.uniform(0.0, math.pi))
-    return block(name, (x, y), (length_m, width_m, field.height_m), yaw_rad)
+    return make_block(name, (x, y), (length_m, width_m, field.height_m), yaw_rad)

@@ -12,13 +12,13 @@ from typing import Annotated, get_args
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.base.errors import short
-from snakesim_hal.model.checked import Checked
+from snakesim_hal.base.errors import shorten
+from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, table
+from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, make_joints
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.plugins import SENSORS, find_plugin
-from snakesim_hal.model.sensors import LinkName, Mounted, OwnSensor, Sensors
+from snakesim_hal.model.sensors import CustomSensor, LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Axis,
@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import (
     SensorDescription,
     StopMode,
 )
-from snakesim_hal.wire.own_sample import schema_of
+from snakesim_hal.wire.own_sample import make_message_schema
 from snakesim_hal.wire.quantities import MAX_JOINTS, above
 
 
@@ -80,7 +80,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
 
     safety: Safety = Safety()
     sensors: Sensors = Sensors()
-    checked: Checked | None = None  # record of the last start check
+    checked: StartCheckRecord | None = None  # record of the last start check
 
     def __post_init__(self) -> None:
         """Check joints, links and sensors against each other. Raises ValueError, which the file reader explains."""
@@ -124,7 +124,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     @property
     def joint_table(self) -> list[Joint]:
         """Return every joint as built, tail to head."""
-        return table(self.axes, self.joints, self.limits, self.motor, self.drive, self.heat, self.supply)
+        return make_joints(self.axes, self.joints, self.limits, self.motor, self.drive, self.heat, self.supply)
 
     @property
     def link_lengths_m(self) -> list[float]:
@@ -153,7 +153,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
 
 
-def described(robot: RobotFile) -> list[JointDescription]:
+def describe_joints(robot: RobotFile) -> list[JointDescription]:
     """Return the descriptions of all joints, tail to head."""
     return [_describe_joint(joint) for joint in robot.joint_table]
 
@@ -201,7 +201,7 @@ def with_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
     return msgspec.structs.replace(robot, drive=all_drives, joints=joints)
 
 
-def describe(
+def describe_robot(
     robot: RobotFile,
     *,
     backend: str,
@@ -225,7 +225,7 @@ def describe(
     Raises:
         ConfigError: The class of a custom sensor cannot be loaded, or has no message.
     """
-    joints = described(robot)
+    joints = describe_joints(robot)
     return Description(
         robot=robot.name,
         # Host and run.
@@ -244,7 +244,7 @@ def describe(
         joints=joints,
         links=_describe_links(robot),
         sensors=_describe_sensors(robot, period_ns),
-        own={keys.own(sensor.name): _own_schema(sensor) for sensor in robot.sensors.own},
+        own={keys.custom_key(sensor.name): _own_schema(sensor) for sensor in robot.sensors.own},
     )
 
 
@@ -270,7 +270,7 @@ def _describe_sensors(robot: RobotFile, period_ns: int) -> list[SensorDescriptio
     return sensors
 
 
-def identified(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
+def with_serials(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
     """Return a description with the serial number and the firmware version of every drive.
 
     Args:
@@ -285,11 +285,11 @@ def identified(robot: Description, serials: Sequence[str], firmware: Sequence[st
     return msgspec.structs.replace(robot, joints=joints)
 
 
-def _own_schema(sensor: OwnSensor) -> str:
+def _own_schema(sensor: CustomSensor) -> str:
     """Return the schema of a custom sensor's message. Raises ConfigError if its class cannot be loaded or has none."""
     model = find_plugin(SENSORS, sensor.model)
     message = getattr(model, "message", None)
-    return schema_of(message, f"sensor {sensor.name!r}: model {short(sensor.model)}")
+    return make_message_schema(message, f"sensor {sensor.name!r}: model {shorten(sensor.model)}")
 
 
 def layout_hash(joints: list[JointDescription]) -> str:

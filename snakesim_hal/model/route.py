@@ -68,7 +68,7 @@ class Route:
         beyond = np.maximum(s - self.length_m, 0.0)[..., None] * self._last_direction
         return points + before + beyond
 
-    def at(self, s_m: float) -> tuple[float, float]:
+    def point_at(self, s_m: float) -> tuple[float, float]:
         """Return the point at arc length `s_m`; like `position_w`, and much faster for a single point."""
         last = len(self._direction_list) - 1
         segment = min(max(bisect_right(self._s_list, s_m) - 1, 0), last)
@@ -79,8 +79,8 @@ class Route:
 
     def heading_rad(self, s_m: float) -> float:
         """Return the direction of travel at arc length `s_m`, averaged over 10 mm."""
-        x0, y0 = self.at(s_m - HEADING_WINDOW_M)
-        x1, y1 = self.at(s_m + HEADING_WINDOW_M)
+        x0, y0 = self.point_at(s_m - HEADING_WINDOW_M)
+        x1, y1 = self.point_at(s_m + HEADING_WINDOW_M)
         return math.atan2(y1 - y0, x1 - x0)
 
     def tangent_w(self, s_m: float) -> Floats:
@@ -171,7 +171,7 @@ def next_on_route(route: Route, from_w: tuple[float, float], from_s_m: float, di
     from_x, from_y = from_w
     s = from_s_m + distance_m
     for _ in range(MAX_CHORD_ITERATIONS):
-        x, y = route.at(s)
+        x, y = route.point_at(s)
         error = distance_m - math.hypot(x - from_x, y - from_y)
         s += error
         if abs(error) < CHORD_TOLERANCE_M:
@@ -197,12 +197,12 @@ def lay_chain(route: Route, tail_s_m: float, segment_lengths_m: Sequence[float])
         segment_lengths_m: tail to head.
     """
     s = tail_s_m
-    tail_w = route.at(s)
+    tail_w = route.point_at(s)
     rear_x, rear_y = tail_w
     headings: list[float] = []
     for length_m in segment_lengths_m:
         s = next_on_route(route, (rear_x, rear_y), s, length_m)
-        front_x, front_y = route.at(s)
+        front_x, front_y = route.point_at(s)
         headings.append(math.atan2(front_y - rear_y, front_x - rear_x))
         rear_x, rear_y = front_x, front_y
     angles_rad = (np.diff(headings) + np.pi) % (2 * np.pi) - np.pi  # from -pi to pi

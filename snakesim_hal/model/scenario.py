@@ -16,17 +16,17 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_hal.base.atomic_write import write_whole
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.atomic_write import write_atomically
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
-from snakesim_hal.model.fitting import fitted
+from snakesim_hal.model.files import FileStruct, Table, decode, find_file, leaves, read_part, read_table
+from snakesim_hal.model.fitting import fit_scene
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
-from snakesim_hal.model.robot import RobotFile, describe
+from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
-from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
+from snakesim_hal.model.scene import Placed, SceneFile, check_clear, make_route, place_scene
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ClockMode, Description, Obstacle
@@ -301,12 +301,12 @@ def parse_set(text: str) -> Override:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or not key:
-        raise ConfigError(f"--set {short(text)}: give section.key=value, such as --set control.propulsion_n=35")
+        raise ConfigError(f"--set {shorten(text)}: give section.key=value, such as --set control.propulsion_n=35")
     try:
         parsed = parse_toml(f"value = {value}", "--set")["value"]
     except ConfigError:
         parsed = value.strip()
-    return Override(key, parsed, f"--set {short(text)}")
+    return Override(key, parsed, f"--set {shorten(text)}")
 
 
 def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
@@ -319,19 +319,19 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
     Raises:
         ConfigError: A file cannot be read, or a value is not allowed.
     """
-    table = compose(scenario, overrides)
+    table = compose_table(scenario, overrides)
     config = decode(table, RunConfig)
     check(config)
     return Loaded(config, table)
 
 
-def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
+def compose_table(scenario: str, overrides: Sequence[Override] = ()) -> Table:
     """Return all values of a scenario, its robot and its scene, with the flags applied, but not checked yet.
 
     Raises:
         ConfigError: A file cannot be read.
     """
-    path = find(scenario, "scenarios")
+    path = find_file(scenario, "scenarios")
     table = read_table(path)
     table.values.setdefault("name", path.stem)
     _split_policy(table, table.values.get("controller"), table.source)
@@ -398,7 +398,7 @@ def _fit_scene(table: Table, flags: set[str]) -> None:
     def is_given_by_flag(key: str) -> bool:
         return table.origin_of(f"scene.{key}") in flags
 
-    changed = fitted(config.scene, config.robot, is_given_by_flag)
+    changed = fit_scene(config.scene, config.robot, is_given_by_flag)
     for key, value in changed.items():
         table.put(f"scene.{key}", value, f"fitted to robot {config.robot.name!r}")
 
@@ -421,11 +421,11 @@ def check(config: RunConfig) -> None:
             f"scenario {config.name!r}: `start.on_route` is true but scene {config.scene.name!r} has no route; "
             f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene"
         )
-    angles_rad = start_of(config).angles_rad.tolist()
+    angles_rad = find_start_pose(config).angles_rad.tolist()
     for joint, angle_rad in zip(config.robot.joint_table, angles_rad, strict=True):
         if not joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad:
             raise _start_angle_error(config, joint, angle_rad)
-    place_all(config)
+    place_obstacles(config)
 
 
 def _start_angle_error(config: RunConfig, joint: Joint, angle_rad: float) -> ConfigError:
@@ -453,11 +453,11 @@ class StartPose:
     angles_rad: NDArray[np.float64]  # (n_joints,), tail to head
 
 
-def start_of(config: RunConfig) -> StartPose:
+def find_start_pose(config: RunConfig) -> StartPose:
     """Return the pose of the snake at tick 0: on the scene's route, or straight."""
     robot = config.robot
     start = config.start
-    route = route_of(config.scene)
+    route = make_route(config.scene)
     if not start.on_route or route is None:
         straight_rad = np.zeros(robot.chain.modules)
         return StartPose(start.position_m, start.yaw_rad, straight_rad)
@@ -466,7 +466,7 @@ def start_of(config: RunConfig) -> StartPose:
     return StartPose(chain.tail_w, chain.heading_rad, chain_angles(robot.axes, chain.angles_rad))
 
 
-def description_of(config: RunConfig, backend: str = "", *, emulated: bool = False) -> Description:
+def describe_run_robot(config: RunConfig, backend: str = "", *, emulated: bool = False) -> Description:
     """Return the description that the HAL publishes of the configured robot.
 
     Args:
@@ -474,7 +474,7 @@ def description_of(config: RunConfig, backend: str = "", *, emulated: bool = Fal
         backend: the name that the backend has for itself; empty: the name in the scenario.
         emulated: whether no real motor moves.
     """
-    return describe(
+    return describe_robot(
         config.robot,
         backend=backend or config.backend,
         period_ns=config.period_ns,
@@ -487,7 +487,7 @@ def description_of(config: RunConfig, backend: str = "", *, emulated: bool = Fal
 def capsules_at_start(config: RunConfig) -> list[Capsule]:
     """Return the outlines of the links at tick 0 as seen from above, tail to head."""
     robot = config.robot
-    pose = start_of(config)
+    pose = find_start_pose(config)
     radius_m = robot.module.radius_m
     base_w = (*pose.position_w, radius_m)
     base_rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
@@ -503,26 +503,26 @@ def capsules_at_start(config: RunConfig) -> list[Capsule]:
     return capsules
 
 
-def place_all(config: RunConfig) -> list[Placed]:
+def place_obstacles(config: RunConfig) -> list[Placed]:
     """Return all obstacles of the scene, placed.
 
     Raises:
         ConfigError: An obstacle cannot be placed, or overlaps the snake's start pose.
     """
     snake = capsules_at_start(config)
-    placed = place(config.scene, snake)
+    placed = place_scene(config.scene, snake)
     check_clear(config.scene, placed, snake)
     return placed
 
 
-def surveyed(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
+def survey_obstacles(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
     """Return the obstacles at the positions that the survey gives, which differ from the true ones by its error.
 
     Args:
         config: of the run; its seed decides the errors.
         walkable: true: the platforms that the snake may lie on; false: the obstacles that it pushes against.
     """
-    obstacles = [placed.obstacle for placed in place_all(config) if placed.walkable == walkable]
+    obstacles = [placed.obstacle for placed in place_obstacles(config) if placed.walkable == walkable]
     error_m = config.mission.map_error_m
     if error_m == 0.0:
         return obstacles
@@ -542,16 +542,16 @@ def config_hash(config: RunConfig) -> str:
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
-def written(config: RunConfig) -> bytes:
+def encode_config(config: RunConfig) -> bytes:
     """Return the effective configuration as JSON; `snakesim run` accepts it like a scenario file."""
     return msgspec.json.format(msgspec.json.encode(config), indent=2)
 
 
-def write(config: RunConfig, path: Path) -> None:
+def write_config(config: RunConfig, path: Path) -> None:
     """Save the effective configuration as JSON."""
-    write_whole(path, written(config))
+    write_atomically(path, encode_config(config))
 
 
-def read(path: Path) -> RunConfig:
+def read_config(path: Path) -> RunConfig:
     """Read a file that `write` saved, whatever its name."""
     return decode(read_table(path), RunConfig)

@@ -16,9 +16,9 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Capsule, Coordinate, Friction, Heading, Outlines, Point, Size
-from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles, solids_of
+from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, make_solids, place_random_obstacles
 from snakesim_hal.model.route import Route, sine_points
-from snakesim_hal.model.solids import Solid, Upright, block, made_of, peg
+from snakesim_hal.model.solids import Solid, Upright, make_block, make_peg, material_fields
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name, above
 
@@ -120,7 +120,7 @@ OVERLAP_M = 1e-4  # a smaller overlap of an obstacle and a link is a rounding er
 MAX_OBSTACLES = 4096  # bound of the message World
 
 
-class Body(FileStruct, frozen=True, kw_only=True):
+class ReferenceRobot(FileStruct, frozen=True, kw_only=True):
     """The body that a scene was laid out for; for another robot the scene is scaled in proportion, see fitting.py."""
 
     spacing_m: Size  # longest distance between two neighboring yaw joints
@@ -133,7 +133,7 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     about: str = ""
     ground: Ground
-    reference_robot: Body | None = None  # none: the scene is the same for every robot
+    reference_robot: ReferenceRobot | None = None  # none: the scene is the same for every robot
     route: SineRoute | WaypointRoute | None = None
 
     # Obstacles.
@@ -146,7 +146,7 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     random_field: list[RandomField] = []
 
 
-def route_of(scene: SceneFile) -> Route | None:
+def make_route(scene: SceneFile) -> Route | None:
     """Return the scene's route as a curve, or None if the scene has no route.
 
     Raises:
@@ -171,7 +171,7 @@ class Placed(Upright, frozen=True, kw_only=True):
     walkable: bool = False  # a step: part of the ground, so the snake does not push off from it
 
 
-def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:
+def place_scene(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:
     """Return all obstacles of a scene, with peg rows and random fields expanded, each with a unique name.
 
     Args:
@@ -189,7 +189,7 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
         *(_placed_wall(scene, i, wall) for i, wall in enumerate(scene.wall)),
         *(_placed_step(i, step) for i, step in enumerate(scene.step)),
     ]
-    route = route_of(scene)
+    route = make_route(scene)
     for i, row in enumerate(scene.pegs_along_route):
         placed += _pegs_along_route(scene, i, row, route)
     for i, field in enumerate(scene.random_field):
@@ -218,18 +218,18 @@ def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
 
 def _with_material(obstacle: Obstacle, solid: Solid) -> Placed:
     """Return a placed obstacle with the material and the lean that its section in the scene file gives."""
-    return Placed(obstacle=obstacle, **made_of(solid))
+    return Placed(obstacle=obstacle, **material_fields(solid))
 
 
 def _placed_cylinder(index: int, cylinder: Cylinder) -> Placed:
     name = cylinder.name or f"cylinder_{index}"
-    obstacle = peg(name, cylinder.position_m, cylinder.radius_m, cylinder.height_m)
+    obstacle = make_peg(name, cylinder.position_m, cylinder.radius_m, cylinder.height_m)
     return _with_material(obstacle, cylinder)
 
 
 def _placed_box(index: int, box: Box) -> Placed:
     name = box.name or f"box_{index}"
-    obstacle = block(name, box.position_m, box.size_m, box.yaw_rad)
+    obstacle = make_block(name, box.position_m, box.size_m, box.yaw_rad)
     return _with_material(obstacle, box)
 
 
@@ -256,14 +256,14 @@ def _placed_wall(scene: SceneFile, index: int, wall: Wall) -> Placed:
     name = wall.name or f"wall_{index}"
     middle_m = ((from_x + to_x) / 2, (from_y + to_y) / 2)
     size_m = (length_m, wall.thickness_m, wall.height_m)
-    obstacle = block(name, middle_m, size_m, math.atan2(run_y, run_x))
+    obstacle = make_block(name, middle_m, size_m, math.atan2(run_y, run_x))
     return _with_material(obstacle, wall)
 
 
 def _placed_step(index: int, step: Step) -> Placed:
     name = step.name or f"step_{index}"
     size_m = (*step.size_m, step.height_m)
-    platform = block(name, step.position_m, size_m, step.yaw_rad)
+    platform = make_block(name, step.position_m, size_m, step.yaw_rad)
     return Placed(obstacle=platform, friction=step.friction, walkable=True)
 
 
@@ -293,7 +293,7 @@ def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: 
         push = left if left @ forward > 0 else -left  # direction of the force from the peg on the body
         center = route.position_w(s_m) - push * (row.corridor_m + row.radius_m)
         center_m = (float(center[0]), float(center[1]))
-        obstacle = peg(f"peg_{index}_{number}", center_m, row.radius_m, row.height_m)
+        obstacle = make_peg(f"peg_{index}_{number}", center_m, row.radius_m, row.height_m)
         pegs.append(_with_material(obstacle, row))
     return pegs
 
@@ -309,8 +309,8 @@ def _obstacles_of_field(
     """Return the obstacles of one random field, between those that are placed already."""
     where = f"scene {scene.name!r}: `random_field.{index}`"
     standing = [item.obstacle for item in placed if not item.walkable]
-    obstacles = random_obstacles(field, where, index, route, standing, keep_clear)
-    solids = solids_of(field, index, len(obstacles))
+    obstacles = place_random_obstacles(field, where, index, route, standing, keep_clear)
+    solids = make_solids(field, index, len(obstacles))
     return [_with_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)]
 
 
@@ -343,14 +343,14 @@ def _overlaps_m(snake: list[Capsule], obstacles: list[Obstacle]) -> Floats:
     The distance of a link's axis from an obstacle's center is exact, which suffices for round obstacles. For boxes the
     distances from `SAMPLES` points along the axis are taken, too, and the smallest one counts.
     """
-    outlines = Outlines.of(obstacles)
+    outlines = Outlines.from_obstacles(obstacles)
     rear_w = np.array([link.rear_m for link in snake])
     front_w = np.array([link.front_m for link in snake])
     radius_m = np.array([link.radius_m for link in snake])
     fractions = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]  # (links, SAMPLES, 2)
     from_points_m = outlines.distance_m(points_w).min(axis=1)
-    from_axes_m = Outlines.of_segments(rear_w, front_w).distance_m(outlines.center_w).T - outlines.rounding_m
+    from_axes_m = Outlines.from_segments(rear_w, front_w).distance_m(outlines.center_w).T - outlines.rounding_m
     gaps_m = np.minimum(from_points_m, from_axes_m)
     return radius_m[:, None] - gaps_m
 

@@ -97,7 +97,7 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     settings: dict[str, Any] = {}  # of its model, which checks them
 
 
-class Looking(Mounted, frozen=True, kw_only=True):
+class DistanceSensor(Mounted, frozen=True, kw_only=True):
     """A sensor that measures distances from its position."""
 
     noise_m: Annotated[float, from_zero(1, "m")] = 0.0
@@ -107,7 +107,7 @@ class Looking(Mounted, frozen=True, kw_only=True):
     model: Model = "rays"  # by which the simulator makes its samples
 
 
-class DepthCamera(Looking, frozen=True, kw_only=True):
+class DepthCamera(DistanceSensor, frozen=True, kw_only=True):
     """Distances along the optical axis, in an image of square pixels without distortion."""
 
     # Image.
@@ -132,7 +132,7 @@ class DepthCamera(Looking, frozen=True, kw_only=True):
         return self.width / 2 / math.tan(self.fov_rad / 2)
 
 
-class RangeSensor(Looking, frozen=True, kw_only=True):
+class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
     """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
@@ -149,7 +149,7 @@ class RangeSensor(Looking, frozen=True, kw_only=True):
             )
 
 
-class OwnSensor(Mounted, frozen=True, kw_only=True):
+class CustomSensor(Mounted, frozen=True, kw_only=True):
     """A custom sensor: the class in `model` defines its message, see docs/sensors.md."""
 
     model: Model  # the name of an installed sensor, or ./file.py:Class
@@ -161,7 +161,7 @@ def _check_range(min_m: float, max_m: float) -> None:
         raise ValueError(f"`range_min_m` = {min_m:g} m must be below `range_max_m` = {max_m:g} m")
 
 
-AnyMounted = DepthCamera | RangeSensor | OwnSensor
+AnyMounted = DepthCamera | RangeSensor | CustomSensor
 AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | AnyMounted
 
 
@@ -175,7 +175,7 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
     power: PowerSensor | None = None
     depth: Annotated[list[DepthCamera], Meta(max_length=MAX_MOUNTED)] = []
     range: Annotated[list[RangeSensor], Meta(max_length=MAX_MOUNTED)] = []
-    own: Annotated[list[OwnSensor], Meta(max_length=MAX_OWN_SENSORS)] = []
+    own: Annotated[list[CustomSensor], Meta(max_length=MAX_OWN_SENSORS)] = []
 
     def __post_init__(self) -> None:
         """Check that no two sensors of a kind have the same name. Raises ValueError, which the file reader explains."""
@@ -200,13 +200,13 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
     def mounted(self) -> Iterator[tuple[str, AnyMounted]]:
         """Yield the sensors at positions on links, with their keys. A color camera has two keys, so it comes twice."""
         for camera in self.depth:
-            yield keys.depth(camera.name), camera
+            yield keys.depth_key(camera.name), camera
             if camera.color:
-                yield keys.color(camera.name), camera
+                yield keys.color_key(camera.name), camera
         for sensor in self.range:
-            yield keys.ranges(sensor.name), sensor
+            yield keys.ranges_key(sensor.name), sensor
         for sensor in self.own:
-            yield keys.own(sensor.name), sensor
+            yield keys.custom_key(sensor.name), sensor
 
     @property
     def max_image_bytes(self) -> int:

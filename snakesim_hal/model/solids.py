@@ -46,13 +46,13 @@ class Upright(Solid, frozen=True, kw_only=True):
     lean_towards_rad: Heading = 0.0  # direction in which its top leans, seen from above; 0: along x
 
 
-def made_of(solid: Solid) -> dict[str, Any]:
+def material_fields(solid: Solid) -> dict[str, Any]:
     """Return the fields of `Solid`, and those of `Upright` if the obstacle is upright, without those of its shape."""
     struct = Upright if isinstance(solid, Upright) else Solid
     return {name: getattr(solid, name) for name in struct.__struct_fields__}
 
 
-def peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
+def make_peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
     """Return an upright cylinder that stands on the ground; all lengths in m."""
     x, y = position
     return Obstacle(
@@ -64,7 +64,7 @@ def peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
     )
 
 
-def block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:
+def make_block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:
     """Return a box that stands on the ground.
 
     Args:

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.base.atomic_write import replaced, write_whole
-from snakesim_hal.base.errors import ConfigError, nearest
+from snakesim_hal.base.atomic_write import replace_atomically, write_atomically
+from snakesim_hal.base.errors import ConfigError, find_nearest_word
 
 MB = 1024 * 1024
 
@@ -82,7 +82,7 @@ def _hint_for_missing(path: Path) -> str:
         names = sorted(entry.name for entry in entries)
     except OSError as error:
         return f"; its folder {path.parent} cannot be read: {error.strerror}"
-    similar = nearest(path.name, names)
+    similar = find_nearest_word(path.name, names)
     if similar:
         return f"; did you mean {path.parent / similar}?"
     if not path.suffix:
@@ -168,7 +168,7 @@ def exported(path: Path) -> Iterator[Path]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(Path(os.path.realpath(path))) as partial:
+        with replace_atomically(Path(os.path.realpath(path))) as partial:
             yield partial
     except OSError as error:
         raise ConfigError(
@@ -197,7 +197,7 @@ def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
             _check_plain(path, path.lstat().st_mode)
-        write_whole(path, text.encode(encoding))
+        write_atomically(path, text.encode(encoding))
     except OSError as error:
         why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
         raise ConfigError(f"{path}: cannot be written: {why}") from None

@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from queue import Empty
 from typing import Any
 
-from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError, short
+from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError, shorten
 from snakesim_hal.network.feed import Feed, RobotFilter
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Publisher, Session
 from snakesim_hal.wire import keys
@@ -32,8 +32,8 @@ from snakesim_hal.wire.messages import (
     Message,
     Mode,
 )
-from snakesim_hal.wire.outgoing import checked
-from snakesim_hal.wire.own_sample import own_kind_at
+from snakesim_hal.wire.outgoing import encode_checked
+from snakesim_hal.wire.own_sample import find_custom_message
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 MISSING_SAMPLE_TIMEOUT_S = 2.0  # in lockstep, for a sample or a description that must exist
@@ -87,7 +87,7 @@ class Client:
         self._publishers: dict[str, Publisher[Any]] = {}
         self._filter = RobotFilter(session.rejected)
         self.commanded_tick = NO_TICK_COMMANDED
-        self.lacks: set[str] = set()  # keys that were read at this tick, and had no sample
+        self.missing: set[str] = set()  # keys that were read at this tick, and had no sample
         session.on_urgent_arrival(keys.CLOCK, self._store_clock)
         session.on_alive(self._on_host_token, keys.HOST_ALL)
 
@@ -131,7 +131,7 @@ class Client:
     def _on_host_token(self, key: str, present: bool) -> None:
         """Note, in Zenoh's thread, that our host has vanished, or the network and with it our view of the host."""
         robot = self._filter.robot
-        if not present and robot is not None and keys.service_of(key) == robot.host:
+        if not present and robot is not None and keys.parse_service(key) == robot.host:
             self._host_left = True
 
     # --- ticks -----------------------------------------------------------------------------------------------
@@ -172,10 +172,10 @@ class Client:
                 feed.clear()
         self._clock = clock
         self.commanded_tick = NO_TICK_COMMANDED
-        self.lacks.clear()
+        self.missing.clear()
         newest_only = clock.clock_mode != "lockstep"
         for feed in self._feeds.values():
-            feed.take_in(newest_only=newest_only)
+            feed.store_arrived(newest_only=newest_only)
 
     def _take_next_clock(self, timeout_s: float | None) -> Clock:
         """Return the next due clock from the queue.
@@ -238,7 +238,7 @@ class Client:
         """
         sample = self._find_sample(feed)
         if sample is None:
-            self.lacks.add(feed.key)
+            self.missing.add(feed.key)
         return sample
 
     def _find_sample(self, feed: Feed[MessageT]) -> MessageT | None:
@@ -264,7 +264,7 @@ class Client:
         deadline = time.monotonic() + MISSING_SAMPLE_TIMEOUT_S
         while time.monotonic() < deadline:
             time.sleep(SAMPLE_POLL_S)
-            feed.take_in()
+            feed.store_arrived()
             sample = feed.at(tick)
             if sample is not None:
                 return sample
@@ -272,7 +272,7 @@ class Client:
 
     # --- outputs ---------------------------------------------------------------------------------------------
 
-    def put(self, key: str, message: Message) -> None:
+    def publish(self, key: str, message: Message) -> None:
         """Publish an output of this service.
 
         Raises:
@@ -280,9 +280,9 @@ class Client:
         """
         robot = self._filter.robot
         try:
-            own_kind = None if robot is None else own_kind_at(key, robot)
-            payload = checked(key, message, own_kind)
-            error = None if robot is None else mismatch(message, robot)
+            own_kind = None if robot is None else find_custom_message(key, robot)
+            payload = encode_checked(key, message, own_kind)
+            error = None if robot is None else find_mismatch(message, robot)
             if error is not None:
                 raise error
         except WireError as error:
@@ -290,10 +290,10 @@ class Client:
             raise WireError(error.reason, f"{which} cannot be published: {error.detail}") from None
         self._publisher(key, type(message)).put(message, payload)
 
-    def done(self, tick: int) -> None:
+    def report_done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""
         if self.commanded_tick != tick:
-            self._publisher(keys.done(self.service), Done).put(Done(tick=tick))
+            self._publisher(keys.done_key(self.service), Done).put(Done(tick=tick))
 
     def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         """Return the publisher of a key, which is declared at its first message."""
@@ -310,7 +310,7 @@ def _describe_output(key: str, message: Message) -> str:
     tick = getattr(message, "tick", None)
     if tick is None:
         return key
-    return f"{key} of tick {short(str(tick), 20)}"
+    return f"{key} of tick {shorten(str(tick), 20)}"
 
 
 class Commander:
@@ -328,7 +328,7 @@ class Commander:
         self._last_request_s = 0.0
         self.refusal: str | None = None  # why the last request of the lease was refused
 
-    def holds(self, clock: Clock) -> bool:
+    def ensure_lease(self, clock: Clock) -> bool:
         """Return whether this service holds the lease at a tick. Requests a lease that it does not hold.
 
         While the robot is armed it requests nothing. It waits for the host's answer, at most two seconds.
@@ -341,7 +341,7 @@ class Commander:
         self._last_request_s = now_s
         request = LeaseRequest(action="acquire", holder=self._client.service)
         try:
-            answer: Answer = self._client.session.ask(keys.LEASE, request, host=self._description.host)
+            answer: Answer = self._client.session.request(keys.LEASE, request, host=self._description.host)
         except NotConnectedError as error:
             self.refusal = str(error)
             return False
@@ -375,10 +375,10 @@ class Commander:
             target=setpoints.target,
             torque_limit_nm=setpoints.torque_limit_nm,
         )
-        self._client.put(keys.JOINT_COMMAND, command)
+        self._client.publish(keys.JOINT_COMMAND, command)
         self._client.commanded_tick = joints.tick
 
-    def stay(self, joints: JointState) -> RequestedSetpoints:
+    def hold_position(self, joints: JointState) -> RequestedSetpoints:
         """Return setpoints that hold every joint at its angle; a service sends them while the robot is not armed."""
         robot_joints = self._description.joints
         modes = [Mode.POSITION] * len(robot_joints)

@@ -21,10 +21,10 @@ from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SILENCE_S = 2.0  # without a clock: the host has stalled
 LEASE_TIMEOUT_S = 10.0  # to get the lease
-READ = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
+READABLE_KEYS = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 
-class Commanding:
+class CommandingClient:
     """Takes the place of the run's control service, from construction to the end of the session."""
 
     def __init__(self, session: Session, robot: Description, clock_mode: ClockMode) -> None:
@@ -39,14 +39,14 @@ class Commanding:
             RefusedError: another client commands the robot.
             StalledError: the robot publishes no clock.
         """
-        if session.present(keys.alive(CONTROL)):
+        if session.present(keys.alive_key(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
                 "--set services.control.external=true"
             )
         self._client = Client(session, CONTROL, clock_mode=clock_mode)
         self._feeds: dict[str, Feed] = {}
-        for key, message in READ.items():
+        for key, message in READABLE_KEYS.items():
             self._feeds[key] = self._client.subscribe(key, message)
         self._client.description()
         self._ticks = self._client.ticks(SILENCE_S)
@@ -71,12 +71,12 @@ class Commanding:
             StalledError: no clock arrived within SILENCE_S.
         """
         if self.clock is not None:
-            self._client.done(self.clock.tick)
+            self._client.report_done(self.clock.tick)
         clock = next(self._ticks)
         if clock is None:
             raise StalledError(f"no tick of the robot for {SILENCE_S:g} s; is its HAL host running?")
         self.clock = clock
-        self._holds_lease = self._commander.holds(clock)
+        self._holds_lease = self._commander.ensure_lease(clock)
         return clock
 
     def host_changed(self) -> bool:
@@ -113,7 +113,7 @@ class Commanding:
         if not isinstance(joints, JointState) or not self._holds_lease:
             return
         if clock.lifecycle != "armed" or self._last_setpoints is None:
-            self._last_setpoints = self._commander.stay(joints)
+            self._last_setpoints = self._commander.hold_position(joints)
         self.send(self._last_setpoints)
 
     def turn_until(self, condition: Callable[[], bool], limit_s: float, why: Callable[[], str]) -> None:

@@ -72,7 +72,7 @@ class Link:
     session: SessionFile | None = None  # how to connect; `endpoint` is then the first one in it
 
     @staticmethod
-    def of_file(session: SessionFile, namespace: str | None = None) -> "Link":
+    def from_session_file(session: SessionFile, namespace: str | None = None) -> "Link":
         """Return the link that a session file describes.
 
         Raises:

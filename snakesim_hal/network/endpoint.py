@@ -4,7 +4,7 @@ import re
 import socket
 from ipaddress import ip_address
 
-from snakesim_hal.base.errors import ConfigError, RefusedError, short
+from snakesim_hal.base.errors import ConfigError, RefusedError, shorten
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
@@ -25,7 +25,7 @@ def check_endpoint(text: str, origin: str) -> str:
     Raises:
         ConfigError: it is not valid.
     """
-    given = f"{origin} {short(text)}"
+    given = f"{origin} {shorten(text)}"
     if text.startswith("unixsock-stream/") and len(text) > len("unixsock-stream/"):
         return text
     parts = _parts.fullmatch(text)
@@ -47,7 +47,8 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
     if access_control or insecure or not is_exposed(endpoint):
         return
     raise ConfigError(
-        f"{origin} {short(endpoint)}: anyone who reaches this address could command the robot, because clients are not "
+        f"{origin} {shorten(endpoint)}: anyone who reaches this address could command the robot, because "
+        "clients are not "
         f"authenticated. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
         f"`snakesim run --router ENDPOINT`), or accept it with --insecure"
     )
@@ -95,7 +96,8 @@ def check_namespace(text: str, origin: str) -> str:
     """
     if not re.fullmatch(r"[^/*$?#\s@]+(/[^/*$?#\s@]+)*", text) or not text.isprintable():
         raise ConfigError(
-            f"{origin} {short(text)!r}: this is not a namespace; give a name such as planar13 or lab/planar13, without "
+            f"{origin} {shorten(text)!r}: this is not a namespace; give a name such as planar13 or "
+            "lab/planar13, without "
             "spaces and * $ ? # @"
         )
     return text

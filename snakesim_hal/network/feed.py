@@ -7,7 +7,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable
 from typing import Generic
 
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Reader
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Description, Message
@@ -34,7 +34,7 @@ class Feed(Generic[MessageT]):
         self._kept: OrderedDict[int, MessageT] = OrderedDict()
         self.key = key
 
-    def take_in(self, *, newest_only: bool = False) -> None:
+    def store_arrived(self, *, newest_only: bool = False) -> None:
         """Store newly arrived samples.
 
         Args:
@@ -88,7 +88,7 @@ class RobotFilter:
         """Return whether a message fits the robot, as far as that is known."""
         if self.robot is None:
             return True
-        error = mismatch(message, self.robot)
+        error = find_mismatch(message, self.robot)
         if error is None:
             return True
         self._rejected[error.reason] += 1

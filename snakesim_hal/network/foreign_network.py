@@ -32,7 +32,7 @@ class RawPublisher:
         """Send a payload. It is dropped if the network is too slow for it."""
         self._publisher.put(payload, attachment=attachment)
 
-    def heard(self) -> bool:
+    def has_subscriber(self) -> bool:
         """Return whether the key has a subscriber now."""
         return bool(self._publisher.matching_status.matching)
 
@@ -53,7 +53,7 @@ class RawReader:
         """Keep at most `depth` samples."""
         self._kept: deque[RawSample] = deque(maxlen=depth)
 
-    def take(self, sample: zenoh.Sample) -> None:
+    def store(self, sample: zenoh.Sample) -> None:
         """Keep a sample, in Zenoh's thread."""
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         self._kept.append(RawSample(sample.payload.to_bytes(), attachment, time.monotonic_ns()))
@@ -72,7 +72,7 @@ class RawReader:
 
 
 @dataclass(frozen=True)
-class RawQuestion:
+class RawQuery:
     """A query that waits for one reply."""
 
     _query: Any
@@ -91,14 +91,14 @@ class RawQueryable:
 
     _queryable: Any
 
-    def next(self) -> RawQuestion | None:
+    def take_next(self) -> RawQuery | None:
         """Return the oldest query that waits; None if there is none."""
         query = self._queryable.try_recv()
         if query is None:
             return None
         payload = b"" if query.payload is None else query.payload.to_bytes()
         attachment = b"" if query.attachment is None else query.attachment.to_bytes()
-        return RawQuestion(query, payload, attachment)
+        return RawQuery(query, payload, attachment)
 
 
 class ForeignNetwork:
@@ -137,7 +137,7 @@ class ForeignNetwork:
     def reader(self, key: str, depth: int = 1) -> RawReader:
         """Subscribe to a key, and keep its newest samples."""
         reader = RawReader(depth)
-        self._declared.append(self._zenoh.declare_subscriber(key, reader.take))
+        self._declared.append(self._zenoh.declare_subscriber(key, reader.store))
         return reader
 
     def declare_token(self, key: str) -> None:

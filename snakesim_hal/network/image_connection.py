@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from snakesim_hal.network.endpoint import is_exposed
-from snakesim_hal.network.session_file import of_mode
+from snakesim_hal.network.session_file import endpoints_of_mode
 
 # A piece waits up to a second for the one before it. No other thread waits for the thread that sends images.
 WAIT_SETTINGS = {"transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1_000_000}
@@ -30,7 +30,7 @@ MARKED_PROTOCOLS = ("tcp/", "tls/")
 
 def configure_for_images(config: zenoh.Config) -> None:
     """Change a client's settings into those of its connection for images. Values of a session file stay."""
-    endpoints = of_mode(config, "connect/endpoints", "client")
+    endpoints = endpoints_of_mode(config, "connect/endpoints", "client")
     set_unless_given(config, WAIT_SETTINGS)
     if any(is_exposed(endpoint) for endpoint in endpoints):  # loopback is never slow
         set_unless_given(config, PIECE_SETTINGS)

@@ -19,14 +19,14 @@ from snakesim_hal.network.session import (
     READER_DEPTH,
     Arrival,
     Publisher,
-    Question,
+    Query,
     Reader,
     Session,
-    depth_of,
     intersects,
+    reader_depth,
 )
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, MessageT, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
 Take = Callable[[Arrival], None]
@@ -40,7 +40,7 @@ class LocalNetwork:
         self.answer: Callable[[], None] = lambda: None  # runs the parts that answer queries
         # Callbacks, each with the key or pattern that it is for.
         self.subscribers: list[tuple[str, Take]] = []
-        self.queryables: list[tuple[str, Callable[[Question], None]]] = []
+        self.queryables: list[tuple[str, Callable[[Query], None]]] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         # What sessions have published.
         self.tokens: list[str] = []
@@ -147,7 +147,7 @@ class LocalSession(Session):
 
     def _declare_publisher(self, key: str, message: type[MessageT], *, latched: bool) -> Publisher[MessageT]:
         network = self._network
-        encoding = encoding_of(message)
+        encoding = format_encoding(message)
 
         def send(payload: bytes) -> None:
             arrival = Arrival(key, payload, encoding, time.monotonic_ns())
@@ -162,7 +162,7 @@ class LocalSession(Session):
         return self._register_publisher(key, Publisher(message, send, has_subscribers))
 
     def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
-        kept: deque[Arrival] = deque(maxlen=depth or depth_of(message))
+        kept: deque[Arrival] = deque(maxlen=depth or reader_depth(message))
         declared = self._subscribe(key, kept.append)
         return LocalReader(declared, kept, message, self.rejected)
 
@@ -186,7 +186,7 @@ class LocalSession(Session):
                 take(arrival)
         self._subscribe(key, take)
 
-    def on_question(self, key: str, take: Callable[[Question], None]) -> None:
+    def on_query(self, key: str, take: Callable[[Query], None]) -> None:
         """Call `take` for every query, in the thread of the session that sends it."""
         queryable = (key, take)
         self._network.queryables.append(queryable)
@@ -219,17 +219,17 @@ class LocalSession(Session):
         self._declared.append(declared)
         return declared
 
-    def put_question(self, pattern: str, request: Message) -> LocalQuery:
+    def send_query(self, pattern: str, request: Message) -> LocalQuery:
         """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
         matching = [(key, take) for key, take in self._network.queryables if intersects(pattern, key)]
         query = LocalQuery(len(matching))
         for key, take in matching:
-            take(Question(key, encode(request), encoding_of(type(request)), query))
+            take(Query(key, encode(request), format_encoding(type(request)), query))
         return query
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
         decoder = Decoder(Answer)
-        query = self.put_question(pattern, request)
+        query = self.send_query(pattern, request)
         self._network.answer()
         deadline = time.monotonic() + timeout_s
         for _ in range(query.asked):

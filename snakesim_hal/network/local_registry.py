@@ -33,7 +33,9 @@ class LocalRobot:
     session: str = ""  # path of the session file by which it has joined a lab; empty: without one
 
     @staticmethod
-    def on(link: "Link", robot: str, backend: str, stop_port: socket.socket, config: str | None = None) -> "LocalRobot":
+    def describe(
+        link: "Link", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
+    ) -> "LocalRobot":
         """Return the entry of a robot for which this process is responsible."""
         stop_host, port = stop_port.getsockname()[:2]
         return LocalRobot(

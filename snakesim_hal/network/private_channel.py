@@ -40,13 +40,13 @@ class HostEnd:
         self._socket = inherited
 
     @staticmethod
-    def of(descriptor: int | None) -> "HostEnd":
+    def from_descriptor(descriptor: int | None) -> "HostEnd":
         """Return the end of an inherited file descriptor; None: the host was started on its own."""
         if descriptor is None:
             return HostEnd(None)
         return HostEnd(socket.socket(fileno=descriptor))
 
-    def say(self, message: HostMessage) -> None:
+    def send(self, message: HostMessage) -> None:
         """Send a message to the starter. It is lost if the starter does not read."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
@@ -67,7 +67,7 @@ class HostEnd:
                     return
                 if not request:
                     return
-                take(decoder.decode(request), lambda answer: self.say(HostMessage(answer=answer)))
+                take(decoder.decode(request), lambda answer: self.send(HostMessage(answer=answer)))
 
         start_worker("private channel", receive_requests)
 
@@ -85,7 +85,7 @@ class StarterEnd:
         self.answers: list[Answer] = []
         self.resets = 0  # how often another host has started in the same process
 
-    def take_in(self) -> None:
+    def receive(self) -> None:
         """Read all messages that have arrived, without waiting."""
         while True:
             try:
@@ -107,7 +107,7 @@ class StarterEnd:
         if message.answer is not None:
             self.answers.append(message.answer)
 
-    def ask(self, request: LifecycleRequest) -> None:
+    def send_request(self, request: LifecycleRequest) -> None:
         """Send a request; the answer is appended to `answers`."""
         with contextlib.suppress(OSError):
             self._socket.send(msgspec.msgpack.encode(request))

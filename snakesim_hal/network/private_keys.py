@@ -12,7 +12,7 @@ from snakesim_hal.base.terminal import print_stderr
 _NAMED = ("connect_private_key", "listen_private_key")  # below transport/link/tls
 
 
-def readable_by_all(key: Path) -> str:
+def check_permissions(key: Path) -> str:
     """Return a text if every user may read a private key, with the remedy; else an empty text."""
     try:
         mode = stat.S_IMODE(key.stat().st_mode)
@@ -33,6 +33,6 @@ def warn_of_readable_keys(settings: zenoh.Config) -> None:
 
 @cache  # a command may read its file twice
 def _warn(key: Path) -> None:
-    problem = readable_by_all(key)
+    problem = check_permissions(key)
     if problem:
         print_stderr(f"snakesim: warning: {problem}, and renew it: snakesim deploy certs --rotate")

@@ -11,7 +11,7 @@ from collections.abc import Collection
 from importlib.metadata import version
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.base.process import user_name
+from snakesim_hal.base.process import get_user_name
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import shared_settings
 from snakesim_hal.network.session import Arrival, Publisher, Session
@@ -28,7 +28,7 @@ def own_entry(name: str, config: RunConfig | None = None) -> Process:
     return Process(
         name=name,
         machine=socket.gethostname()[:64] or "unnamed",
-        user=user_name(),
+        user=get_user_name(),
         pid=os.getpid(),
         version=version("snakesim"),
         started_unix_s=round(time.time()),
@@ -45,29 +45,31 @@ def show_process(session: Session, entry: Process) -> Publisher[Process]:
     Returns:
         The publisher, for later changes.
     """
-    key = keys.process(entry.name, secrets.token_hex(4))
+    key = keys.process_key(entry.name, secrets.token_hex(4))
     session.declare_token(key)
     shown = session.latched_publisher(key, Process)
     shown.put(entry)
     return shown
 
 
-def differences(one: Process, other: Process) -> list[str]:
+def find_differences(one: Process, other: Process) -> list[str]:
     """Return the differences between two processes of one robot as texts, with values in the order of the arguments."""
     found = [
-        f"`{field}` is {one.settings[field]} on {place(one)}, {other.settings[field]} on {place(other)}"
+        f"`{field}` is {one.settings[field]} on {describe_place(one)}, {other.settings[field]} on "
+        f"{describe_place(other)}"
         for field in one.settings
         if field in other.settings and one.settings[field] != other.settings[field]
     ]
     found += [
-        f"message {name} has version {one.messages[name]} on {place(one)}, {other.messages[name]} on {place(other)}"
+        f"message {name} has version {one.messages[name]} on {describe_place(one)}, {other.messages[name]} on "
+        f"{describe_place(other)}"
         for name in one.messages
         if name in other.messages and one.messages[name] != other.messages[name]
     ]
     return found
 
 
-def place(entry: Process) -> str:
+def describe_place(entry: Process) -> str:
     """Return the machine, name and id of a process as text."""
     return f"{entry.machine} ({entry.name}, process {entry.pid})"
 
@@ -84,18 +86,18 @@ class ProcessEntries:
         session.on_alive(self._on_token, keys.PROCESS_ALL)
         session.on_latched_arrival(keys.PROCESS_ALL, self._store_entry)
 
-    def against(self, own: Process, names: Collection[str]) -> list[str]:
+    def find_problems(self, own: Process, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
         problems: list[str] = []
         for key in sorted(self._alive.copy()):
-            name = keys.service_of(key).rpartition("-")[0]
+            name = keys.parse_service(key).rpartition("-")[0]
             if name not in names:
                 continue
             entry = self._entries.get(key)
             if entry is None or entry.name != name:
-                problems.append(f"{keys.service_of(key)} has not published its settings yet")
+                problems.append(f"{keys.parse_service(key)} has not published its settings yet")
             else:
-                problems += differences(entry, own)
+                problems += find_differences(entry, own)
         return problems
 
     def waits(self) -> dict[str, list[str]]:

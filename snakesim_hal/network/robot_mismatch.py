@@ -33,13 +33,17 @@ IMU_LISTS = ("angular_velocity_rad_s", "acceleration_m_s2")
 UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
 
-def mismatch(message: Message, robot: Description) -> WireError | None:
+def find_mismatch(message: Message, robot: Description) -> WireError | None:
     """Return the error of a message that does not fit a robot, with a reason to count by; None if it fits."""
     joints = len(robot.joints)
     last_link = len(robot.links) - 1
     match message:
         case JointState():
-            return None if message.is_of(joints) else _check_lengths(message, JOINT_STATE_LISTS, joints, "one a joint")
+            return (
+                None
+                if message.has_joint_count(joints)
+                else _check_lengths(message, JOINT_STATE_LISTS, joints, "one a joint")
+            )
         case Power():
             return _check_lengths(message, POWER_LISTS, joints, "one a joint")
         case Imu():

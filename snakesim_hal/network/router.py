@@ -11,7 +11,7 @@ import zenoh
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.router_log import ZENOH_LEVELS, short_log
-from snakesim_hal.network.session_file import of_mode, read_zenoh_file, refused_by_zenoh
+from snakesim_hal.network.session_file import endpoints_of_mode, read_zenoh_file, refused_by_zenoh
 
 
 def router_settings(config: Path) -> zenoh.Config:
@@ -46,7 +46,7 @@ def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
         ConfigError: the file is not valid, or the router would let other machines command a robot.
     """
     settings = router_settings(config)
-    for endpoint in of_mode(settings, "listen/endpoints", "router"):
+    for endpoint in endpoints_of_mode(settings, "listen/endpoints", "router"):
         guarded = _denies_by_default(settings)
         check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
     with nullcontext() if "RUST_LOG" in os.environ else short_log():

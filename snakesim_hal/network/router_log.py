@@ -66,7 +66,7 @@ class RouterLog:
         self._allowance = MAX_BURST_LINES  # how many lines may still be written
         self._dropped = 0  # lines since the last report
 
-    def take(self, line: str) -> None:
+    def process_line(self, line: str) -> None:
         """Process one line of Zenoh's log."""
         if ALLOWED in line and LIST_END not in line:
             return
@@ -85,7 +85,7 @@ class RouterLog:
         elif parts["level"] != "DEBUG":
             self._write_once(f"{parts['level']} {parts['module']}: {text}")
 
-    def turn(self) -> None:
+    def report_repetitions(self) -> None:
         """Report repeated and dropped lines, and restart the count. Call it every REPORT_INTERVAL_S."""
         repetitions = self._repetitions
         dropped = self._dropped
@@ -171,7 +171,7 @@ def short_log() -> Iterator[None]:
             reader.join(CLOSE_LIMIT_S)
             if not reader.is_alive():
                 source.close()
-            log.turn()
+            log.report_repetitions()
 
 
 def _to_stderr(line: str) -> None:
@@ -188,8 +188,8 @@ def _read_pipe(source: RawIOBase, log: RouterLog) -> None:
     while (data := source.read(PIPE_BYTES)) != b"":  # None: the pipe is empty now
         *lines, unfinished = (unfinished + (data or b"")).split(b"\n")
         for line in lines:
-            log.take(line.decode(errors="replace"))
+            log.process_line(line.decode(errors="replace"))
         if time.monotonic() >= next_report_s:
             next_report_s += REPORT_INTERVAL_S
-            log.turn()
+            log.report_repetitions()
         time.sleep(POLL_S)

@@ -26,7 +26,7 @@ def own_run_key() -> str | None:
     return os.environ.get(RUN_KEY) or None
 
 
-def proven(description: Description, key: str | None) -> Description:
+def add_proof(description: Description, key: str | None) -> Description:
     """Return a description with the proof that it is of the run with this key."""
     if key is None:
         return description

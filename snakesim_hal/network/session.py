@@ -35,7 +35,7 @@ from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT  
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.image_connection import configure_for_images
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGES, Decoder, MessageT, encode, encoding_of
+from snakesim_hal.wire.codec import IMAGES, Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message, Preview
 
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
@@ -66,7 +66,7 @@ class Publisher(Generic[MessageT]):
         """
         self.message = message
         self.send = send
-        self.heard = heard
+        self.has_subscriber = heard
         self._put = send
 
     def put(self, message: MessageT, encoded: bytes | None = None) -> None:
@@ -134,7 +134,7 @@ class Reader(Generic[MessageT]):
 
 
 @dataclass(frozen=True)
-class Question:
+class Query:
     """A query that waits for its answer."""
 
     key: str
@@ -144,7 +144,7 @@ class Question:
 
     def reply(self, answer: Answer) -> None:
         """Send the answer and close the query. May be called from any thread."""
-        self._query.reply(self.key, encode(answer), encoding=encoding_of(Answer))
+        self._query.reply(self.key, encode(answer), encoding=format_encoding(Answer))
         self._query.drop()
 
 
@@ -189,13 +189,13 @@ class Session:
         """
         is_command = key == keys.JOINT_COMMAND
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
-        ends_a_tick = is_command or key == keys.CLOCK or key.startswith(keys.done(""))
+        ends_a_tick = is_command or key == keys.CLOCK or key.startswith(keys.done_key(""))
         session = self._zenoh
         if message in IMAGES and not lossless:  # in lockstep a clock must not overtake the images that it names
             session = self._open_image_session()
         publisher = session.declare_publisher(
             key,
-            encoding=encoding_of(message),
+            encoding=format_encoding(message),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
             priority=_choose_priority(key, message),
             express=ends_a_tick,
@@ -215,7 +215,7 @@ class Session:
         publisher = ext.declare_advanced_publisher(
             self._zenoh,
             key,
-            encoding=encoding_of(message),
+            encoding=format_encoding(message),
             cache=ext.CacheConfig(1),
             publisher_detection=True,
         )
@@ -255,7 +255,7 @@ class Session:
             message: the type of its messages.
             depth: how many of the newest samples are kept; None: the default for this type.
         """
-        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or depth_of(message)))
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or reader_depth(message)))
         self._declared.append(subscriber)
         return Reader(subscriber, message, self.rejected)
 
@@ -324,20 +324,20 @@ class Session:
         )
         self._declared.append(subscriber)
 
-    def on_question(self, key: str, take: Callable[[Question], None]) -> None:
+    def on_query(self, key: str, take: Callable[[Query], None]) -> None:
         """Call `take` for every query, in Zenoh's thread. Reply from a thread of your own."""
 
         def handle(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
             encoding = str(query.encoding or "")
             # The query's own key may be a pattern, such as `hal/*`; the question is always for our key.
-            take(Question(key, payload, encoding, query))
+            take(Query(key, payload, encoding, query))
 
         self._declared.append(self._zenoh.declare_queryable(key, handle))
 
     # --- queries ---------------------------------------------------------------------------------------------
 
-    def ask(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
+    def request(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
         """Send a request to the HAL host, and wait for the answer.
 
         Args:
@@ -359,7 +359,7 @@ class Session:
             raise NotConnectedError(f"the answer on {key} cannot be decoded: {unreadable}")
         raise NotConnectedError(f"no answer on {key} within {timeout_s} s; is the robot's HAL host running?")
 
-    def ask_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
+    def request_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
         """Send a request to all matching keys at once.
 
         Yields:
@@ -373,7 +373,7 @@ class Session:
         replies = self._zenoh.get(
             pattern,
             payload=encode(request),
-            encoding=encoding_of(type(request)),
+            encoding=format_encoding(type(request)),
             timeout=timeout_s,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,  # no answer replaces another
@@ -401,7 +401,7 @@ class Session:
 
     def declare_alive(self, service: str) -> None:
         """Declare the liveliness token of a service for as long as the session lives."""
-        self.declare_token(keys.alive(service))
+        self.declare_token(keys.alive_key(service))
 
     def declare_token(self, key: str) -> None:
         """Declare a liveliness token for as long as the session lives."""
@@ -462,7 +462,7 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         yield session
 
 
-def depth_of(message: type[Message]) -> int:
+def reader_depth(message: type[Message]) -> int:
     """Return how many samples of a stream a reader keeps."""
     return IMAGES_DEPTH if message in IMAGES else READER_DEPTH
 

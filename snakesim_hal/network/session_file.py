@@ -11,7 +11,7 @@ from typing import Any
 
 import zenoh
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.textfiles import check_brackets, read_text
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.private_keys import warn_of_readable_keys
@@ -41,7 +41,8 @@ class SessionFile:
         """
         if self.namespace is not None and wanted not in (None, self.namespace):
             raise ConfigError(
-                f"{self.path}: `namespace` is {short(self.namespace)!r}, not {wanted!r}; use the session file of that "
+                f"{self.path}: `namespace` is {shorten(self.namespace)!r}, not {wanted!r}; use the session "
+                "file of that "
                 "robot, or another --namespace"
             )
         return wanted or self.namespace
@@ -60,9 +61,9 @@ def read_session(path: Path) -> SessionFile:
             dotted_key = key.replace("/", ".")
             present = "missing" if given is None else json.dumps(given)
             raise ConfigError(f"{path}: `{dotted_key}` is {present}, must be {json.dumps(wanted)}")
-    if of_mode(settings, "listen/endpoints", "client"):
+    if endpoints_of_mode(settings, "listen/endpoints", "client"):
         raise ConfigError(f"{path}: `listen.endpoints`: a session only connects; leave it out")
-    endpoints = of_mode(settings, "connect/endpoints", "client")
+    endpoints = endpoints_of_mode(settings, "connect/endpoints", "client")
     if not endpoints:
         raise ConfigError(f"{path}: `connect.endpoints` is empty: name the router's, such as tls/robot-lab:7447")
     for endpoint in endpoints:
@@ -95,10 +96,10 @@ def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
 def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:
     """Return an error with Zenoh's own message about a file, shortened because it quotes the file."""
     message = " ".join(str(error).split())
-    return ConfigError(f"{path}: Zenoh refuses it: {short(message, 500)}")
+    return ConfigError(f"{path}: Zenoh refuses it: {shorten(message, 500)}")
 
 
-def of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:
+def endpoints_of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:
     """Return a list of endpoints for a mode. The file has one list for all modes, or one for each."""
     given = json.loads(settings.get_json(key))
     return given if isinstance(given, list) else given.get(mode, [])

@@ -104,7 +104,7 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
 
 
 @dataclass(frozen=True)
-class Stopped:
+class StopAnswer:
     """The answer of a stop port."""
 
     robot: str  # its namespace
@@ -133,7 +133,7 @@ class StopRequester:
         for address in unused:
             self._sockets.pop(address).close()
 
-    def ask(self, address: Address, who: str, timeout_s: float) -> Stopped | None:
+    def request_stop(self, address: Address, who: str, timeout_s: float) -> StopAnswer | None:
         """Repeat a stop request until it is answered.
 
         Args:
@@ -187,14 +187,14 @@ class StopRequester:
         self._sockets.clear()
 
 
-def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | None:
+def request_stop(host: str, port: int, who: str, timeout_s: float) -> StopAnswer | None:
     """Send a stop request to one stop port, as `StopRequester.ask` does.
 
     Raises:
         NotConnectedError: the port is closed.
     """
     with closing(StopRequester()) as requester:
-        return requester.ask((host, port), who, timeout_s)
+        return requester.request_stop((host, port), who, timeout_s)
 
 
 def _open_for(address: Address) -> socket.socket:
@@ -202,7 +202,7 @@ def _open_for(address: Address) -> socket.socket:
     return socket.socket(address_family, socket.SOCK_DGRAM)
 
 
-def _request_stop(opened: socket.socket, address: Address, who: str, timeout_s: float) -> Stopped | None:
+def _request_stop(opened: socket.socket, address: Address, who: str, timeout_s: float) -> StopAnswer | None:
     """Repeat a stop request until it is answered; None: no answer came in time."""
     nonce = os.urandom(NONCE_BYTES)
     request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
@@ -228,7 +228,7 @@ def _request_stop(opened: socket.socket, address: Address, who: str, timeout_s: 
     return None
 
 
-def _receive_answer(opened: socket.socket, nonce: bytes) -> Stopped | None:
+def _receive_answer(opened: socket.socket, nonce: bytes) -> StopAnswer | None:
     """Wait for the answer to the request with this nonce, for REPEAT_S; other datagrams are ignored.
 
     Raises:
@@ -240,7 +240,7 @@ def _receive_answer(opened: socket.socket, nonce: bytes) -> Stopped | None:
         if datagram.startswith(ANSWER + nonce):
             content = datagram[len(ANSWER) + NONCE_BYTES :].decode(errors="replace")
             robot, _, text = content.partition("\n")
-            return Stopped(robot, text)
+            return StopAnswer(robot, text)
     return None
 
 

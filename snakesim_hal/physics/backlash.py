@@ -40,7 +40,7 @@ def without_rotors(config: RunConfig, joints: Sequence[Joint], backlash_rad: Map
     return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, joints=exceptions))
 
 
-class BacklashPlant:
+class BacklashModel:
     """A `PhysicsModel` that wraps another one, and whose joint angles are those that encoders on the rotors measure."""
 
     def __init__(

@@ -12,7 +12,7 @@ WAVES = 40  # plane waves whose sum is the ground
 WAVELENGTH_SPREAD = (0.7, 1.3)  # wave numbers of the waves, relative to that of the typical wavelength
 
 
-def hills(uneven: Heightfield) -> Floats:
+def make_heights(uneven: Heightfield) -> Floats:
     """Return the heights over the square area, (n, n) float64 in m, row by row along y.
 
     The ground is a sum of plane waves in random directions, so it is smooth, and the same for the same seed:

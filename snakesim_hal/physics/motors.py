@@ -73,7 +73,7 @@ class Motors:
         steepness = np.array([roll_off(joint, robot.module, step_s) for joint in joints])
         return steepness * self.full_nm / speed_limits_rad_s
 
-    def drive(
+    def set_demand(
         self, i: int, mode: Mode, target: float, limit_nm: float, gain: float, damping: float, speed: float
     ) -> None:
         """Set the demand of one motor.
@@ -171,7 +171,7 @@ class Motors:
         self._steps += 1
         return torque
 
-    def take_heat(self) -> Floats:
+    def pop_mean_square_torque(self) -> Floats:
         """Return the mean square of each torque since the last call, N²·m², (n_joints,), and start a new mean."""
         mean = self.heat / max(self._steps, 1)
         self.heat[:] = 0.0

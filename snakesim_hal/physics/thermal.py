@@ -20,7 +20,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 
-MIN_SHARE = 0.2  # fraction of its torque that the hottest winding may still use
+MIN_TORQUE_FRACTION = 0.2  # fraction of its torque that the hottest winding may still use
 INJECTED_ABOVE_STOP_K = 5.0  # how far above its `stop_at_c` an injected fault heats a winding
 
 
@@ -37,7 +37,7 @@ class HeatLimits:
         It is 1 up to `derate_from_c`, `MIN_SHARE` from `stop_at_c` on, and falls linearly between the two.
         """
         over = (winding_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
-        return 1.0 - (1.0 - MIN_SHARE) * min(max(over, 0.0), 1.0)
+        return 1.0 - (1.0 - MIN_TORQUE_FRACTION) * min(max(over, 0.0), 1.0)
 
 
 class Thermal:

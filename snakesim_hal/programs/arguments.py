@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_endpoint, check_namespace
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
 
 
-def number(least: float, most: float, unit: str = "") -> Callable[[str], float]:
+def number_type(least: float, most: float, unit: str = "") -> Callable[[str], float]:
     """Return a type for argparse: a number within bounds.
 
     Args:
@@ -39,7 +39,7 @@ def number(least: float, most: float, unit: str = "") -> Callable[[str], float]:
             kind = "a whole number" if is_whole else "a number"
             suffix = f" {unit}" if unit else ""
             bounds = f"from {least:.12g} to {most:.12g}{suffix}"
-            raise argparse.ArgumentTypeError(f"{short(text, 40)!r}: give {kind} {bounds}")
+            raise argparse.ArgumentTypeError(f"{shorten(text, 40)!r}: give {kind} {bounds}")
         return value
 
     return parse
@@ -83,12 +83,12 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
         "seed": arguments.seed,
     }
     overrides = [parse_set(text) for text in arguments.set]
-    overrides += [Override(key, None, f"--unset {short(key)}") for key in arguments.unset]
+    overrides += [Override(key, None, f"--unset {shorten(key)}") for key in arguments.unset]
     if getattr(arguments, "until_goal", False):
         overrides.append(Override("mission.until_goal", True, "--until-goal"))
     for key, value in flags.items():
         if value is not None:
-            flag = f"--{key.removesuffix('_s').replace('_', '-')} {short(str(value))}"
+            flag = f"--{key.removesuffix('_s').replace('_', '-')} {shorten(str(value))}"
             overrides.append(Override(key, value, flag))
     faults = getattr(arguments, "fault", None)
     if faults:
@@ -174,7 +174,7 @@ def check_network(arguments: argparse.Namespace) -> None:
         check_namespace(arguments.namespace, "--namespace")
 
 
-def session_given(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
+def read_session_option(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
     """Read the session file, if one is given. Raises ConfigError.
 
     Args:
@@ -194,7 +194,7 @@ def session_given(arguments: argparse.Namespace, *, or_environment: bool = False
     return read_session(path.expanduser())
 
 
-def link_of(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
+def create_link(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
     """Return how a process of a robot joins its network. Raises ConfigError.
 
     Args:
@@ -206,7 +206,7 @@ def link_of(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool =
     from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
     check_network(arguments)
-    session = session_given(arguments)
+    session = read_session_option(arguments)
     max_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.max_image_bytes)
     if session is not None:
         namespace = session.namespace_for(arguments.namespace) or config.robot.name

@@ -21,9 +21,9 @@ from snakesim_hal.base.process import (
     restart_process,
     tune_garbage_collector,
 )
-from snakesim_hal.base.terminal import exit_code, print_stderr
-from snakesim_hal.faults.allowed import faults_of_host
-from snakesim_hal.host.cable_file import kept_at
+from snakesim_hal.base.terminal import print_stderr, run_tool
+from snakesim_hal.faults.allowed import create_host_faults
+from snakesim_hal.host.cable_file import open_cable_file
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.host.latch import EstopLatch
@@ -38,7 +38,7 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.programs.arguments import add_host
 from snakesim_hal.programs.preflight import backend_settings, check_backend
-from snakesim_hal.programs.service_program import ProcessOptions, joined, process_options
+from snakesim_hal.programs.service_program import ProcessOptions, open_session_when_ready, process_options
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.wire import keys
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
     add_host(parser)
     arguments = parser.parse_args(argv)
-    return exit_code("snakesim host", lambda: host(process_options(arguments, hosts=True)))
+    return run_tool("snakesim host", lambda: host(process_options(arguments, hosts=True)))
 
 
 def host(given: ProcessOptions) -> int:
@@ -64,7 +64,7 @@ def host(given: ProcessOptions) -> int:
     host = _run(given, check_backend(given.config, given.loaded.table))
     if host.ended == "reset":
         restart_process()
-    stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
+    stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.kept)
     return 1 if stopped or host.ended != "complete" else 0
 
 
@@ -76,7 +76,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
-        network = open_session(given.link) if given.link.listen else joined(given.link, "host")
+        network = open_session(given.link) if given.link.listen else open_session_when_ready(given.link, "host")
         session = opened.enter_context(network)
         refuse_second_host(session, given.link)
         host = _create_host(arguments, config, backend, session, realtime_warnings)
@@ -84,11 +84,13 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         on_stop_signal(host.stop)
         tune_garbage_collector()
         memory = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
-        with HostRecordWriter(host.black_box, host.description, partial(record_of, host), arguments.out, memory):
+        with HostRecordWriter(
+            host.black_box, host.description, partial(create_host_record, host), arguments.out, memory
+        ):
             if config.beside:  # imported only for runs with such services
-                from snakesim_hal.programs.in_host_service import Beside
+                from snakesim_hal.programs.in_host_service import InHostServices
 
-                opened.enter_context(Beside(config, session))
+                opened.enter_context(InHostServices(config, session))
             host.run()
     return host
 
@@ -100,7 +102,7 @@ def _open_stop_port(given: ProcessOptions, config: RunConfig, opened: contextlib
         stop_port = socket.socket(fileno=os.dup(inherited))  # the original stays open for another host
     else:
         stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
-        robot = LocalRobot.on(given.link, config.robot.name, config.backend, stop_port)
+        robot = LocalRobot.describe(given.link, config.robot.name, config.backend, stop_port)
         opened.enter_context(registered(robot))
     opened.callback(stop_port.close)
     return stop_port
@@ -120,7 +122,7 @@ def _create_host(
     if config.controller != CHECK:
         unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
     folder = robot_folder(described.robot, described.backend, described.hardware)
-    backend_with_faults, faults = faults_of_host(config, backend, session)
+    backend_with_faults, faults = create_host_faults(config, backend, session)
     options = HostOptions(
         # The end of the run.
         max_ticks=round(config.duration_s * config.rate_hz) if arguments.once else None,
@@ -128,12 +130,12 @@ def _create_host(
         stay=arguments.end_after_fault is None,
         # What connects the host with its surroundings.
         latch=EstopLatch(folder),
-        starter=HostEnd.of(arguments.channel),
+        starter=HostEnd.from_descriptor(arguments.channel),
         realtime_warnings=realtime_warnings,
         # The robot.
         faults=faults,
         unchecked=unchecked,
-        cables=kept_at(folder, config.robot.joint_table, described),
+        cables=open_cable_file(folder, config.robot.joint_table, described),
     )
     return Host(config, backend_with_faults, session, options)
 
@@ -144,7 +146,8 @@ def refuse_second_host(session: Session, link: Link) -> None:
     while others := session.present(keys.HOST_ALL):
         if time.monotonic() > deadline:
             raise RefusedError(
-                f"another HAL host is on {link.endpoint} as {link.namespace}: {keys.service_of(others[0])}. End it, or "
+                f"another HAL host is on {link.endpoint} as {link.namespace}: "
+                f"{keys.parse_service(others[0])}. End it, or "
                 f"give this robot another --namespace"
             )
 
@@ -160,7 +163,7 @@ def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
         raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
 
 
-def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
+def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
     """Return the host's present statistics.
 
     This may be called in another thread than the host's loop, which updates each value atomically.
@@ -176,19 +179,19 @@ def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostReco
         command_digest=host.black_box.command_digest,
         state_to_command_us={f"p{p}": statistics.state_to_command.percentile_us(p) for p in (50, 99)},
         tick_times=statistics.times.timings(),
-        rejected_commands=dict(authority.rejected),
-        limited_commands=dict(authority.limited),
-        faults=list(authority.since_start.kept),
-        faults_left_out=authority.since_start.left_out,
+        rejected_commands=dict(authority.rejected_counts),
+        limited_commands=dict(authority.limited_counts),
+        faults=list(authority.faults_since_start.kept),
+        faults_left_out=authority.faults_since_start.left_out,
         lifecycle=authority.state,
-        why=authority.why,
+        why=authority.reason,
         ended=host.ended,
         ended_why=host.ended_why,
         lost_ticks=lost_ticks,
         failure=failure,
-        injected=list(host.faults.noted),
+        injected=list(host.faults.notes),
         requests=list(host.requests),
-        isolated=authority.isolated,
+        isolated=authority.isolated_joints,
     )
 
 

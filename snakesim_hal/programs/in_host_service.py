@@ -28,7 +28,7 @@ RESTART_S = 1.0  # until a service that ended is started again
 END_S = 0.5  # for all threads to end; one that hangs ends with the process
 
 
-class Beside:
+class InHostServices:
     """The services of a run that run inside the host, from `with` to its end. They wait for the host to publish."""
 
     def __init__(self, config: RunConfig, session: Session) -> None:

@@ -5,12 +5,12 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
-from snakesim_hal.model.robot import described, with_modes
-from snakesim_hal.model.scenario import CONTROL, RunConfig, description_of
+from snakesim_hal.model.robot import describe_joints, with_modes
+from snakesim_hal.model.scenario import CONTROL, RunConfig, describe_run_robot
 from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
@@ -34,7 +34,7 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
-    config = on_backend(config, find(BACKENDS, config.backend))
+    config = with_backend_modes(config, find(BACKENDS, config.backend))
     controller = find(CONTROLLERS, config.controller)
     if controller is not None:
         config = _check_controller(config, controller, source, table)
@@ -50,11 +50,11 @@ def _check_controller(config: RunConfig, controller: Any, source: str, table: Ta
     origin = table.origin if table is not None else None
     settings = plugin_settings(controller, config.control_settings, source, config.control_section, origin)
     config = _without_pose_services(config, controller)
-    problem = what_it_lacks(described(config.robot), controller, config.controller)
+    problem = describe_missing_capability(describe_joints(config.robot), controller, config.controller)
     if problem is not None:
         raise ConfigError(f"robot {config.robot.name!r}: {problem}")
     if hasattr(controller, "check"):
-        controller.check(description_of(config), settings)
+        controller.check(describe_run_robot(config), settings)
     return config
 
 
@@ -87,18 +87,20 @@ def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] =
     missing = [attribute for attribute in SERVICE_ATTRIBUTES if not hasattr(service, attribute)]
     if missing:
         raise ConfigError(
-            f"service {short(code)!r} has no {', '.join(missing)}; write its class as in snakesim_hal/service.py, "
+            f"service {shorten(code)!r} has no {', '.join(missing)}; write its class as in snakesim_hal/service.py, "
             "or derive it from Service there"
         )
     if section is not None and service.name != name:
         raise ConfigError(
-            f"service {short(code)!r} calls itself {service.name!r}, but is that of services.{short(name)}, and both "
-            f"have one name. Write [services.{service.name}] with code = {short(code)!r}, or change the class's `name`"
+            f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
+            f"services.{shorten(name)}, and both "
+            f"have one name. Write [services.{service.name}] with code = {shorten(code)!r}, or change the "
+            "class's `name`"
         )
     return service
 
 
-def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str) -> str | None:
+def describe_missing_capability(joints: Sequence[JointDescription], controller: Any, name: str) -> str | None:
     """Return the first joint, with the capability, that a controller needs and the robot does not have.
 
     Args:
@@ -111,7 +113,7 @@ def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str
     """
     for joint in joints:
         for mode in getattr(controller, "MODES", ()):
-            if not joint.has(mode):
+            if not joint.supports_mode(mode):
                 available = [mode.name.lower() for mode in joint.modes if mode is not Mode.PASSIVE]
                 return (
                     f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has "
@@ -134,7 +136,7 @@ def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
     They stay if the scenario asks for dead reckoning itself, or has further services.
     """
     # A scenario that asks for dead reckoning names it as its localization.
-    dead_reckons = config.dead_reckons(description_of(config))
+    dead_reckons = config.dead_reckons(describe_run_robot(config))
     if not dead_reckons or config.mission.localization != "pose_sensor":
         return config
     services = config.own_services.keys()
@@ -146,7 +148,7 @@ def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
     return msgspec.structs.replace(config, services=remaining)
 
 
-def on_backend(config: RunConfig, backend: Any) -> RunConfig:
+def with_backend_modes(config: RunConfig, backend: Any) -> RunConfig:
     """Return the configuration with the control modes that the joints have on a backend.
 
     These are all modes, unless the backend's class names them in `MODES`, or for each joint in `as_driven`.
@@ -185,7 +187,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     if backend is None:
         return config
     settings = backend_settings(config, backend, table)
-    config = on_backend(config, backend)
+    config = with_backend_modes(config, backend)
     clock_modes = backend.check(config, settings)
     if config.clock_mode in clock_modes:
         return config

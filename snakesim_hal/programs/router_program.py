@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from snakesim_hal.base.process import on_stop_signal
-from snakesim_hal.base.terminal import exit_code
+from snakesim_hal.base.terminal import run_tool
 from snakesim_hal.network.session import open_session
 from snakesim_hal.programs.arguments import add_insecure, add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import ProcessOptions, process_options
@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_insecure(parser)
     add_parent(parser)
     arguments = parser.parse_args(argv)
-    return exit_code("snakesim router", lambda: _forward(process_options(arguments, hosts=True)))
+    return run_tool("snakesim router", lambda: _forward(process_options(arguments, hosts=True)))
 
 
 def _forward(given: ProcessOptions) -> int:

@@ -23,12 +23,12 @@ from snakesim_hal.base.process import (
     enter_realtime,
     tune_garbage_collector,
 )
-from snakesim_hal.base.terminal import exit_code, print_stderr
+from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.programs.arguments import add_service, link_of, load_scenario
+from snakesim_hal.programs.arguments import add_service, create_link, load_scenario
 from snakesim_hal.programs.preflight import find_service
-from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
+from snakesim_hal.service import SERVICE_START_LIMIT_S, Service, ServiceLoop
 
 CONNECT_TIMEOUT_S = 2.0  # for one attempt
 REPORT_PERIOD_S = 20.0  # between two lines that report the wait
@@ -53,7 +53,7 @@ def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> Pr
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
     loaded = load_scenario(arguments)
-    return ProcessOptions(loaded, link_of(arguments, loaded.config, hosts=hosts), arguments)
+    return ProcessOptions(loaded, create_link(arguments, loaded.config, hosts=hosts), arguments)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             serve(find_service(given.config, arguments.name), given)
         return 0
 
-    return exit_code(f"snakesim {arguments.name}", act)
+    return run_tool(f"snakesim {arguments.name}", act)
 
 
 def serve(service_type: type[Service], given: ProcessOptions) -> None:
@@ -84,7 +84,7 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
     if service_type.urgent and config.clock_mode == "realtime":
         enter_realtime(SERVICE_PRIORITY)
         drop_priority_after(config.lease_ns * 1e-9)
-    with joined(given.link, name) as session:
+    with open_session_when_ready(given.link, name) as session:
         waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
         with closing(ServiceLoop(service_type, config, session, waiting.keeps_waiting)) as loop:
             loop.join()
@@ -108,11 +108,11 @@ class StartupWait:
         if now_s - self._reported_s >= REPORT_PERIOD_S:
             self._reported_s = now_s
             print_stderr(f"{self._name}: waiting for {self._what}")
-        return now_s - self._began_s < START_LIMIT_S
+        return now_s - self._began_s < SERVICE_START_LIMIT_S
 
 
 @contextmanager
-def joined(link: Link, name: str) -> Iterator[Session]:
+def open_session_when_ready(link: Link, name: str) -> Iterator[Session]:
     """Connect as soon as there is a network. Raises NotConnectedError when there is none within START_LIMIT_S."""
     waiting = StartupWait(name, f"the network: {link.endpoint}")
     with ExitStack() as stack:

@@ -19,18 +19,18 @@ from typing import Self
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.base.errors import ConfigError, RefusedError, ServiceError, SnakesimError
-from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, place_of
+from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, describe_interrupted_line
 from snakesim_hal.base.terminal import report_error
-from snakesim_hal.faults.allowed import faults_of_host
+from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.host import Host, HostOptions
-from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.fault_plan import parse_planned
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.host_program import open_backend
 from snakesim_hal.programs.preflight import find_service
-from snakesim_hal.service import START_LIMIT_S, ServiceLoop
-from snakesim_hal.wire.messages import request_to_arm
+from snakesim_hal.service import SERVICE_START_LIMIT_S, ServiceLoop
+from snakesim_hal.wire.messages import make_arm_request
 
 AFTER_FAULT_S = 1.5
 ARM_LIMIT_S, ARM_LIMIT_TURNS = 10.0, 100  # both: planning, or a busy computer, may take long for a turn
@@ -52,7 +52,7 @@ def check(config: RunConfig) -> None:
     for name, service in config.services.items():
         if service.external:
             raise ConfigError(f"{where}: services.{name} is external, and there is no network to meet it")
-    for injection in planned(config):
+    for injection in parse_planned(config):
         if injection.target_type in ("process", "clock"):
             raise ConfigError(f"{where}: fault {str(injection)!r} needs processes of their own")
 
@@ -73,7 +73,7 @@ class InProcessRun:
         """
         check(config)
         self.config = config
-        self._limit = StepLimit(START_LIMIT_S, pulse)
+        self._limit = StepLimit(SERVICE_START_LIMIT_S, pulse)
         self._turn_limit_s = turn_limit_s or max(TURN_LIMIT_S, config.start_limit_s)
         self.network = LocalNetwork()
         self.failed: list[str] = []  # services that could not go on, and why
@@ -111,7 +111,7 @@ class InProcessRun:
             )
         session = self.network.session()
         opened.callback(session.close)
-        faulty, faults = faults_of_host(config, backend, session)
+        faulty, faults = create_host_faults(config, backend, session)
         options = HostOptions(
             max_ticks=round(config.duration_s * config.rate_hz),
             end_after_fault_s=AFTER_FAULT_S,
@@ -153,7 +153,7 @@ class InProcessRun:
                     if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
                         raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.why}")
                     if status.ready_to_arm:
-                        self.host.submit_request(request_to_arm(self.host.description, WHO), lambda _answer: None)
+                        self.host.submit_request(make_arm_request(self.host.description, WHO), lambda _answer: None)
                 if not before_services:
                     yield
 
@@ -201,8 +201,12 @@ class InProcessRun:
     def _explain(self, error: StepTooLongError) -> str:
         """Return why a part was interrupted, and what to do about it."""
         if self._limit.is_hurried:
-            return f"{place_of(error)} had not returned {INTERRUPT_GRACE_S:g} s after the run was told to stop"
+            return (
+                f"{describe_interrupted_line(error)} had not returned {INTERRUPT_GRACE_S:g} s after the "
+                "run was told to stop"
+            )
         return (
-            f"{place_of(error)} took longer than {self._limit.limit_s:g} s in one tick; if it needs so long, allow it "
+            f"{describe_interrupted_line(error)} took longer than {self._limit.limit_s:g} s in one tick; if "
+            "it needs so long, allow it "
             "with --set start_limit_s=600"
         )

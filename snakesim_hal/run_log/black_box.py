@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.safety.authority import Decision
+from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Pose
 
@@ -64,7 +64,7 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
     columns: list[Column]  # in order; the rest of the row is padding
 
     @staticmethod
-    def of(robot: Description) -> "Layout":
+    def for_robot(robot: Description) -> "Layout":
         """Return the columns for a robot. Names contain the units; vectors are in the frame of `Pose`."""
         joints = len(robot.joints)
         joint_columns = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
@@ -109,7 +109,7 @@ class BlackBox:
 
     def __init__(self, description: Description, memory_bytes: int = MEMORY_BYTES) -> None:
         """Allocate the memory for a robot's rows."""
-        self.layout = Layout.of(description)
+        self.layout = Layout.for_robot(description)
         joints = len(description.joints)
         self._pack_into = struct.Struct(f"<qd{5 * joints + 9}d{joints}b").pack_into
         self._capacity = max(memory_bytes // self.layout.row_bytes, 2)
@@ -122,14 +122,14 @@ class BlackBox:
         self._contact_peak_n = 0.0
         self._contact_count = 0
 
-    def record(self, tick: int, timestamp_ns: int, samples: Samples, decision: Decision) -> None:
+    def record(self, tick: int, timestamp_ns: int, samples: Samples, decision: TickDecision) -> None:
         """Record one tick."""
         pose = samples.others.get(keys.POSE)
         if isinstance(pose, Pose):
             self._pose = [*pose.position_w, *pose.orientation_wxyz]
         contacts = samples.others.get(keys.CONTACTS)
         if isinstance(contacts, Contacts):
-            self._contact_peak_n, self._contact_count = touching(contacts)
+            self._contact_peak_n, self._contact_count = summarize_contacts(contacts)
         joints = samples.joints
         setpoints = decision.setpoints
         self._pack_into(
@@ -161,7 +161,7 @@ class BlackBox:
         """Return the hash of every setpoint applied so far."""
         return self._digest.hexdigest()
 
-    def rows_from(self, row: int) -> tuple[int, bytes]:
+    def read_rows(self, row: int) -> tuple[int, bytes]:
         """Return some rows from number `row` on, or from the oldest row that is still kept.
 
         May be called from another thread: the rows are consistent, also while the host records.
@@ -180,7 +180,7 @@ class BlackBox:
                 return first, rows
 
 
-def touching(contacts: Contacts) -> tuple[float, int]:
+def summarize_contacts(contacts: Contacts) -> tuple[float, int]:
     """Return the force of the strongest contact in N, and the number of touched obstacles.
 
     The force is the mean over 50 ms that the sensor measures, see `measured_force`; without one, it is the largest
@@ -214,7 +214,7 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
         raise ConfigError(f"{path} cannot be read as the black box of a run: {str(error)[:200]}") from None
 
 
-def digest_of(columns: dict[str, NDArray[Any]]) -> str:
+def compute_digest(columns: dict[str, NDArray[Any]]) -> str:
     """Compute `command_digest` from recorded rows, for a host that was killed."""
     names = {"tick": "<i8", "mode": "|i1", "target": "<f8", "torque_limit_nm": "<f8"}
     dtype = [(name, type_, columns[name].shape[1:]) for name, type_ in names.items()]

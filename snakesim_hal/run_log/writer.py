@@ -17,7 +17,7 @@ from typing import Protocol, Self
 
 import msgspec
 
-from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.base.workers import start_worker
 from snakesim_hal.run_log.black_box import BlackBox
@@ -108,7 +108,7 @@ class HostRecordWriter:
         if self._file is None:  # the file in the folder is an earlier host's, and must not be overwritten
             return
         content = msgspec.json.encode(self._make_statistics(failure))
-        write_whole(folder / HOST_RECORD, msgspec.json.format(content))
+        write_atomically(folder / HOST_RECORD, msgspec.json.format(content))
 
     def _open(self, folder: Path) -> int:
         """Create the files of this host; those of an earlier one in this run get a number."""
@@ -117,9 +117,9 @@ class HostRecordWriter:
             for path in (folder / BLACK_BOX, folder / HOST_RECORD):
                 with contextlib.suppress(FileNotFoundError):
                     path.rename(_numbered(path, number))
-        write_whole(folder / DESCRIPTION, msgspec.json.encode(self._description))
+        write_atomically(folder / DESCRIPTION, msgspec.json.encode(self._description))
         header = self._box.layout.header()
-        write_whole(folder / BLACK_BOX, header)
+        write_atomically(folder / BLACK_BOX, header)
         self._rows_offset = len(header)
         return os.open(folder / BLACK_BOX, os.O_WRONLY | os.O_CLOEXEC)
 
@@ -134,7 +134,7 @@ class HostRecordWriter:
         size = self._box.layout.row_bytes
         end = self._box.ticks  # of now, because a slow disk may never catch up with a host that keeps recording
         while self._next_row < end:
-            first, rows = self._box.rows_from(self._next_row)
+            first, rows = self._box.read_rows(self._next_row)
             self._skipped_rows += first - self._next_row
             self._next_row = first
             offset = self._rows_offset + (self._next_row - self._skipped_rows) * size

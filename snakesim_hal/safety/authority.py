@@ -18,7 +18,7 @@ from snakesim_hal.safety.derating import Derating
 from snakesim_hal.safety.fault_log import FaultLog
 from snakesim_hal.safety.isolation import Isolation
 from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask
-from snakesim_hal.safety.lease import Lease, freed, renewed, rule
+from snakesim_hal.safety.lease import Lease, decide_lease_request, free_lease, renew_lease
 from snakesim_hal.safety.lifecycle import UnmetCondition
 from snakesim_hal.safety.limit_names import name_active_limits
 from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityCheck, replace_unreadable
@@ -42,7 +42,7 @@ MAX_REASON_LENGTH = 500  # characters, as `quantities.Reason` allows
 
 
 @dataclass(frozen=True)
-class Decision:
+class TickDecision:
     """The setpoints of one tick."""
 
     setpoints: SafeSetpoints
@@ -81,7 +81,7 @@ class Authority:
 
         # Lifecycle and lease.
         self.state: LifecycleState = "disarmed"
-        self.why = "not armed yet"
+        self.reason = "not armed yet"
         self.arm_session = 0
         self.lease = Lease(epoch=first_epoch)
         self._state_tick = 0  # of the newest joint state
@@ -89,12 +89,12 @@ class Authority:
         self._stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
 
         # Faults and counters.
-        self.since_clear = FaultLog()
-        self.since_start = FaultLog()
-        self.accepted = 0
-        self.standby = 0
-        self.rejected: Counter[str] = Counter()
-        self.limited: Counter[str] = Counter()
+        self.faults_since_clear = FaultLog()
+        self.faults_since_start = FaultLog()
+        self.accepted_count = 0
+        self.standby_count = 0
+        self.rejected_counts: Counter[str] = Counter()
+        self.limited_counts: Counter[str] = Counter()
 
         # Checks of what is measured.
         self._plausibility = PlausibilityCheck(self.limits)
@@ -139,28 +139,28 @@ class Authority:
         """Process the newest power sample: supply, heat and leaks. `expire` acts on it."""
         self._derating.update(power, now_ns)
 
-    def readable(self, joints: JointState) -> JointState:
+    def replace_unreadable(self, joints: JointState) -> JointState:
         """Return a joint state for publishing: without NaN or infinity."""
         return replace_unreadable(joints, self._measured)
 
     @property
-    def derated(self) -> dict[str, float]:
+    def derated_joints(self) -> dict[str, float]:
         """The names of derated joints, with the fraction of their torque that is left."""
         return self._derating.derated_joints()
 
     @property
     def faults(self) -> list[Fault]:
         """Faults since the last clear, as far as they are kept."""
-        return self.since_clear.kept
+        return self.faults_since_clear.kept
 
     @property
-    def isolated(self) -> list[str]:
+    def isolated_joints(self) -> list[str]:
         """The names of joints that failed, and are passive until a clear."""
         return self._isolation.names
 
     # --- inputs: commands and requests -----------------------------------------------------------------------
 
-    def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
+    def offer_command(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
         """Accept a command, or return why it is rejected.
 
         Args:
@@ -179,7 +179,7 @@ class Authority:
             limits=self.limits,
         )
         if refusal is not None:
-            self.rejected[refusal] += 1
+            self.rejected_counts[refusal] += 1
             return refusal
         if not self.answers_arm_session(command):
             # It does not renew the lease either: that takes commands of the present arm session.
@@ -187,36 +187,36 @@ class Authority:
             return "before_arming"
         # Only now: a rejected command must not make the next good one a replay.
         self._last_sequence = command.sequence
-        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        self.lease = renew_lease(self.lease, now_ns, self.description.lease_ns)
         self._command = command
         self._command_ns = now_ns
         if self.state == "armed":
-            self.accepted += 1
+            self.accepted_count += 1
             self._recent.append(command)
         else:
-            self.standby += 1
+            self.standby_count += 1
         return None
 
     def answers_arm_session(self, command: JointCommand) -> bool:
         """Return whether a command names the present arm session, or the robot is not armed."""
         return self.state != "armed" or command.arm_session == self.arm_session
 
-    def reject(self, reason: str) -> None:
+    def count_rejection(self, reason: str) -> None:
         """Count a sample that could not be decoded."""
-        self.rejected[reason] += 1
+        self.rejected_counts[reason] += 1
 
     def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
         """Decide a lease request. If the lease changes hands, an armed robot is disarmed."""
-        decision = rule(self.lease, request, now_ns, self.description.lease_ns)
+        decision = decide_lease_request(self.lease, request, now_ns, self.description.lease_ns)
         if self.state == "armed" and request.action == "renew":
             # While armed only a command renews the lease.
-            return self._answer(decision.refusal, decision.word)
+            return self._answer(decision.refusal, decision.refusal_word)
         self.lease = decision.lease
         if decision.changed_hands:
             self._forget_commands()
             if self.state == "armed":
                 self._transition("disarm", f"lease passed to {decision.lease.holder or 'nobody'}")
-        return self._answer(decision.refusal, decision.word)
+        return self._answer(decision.refusal, decision.refusal_word)
 
     def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
         """Arm, disarm, clear or finish. A refused arming lists every condition that is not met."""
@@ -234,8 +234,8 @@ class Authority:
 
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
         """Stop now, for any requester."""
-        fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
-        self._record(fault, stops=self.state != "estop")
+        latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
+        self._record(latch_fault, stops=self.state != "estop")
         self._transition("estop", f"emergency stop by {request.who}; clear it to go on")
         return self._answer(None)
 
@@ -265,7 +265,7 @@ class Authority:
             self._transition("fault", fault.cause[:MAX_REASON_LENGTH] or fault.what)
         self._drop_lease()
 
-    def note(self, fault: Fault, *, precedes_stop: bool = False) -> None:
+    def record_fault(self, fault: Fault, *, precedes_stop: bool = False) -> None:
         """Record a fault for people that stops nothing by itself.
 
         Args:
@@ -275,20 +275,20 @@ class Authority:
         reach = "robot" if precedes_stop else "none"
         self._record(msgspec.structs.replace(fault, reach=reach), stops=False)
 
-    def holder_gone(self, cause: str) -> None:
+    def on_holder_gone(self, cause: str) -> None:
         """React to the end of the lease holder's process: unless the robot is armed, free the lease at once."""
         if self.state != "armed":
             self._drop_lease()
         if self.state == "disarmed":
-            self.why = cause
+            self.reason = cause
 
     # --- outputs ---------------------------------------------------------------------------------------------
 
-    def against_arming(self, now_ns: int) -> list[str]:
+    def list_unmet_conditions(self, now_ns: int) -> list[str]:
         """Return every condition for arming that is not met; empty if the robot is ready."""
         return [condition.reason for condition in self._find_unmet_conditions(now_ns)]
 
-    def expire(self, now_ns: int, tick: int) -> None:
+    def check_deadlines(self, now_ns: int, tick: int) -> None:
         """Latch the faults that follow from the measured values and from the time.
 
         These are: an armed robot without plausible joint states; a robot, armed or not, whose modules are too hot,
@@ -301,8 +301,8 @@ class Authority:
         for fault in new_faults:
             self.fault(fault)
         if silent is not None and not self._isolation.is_isolated(silent.joint):
-            self.note(silent)
-        if self.lease.live(now_ns):
+            self.record_fault(silent)
+        if self.lease.is_live(now_ns):
             return
         if self.state == "armed":
             term_ms = self.description.lease_ns / 1e6
@@ -311,7 +311,7 @@ class Authority:
         else:
             self._drop_lease()
 
-    def decide(self, up_to: int | None = None) -> Decision:
+    def decide(self, up_to: int | None = None) -> TickDecision:
         """Return the setpoints for the next period. Call `expire` first.
 
         Args:
@@ -340,16 +340,16 @@ class Authority:
             self._decided_command = command
         applied = self._isolation.make_passive(applied)
         self._applied = applied
-        return Decision(limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited)
+        return TickDecision(limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited)
 
     # --- commands and setpoints ------------------------------------------------------------------------------
 
     def _count_command_before_arming(self, command: JointCommand) -> None:
         """Count a command of another arm session: it is an error only if it was sent after the last arming."""
         if command.tick <= self._armed_tick:
-            self.standby += 1
+            self.standby_count += 1
         else:
-            self.rejected["before_arming"] += 1
+            self.rejected_counts["before_arming"] += 1
 
     def _find_command(self, up_to: int | None) -> JointCommand | None:
         """Return the newest command, or in lockstep the newest one that does not answer a later tick than `up_to`."""
@@ -369,7 +369,7 @@ class Authority:
                 command, applied, measured=self._measured, limits=self.limits, torque_fraction=torque_fraction
             )
         limited |= self._isolation.name_overruled(command)
-        self.limited.update(limited.values())
+        self.limited_counts.update(limited.values())
         return limited
 
     def _derated_torque_nm(self) -> Floats:
@@ -387,7 +387,7 @@ class Authority:
         if unmet:
             reasons = "; ".join(condition.reason for condition in unmet)
             refusals = {condition.refusal for condition in unmet}
-            return self._answer(reasons, min(refusals, key=lifecycle.ORDER.index))
+            return self._answer(reasons, min(refusals, key=lifecycle.REFUSAL_ORDER.index))
         as_it_is = ", unchecked" if self.unchecked else ""
         self._transition("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
         self.arm_session += 1
@@ -395,7 +395,7 @@ class Authority:
         self._command = None
         self._decided_command = None
         self._recent.clear()
-        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        self.lease = renew_lease(self.lease, now_ns, self.description.lease_ns)
         return self._answer(None)
 
     def _disarm(self, request: LifecycleRequest) -> Answer:
@@ -406,11 +406,11 @@ class Authority:
     def _clear(self, request: LifecycleRequest) -> Answer:
         if not self._transition("clear", f"cleared by {request.who}; arm to move again"):
             hint = ""
-            if self.isolated:
-                hint = f"; disarm first, then a clear ends the isolation of {', '.join(self.isolated)}"
+            if self.isolated_joints:
+                hint = f"; disarm first, then a clear ends the isolation of {', '.join(self.isolated_joints)}"
             return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
         self._end_isolation()
-        self.since_clear = FaultLog()
+        self.faults_since_clear = FaultLog()
         return self._answer(None)
 
     def _transition(self, event: lifecycle.Event, why: str) -> bool:
@@ -430,7 +430,7 @@ class Authority:
         if was_armed:
             self._command = None
         self.state = following
-        self.why = why
+        self.reason = why
         return True
 
     def _find_unmet_conditions(self, now_ns: int) -> list[UnmetCondition]:
@@ -439,7 +439,7 @@ class Authority:
         if self.state != "disarmed":
             clear_first = "; first `snakesim clear`" if self.state in ("fault", "estop") else ""
             unmet.append(UnmetCondition("wrong_state", f"state is {self.state}, must be disarmed{clear_first}"))
-        unmet += [UnmetCondition("cable", reason) for reason in self._cables.against_arming()]
+        unmet += [UnmetCondition("cable", reason) for reason in self._cables.list_arming_obstacles()]
         not_ready = self._find_unready_robot(now_ns) + self._find_unready_commands(now_ns)
         unmet += [UnmetCondition("not_ready", reason) for reason in not_ready]
         return unmet
@@ -460,7 +460,7 @@ class Authority:
 
     def _find_unready_commands(self, now_ns: int) -> list[str]:
         """Return what is wrong with the lease and with the stream of commands."""
-        if not self.lease.live(now_ns):
+        if not self.lease.is_live(now_ns):
             return ["nothing commands the robot: the lease is free"]
         if self._command is None:
             return [f"no commands from {self.lease.holder} yet"]
@@ -475,8 +475,8 @@ class Authority:
     def _record(self, fault: Fault, *, stops: bool) -> None:
         """Log a fault. `stops` means that the robot is in `fault` or `estop` now because of it."""
         fault = msgspec.structs.replace(fault, cause=fault.cause[:MAX_REASON_LENGTH])
-        self.since_clear.add(fault, stops=stops)
-        self.since_start.add(fault, stops=stops)
+        self.faults_since_clear.add(fault, stops=stops)
+        self.faults_since_start.add(fault, stops=stops)
 
     def _isolate(self, fault: Fault, joints: Mask) -> bool:
         """Isolate failed joints, and return whether that is allowed. Later faults of isolated joints are ignored."""
@@ -485,12 +485,12 @@ class Authority:
         if self.state != "armed" or not self._isolation.isolate(joints):
             return False
         self._record(fault, stops=False)
-        self.why = f"armed, without {', '.join(self.isolated)}: {fault.cause}"[:MAX_REASON_LENGTH]
+        self.reason = f"armed, without {', '.join(self.isolated_joints)}: {fault.cause}"[:MAX_REASON_LENGTH]
         return True
 
     def _end_isolation(self) -> None:
         """End the isolation of joints. Before the next arming, a new joint state must arrive."""
-        if self.isolated:
+        if self.isolated_joints:
             self._isolation.clear()
             self._implausible = self._unknown_state("no joint state since the clear")
 
@@ -504,7 +504,7 @@ class Authority:
     # --- lease and answers -----------------------------------------------------------------------------------
 
     def _drop_lease(self) -> None:
-        self.lease = freed(self.lease)
+        self.lease = free_lease(self.lease)
         self._forget_commands()
 
     def _forget_commands(self) -> None:
@@ -515,7 +515,7 @@ class Authority:
         """Answer a request. `reason` is None if it was granted; `refusal` is the reason as one word."""
         return Answer(
             ok=reason is None,
-            reason=(reason or self.why)[:MAX_REASON_LENGTH],
+            reason=(reason or self.reason)[:MAX_REASON_LENGTH],
             refusal=refusal,
             epoch=self.lease.epoch,
             lifecycle=self.state,

@@ -44,9 +44,9 @@ class Cables:
         self._angles_rad = dict(seen_rad)  # counted over restarts
         self._drives_rad: dict[str, float] = {}  # as the drive measures it
         self._kept_rad: dict[str, float] = {}
-        self.not_kept = ""  # why the counted angles would be lost with this host; empty if they are saved
+        self.save_problem = ""  # why the counted angles would be lost with this host; empty if they are saved
 
-    def take(self, joints: JointState) -> None:
+    def follow(self, joints: JointState) -> None:
         """Follow a sample."""
         for joint in self._joints:
             if joint.name not in self._angles_rad:
@@ -57,7 +57,7 @@ class Cables:
                 self._angles_rad[joint.name] = drive_rad + turns * TURN_RAD
                 self._drives_rad[joint.name] = drive_rad
 
-    def to_keep(self, *, all_of_it: bool = False) -> dict[str, float] | None:
+    def take_angles_to_save(self, *, all_of_it: bool = False) -> dict[str, float] | None:
         """Return the counted angles if they should be saved now; from then on they count as saved.
 
         Args:
@@ -71,7 +71,7 @@ class Cables:
         self._kept_rad = angles_rad
         return dict(angles_rad)
 
-    def against_arming(self) -> list[str]:
+    def list_arming_obstacles(self) -> list[str]:
         """Return why the robot must not be armed: a turn is not known, or a cable could be wound too far."""
         reasons = [f"{name}: {why}" for name, why in self._unknown.items()]
         for joint in self._joints:
@@ -81,8 +81,8 @@ class Cables:
             reason = _explain_winding(joint, drive_rad, self._angles_rad[joint.name])
             if reason is not None:
                 reasons.append(reason)
-        if self.not_kept:
-            reasons.append(self.not_kept)
+        if self.save_problem:
+            reasons.append(self.save_problem)
         return reasons
 
     def _have_changed(self, angles_rad: Mapping[str, float]) -> bool:

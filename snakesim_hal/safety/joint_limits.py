@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.freshness import oldest_state_ns
+from snakesim_hal.wire.freshness import max_state_age_ns
 from snakesim_hal.wire.messages import Description, JointDescription, Mode
 
 Ints = NDArray[np.int64]
@@ -55,11 +55,11 @@ class JointLimits:
             max_step_rad=description.max_step_rad,
             period_s=description.period_ns * 1e-9,
             lease_ns=description.lease_ns,
-            oldest_state_ns=oldest_state_ns(description),
+            oldest_state_ns=max_state_age_ns(description),
             layout=description.layout,
             joints=tuple(joints),
-            has_velocity_mode=np.array([joint.has(Mode.VELOCITY) for joint in joints]),
-            all_modes=all(joint.has(mode) for joint in joints for mode in Mode),
+            has_velocity_mode=np.array([joint.supports_mode(Mode.VELOCITY) for joint in joints]),
+            all_modes=all(joint.supports_mode(mode) for joint in joints for mode in Mode),
         )
 
     def clip_angles(self, angle_rad: Floats) -> Floats:

@@ -14,7 +14,7 @@ class Lease:
     priority: int = 0
     expires_ns: int = 0
 
-    def live(self, now_ns: int) -> bool:
+    def is_live(self, now_ns: int) -> bool:
         """Return whether the lease is held at this time."""
         return self.holder is not None and now_ns <= self.expires_ns
 
@@ -26,10 +26,10 @@ class LeaseDecision:
     lease: Lease  # after the request
     refusal: str | None = None  # why it was refused; None: it was granted
     changed_hands: bool = False
-    word: str | None = None  # the refusal as one word
+    refusal_word: str | None = None  # the refusal as one word
 
 
-def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> LeaseDecision:
+def decide_lease_request(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> LeaseDecision:
     """Decide a request. While a lease is live, it is granted only to its holder, or to a higher priority.
 
     Args:
@@ -38,39 +38,41 @@ def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Leas
         now_ns: safety time.
         term_ns: how long a lease lasts without a renewal.
     """
-    is_holder = lease.live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
+    is_holder = lease.is_live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
     match request.action:
         case "acquire":
-            if lease.live(now_ns) and request.priority <= lease.priority:
+            if lease.is_live(now_ns) and request.priority <= lease.priority:
                 left_ms = (lease.expires_ns - now_ns) / 1e6
                 return LeaseDecision(
                     lease,
                     f"held by {lease.holder} (epoch {lease.epoch}, priority {lease.priority}) for another "
                     f"{left_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
-                    word="lease_held",
+                    refusal_word="lease_held",
                 )
             acquired = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
             return LeaseDecision(acquired, changed_hands=True)
         case "renew":
             if not is_holder:
                 return _refuse_other_holder(lease, request, "acquire the lease first")
-            return LeaseDecision(renewed(lease, now_ns, term_ns))
+            return LeaseDecision(renew_lease(lease, now_ns, term_ns))
         case "release":
             if not is_holder:
                 return _refuse_other_holder(lease, request, "nothing to release")
-            return LeaseDecision(freed(lease), changed_hands=True)
+            return LeaseDecision(free_lease(lease), changed_hands=True)
 
 
 def _refuse_other_holder(lease: Lease, request: LeaseRequest, advice: str) -> LeaseDecision:
     """Refuse a request of a client that does not hold the lease."""
-    return LeaseDecision(lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", word="not_holder")
+    return LeaseDecision(
+        lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", refusal_word="not_holder"
+    )
 
 
-def renewed(lease: Lease, now_ns: int, term_ns: int) -> Lease:
+def renew_lease(lease: Lease, now_ns: int, term_ns: int) -> Lease:
     """Return the lease, extended by a term from now on."""
     return replace(lease, expires_ns=now_ns + term_ns)
 
 
-def freed(lease: Lease) -> Lease:
+def free_lease(lease: Lease) -> Lease:
     """Return the free lease. The epoch stays, so that later commands of the last holder are rejected."""
     return Lease(epoch=lease.epoch)

@@ -42,7 +42,7 @@ def next_state(state: LifecycleState, event: Event) -> LifecycleState | None:
 # --- arming --------------------------------------------------------------------------------------------------
 
 # The refusals of a request to arm, the most important first.
-ORDER = (
+REFUSAL_ORDER = (
     "wrong_robot",
     "wrong_backend",
     "wrong_config",

@@ -70,7 +70,7 @@ def find_refusal(
         age_ns: how long ago the state that the command answers was published.
         limits: the limits of the robot.
     """
-    if not lease.live(now_ns):
+    if not lease.is_live(now_ns):
         return "no_lease"
     if command.lease_epoch != lease.epoch:
         return "wrong_epoch"
@@ -87,7 +87,7 @@ def find_refusal(
         return "wrong_length"
     if command.torque_limit_nm is not None and len(command.torque_limit_nm) != joints:
         return "wrong_length"
-    if not limits.all_modes and not all(map(JointDescription.has, limits.joints, command.mode)):
+    if not limits.all_modes and not all(map(JointDescription.supports_mode, limits.joints, command.mode)):
         return "wrong_mode"
     if not all(map(math.isfinite, command.target)):
         return "not_finite"
@@ -137,7 +137,7 @@ def limit_command(
             continue
         start = last_target
         if mode != last_mode:
-            start = bumpless_target(joint, mode, angle, velocity, torque)
+            start = find_bumpless_target(joint, mode, angle, velocity, torque)
         match mode:
             case Mode.POSITION:
                 target = _limit_angle_target(joint, requested, start, angle, limits)
@@ -270,7 +270,7 @@ def stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: f
     return acceleration_rad_s2 * (math.sqrt(reaction_s**2 + 2.0 * distance_rad / acceleration_rad_s2) - reaction_s)
 
 
-def bumpless_target(
+def find_bumpless_target(
     joint: JointDescription, mode: Mode, angle_rad: float, velocity_rad_s: float, torque_nm: float
 ) -> float:
     """Return the target with which a motor that changes to `mode` keeps its present torque.

@@ -75,7 +75,7 @@ class PlausibilityCheck:
             isolated: (n_joints,), joints that are not checked.
         """
         count = len(self._known)
-        if not joints.is_of(count):
+        if not joints.has_joint_count(count):
             fault = Fault(tick=joints.tick, what="state_invalid", cause=f"no joint state of {count} joints")
             return ImplausibleState(fault, np.ones_like(self._known))
         if self._is_ordinary(joints):
@@ -204,7 +204,7 @@ def replace_unreadable(joints: JointState, good: Measured) -> JointState:
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
     all_finite = all(all(map(math.isfinite, column)) for column in columns)
-    if all_finite or not joints.is_of(len(good.angle_rad)):
+    if all_finite or not joints.has_joint_count(len(good.angle_rad)):
         return joints
     angle = list(joints.angle_rad)
     velocity = list(joints.velocity_rad_s)

@@ -18,7 +18,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
-from snakesim_hal.safety.limiter import bumpless_target
+from snakesim_hal.safety.limiter import find_bumpless_target
 from snakesim_hal.wire.messages import LifecycleState, Mode, StopMode
 
 
@@ -42,7 +42,8 @@ class StopRamp:
             strict=True,
         )
         bumpless_rad = [
-            bumpless_target(joint, Mode.POSITION, angle, velocity, torque) for joint, angle, velocity, torque in states
+            find_bumpless_target(joint, Mode.POSITION, angle, velocity, torque)
+            for joint, angle, velocity, torque in states
         ]
         target_rad = np.where(last.mode == Mode.POSITION, last.target, bumpless_rad)
         near_rad = np.clip(target_rad, angle_rad - limits.max_step_rad, angle_rad + limits.max_step_rad)

@@ -25,7 +25,7 @@ _encoder = msgspec.msgpack.Encoder()
 encode = _encoder.encode
 
 
-def encoding_of(message: type[Message]) -> str:
+def format_encoding(message: type[Message]) -> str:
     """Return the Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
     known = message
     if issubclass(message, OwnSample):
@@ -38,7 +38,7 @@ class Decoder(Generic[MessageT]):
 
     def __init__(self, message: type[MessageT]) -> None:
         self.message = message
-        self.encoding = encoding_of(message)
+        self.encoding = format_encoding(message)
         self._max_bytes = MAX_IMAGE_BYTES if message in IMAGES else MAX_PAYLOAD_BYTES
         self._decoder = msgspec.msgpack.Decoder(message)
 

@@ -10,11 +10,11 @@ IMU = "sensor/imu"
 POSE = "sensor/pose"
 POWER = "sensor/power"
 DEPTH_ALL = "sensor/depth/*"
-COLOUR_ALL = "sensor/color/*"
+COLOR_ALL = "sensor/color/*"
 RANGE_ALL = "sensor/range/*"
 OWN_ALL = "sensor/own/*"
 PREVIEW_DEPTH_ALL = "preview/depth/*"
-PREVIEW_COLOUR_ALL = "preview/color/*"
+PREVIEW_COLOR_ALL = "preview/color/*"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
 CONFIG = "hal/config"
@@ -39,7 +39,7 @@ PROCESS_ALL = "process/*"
 
 
 @dataclass(frozen=True)
-class Row:
+class KeyRow:
     """One line of the key space: the message at a key, who writes it, how and when."""
 
     key: str
@@ -57,102 +57,108 @@ _TURN = "every `decimation` of its service"
 _LIVES = "while connected"
 _LOOKED_AT = "2 Hz, if there is a subscriber"
 
-SPACE: tuple[Row, ...] = (
-    Row(JOINTS, m.JointState, "HAL", "stream", _TICK, "angle, velocity, torque of every joint"),
-    Row(CONTACTS, m.Contacts, "HAL", "stream", _SENSOR, "every contact of a link with an obstacle"),
-    Row(IMU, m.Imu, "HAL", "stream", _SENSOR, "angular velocity and acceleration of the links"),
-    Row(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose from motion capture"),
-    Row(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
-    Row(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
-    Row(COLOUR_ALL, m.ColorImage, "HAL", "stream", _SENSOR, "what a camera sees, in color"),
-    Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
-    Row(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "what a sensor with a message of its own says"),
-    Row(
+SPACE: tuple[KeyRow, ...] = (
+    KeyRow(JOINTS, m.JointState, "HAL", "stream", _TICK, "angle, velocity, torque of every joint"),
+    KeyRow(CONTACTS, m.Contacts, "HAL", "stream", _SENSOR, "every contact of a link with an obstacle"),
+    KeyRow(IMU, m.Imu, "HAL", "stream", _SENSOR, "angular velocity and acceleration of the links"),
+    KeyRow(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose from motion capture"),
+    KeyRow(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
+    KeyRow(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
+    KeyRow(COLOR_ALL, m.ColorImage, "HAL", "stream", _SENSOR, "what a camera sees, in color"),
+    KeyRow(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
+    KeyRow(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "what a sensor with a message of its own says"),
+    KeyRow(
         PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
     ),
-    Row(PREVIEW_COLOUR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a color image"),
-    Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and setpoint of every joint"),
-    Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
-    Row(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
-    Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
-    Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
-    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "setpoints that the motors got, and limits applied"),
-    Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
-    Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
-    Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
-    Row(SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator; replies Answer"),
-    Row(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed; replies Answer"),
-    Row(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
-    Row(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
-    Row(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
-    Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"),
-    Row(SETTINGS, m.SettingsRequest, "any", "query", _ASKED, "other settings for the running controller; Answer"),
-    Row(SETTINGS_IN_FORCE, m.ControlSettings, "control", "latched", "on a change", "the controller's settings now"),
-    Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
-    Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
-    Row(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
-    Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
+    KeyRow(PREVIEW_COLOR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a color image"),
+    KeyRow(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and setpoint of every joint"),
+    KeyRow(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
+    KeyRow(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
+    KeyRow(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
+    KeyRow(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
+    KeyRow(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "setpoints that the motors got, and limits applied"),
+    KeyRow(
+        LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"
+    ),
+    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
+    KeyRow(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
+    KeyRow(
+        SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator; replies Answer"
+    ),
+    KeyRow(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed; replies Answer"),
+    KeyRow(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
+    KeyRow(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
+    KeyRow(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
+    KeyRow(
+        CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"
+    ),
+    KeyRow(SETTINGS, m.SettingsRequest, "any", "query", _ASKED, "other settings for the running controller; Answer"),
+    KeyRow(SETTINGS_IN_FORCE, m.ControlSettings, "control", "latched", "on a change", "the controller's settings now"),
+    KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
+    KeyRow(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
+    KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
+    KeyRow(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
 )
 
-ROW_AT: dict[str, Row] = {row.key: row for row in SPACE if row.message is not None}
+ROW_AT: dict[str, KeyRow] = {row.key: row for row in SPACE if row.message is not None}
 
 
-def depth(camera: str) -> str:
+def depth_key(camera: str) -> str:
     """Return the key of the depth images of a camera."""
     return f"sensor/depth/{camera}"
 
 
-def color(camera: str) -> str:
+def color_key(camera: str) -> str:
     """Return the key of the color images of a camera."""
     return f"sensor/color/{camera}"
 
 
-def ranges(sensor: str) -> str:
+def ranges_key(sensor: str) -> str:
     """Return the key of a lidar or a range finder."""
     return f"sensor/range/{sensor}"
 
 
-def own(sensor: str) -> str:
+def custom_key(sensor: str) -> str:
     """Return the key of a sensor with a message of its own."""
     return f"sensor/own/{sensor}"
 
 
-def preview(image_key: str) -> str:
+def preview_key(image_key: str) -> str:
     """Return the key of the preview of an image: `sensor/depth/head` -> `preview/depth/head`."""
     return f"preview/{image_key.partition('/')[2]}"
 
 
-def done(service: str) -> str:
+def done_key(service: str) -> str:
     """Return the key on which `service` reports a lockstep tick as done."""
     return f"hal/done/{service}"
 
 
-def fault(part: str) -> str:
+def fault_key(part: str) -> str:
     """Return the key on which a part of a run receives requests for fault injection."""
     return f"fault/{part}"
 
 
-def alive(service: str) -> str:
+def alive_key(service: str) -> str:
     """Return the liveliness key of `service`."""
     return f"alive/{service}"
 
 
-def host(host_id: str) -> str:
+def host_key(host_id: str) -> str:
     """Return the liveliness key of one host process."""
     return f"hal/host/{host_id}"
 
 
-def process(name: str, process_id: str) -> str:
+def process_key(name: str, process_id: str) -> str:
     """Return the key of one process, and of its liveliness token."""
     return f"process/{name}-{process_id}"
 
 
-def service_of(key: str) -> str:
+def parse_service(key: str) -> str:
     """Return the service that a done or alive key names."""
     return key.rpartition("/")[2]
 
 
-def row_at(key: str) -> Row | None:
+def find_row(key: str) -> KeyRow | None:
     """Return the line of the key space that a key with a message belongs to; None for other keys."""
     row = ROW_AT.get(key)
     if row is not None:
@@ -163,15 +169,15 @@ def row_at(key: str) -> Row | None:
     return ROW_AT.get(f"{start}/*")
 
 
-def row_key(key: str) -> str:
+def find_row_key(key: str) -> str:
     """Return the key or pattern of the line of the key space that a key belongs to; empty for other keys."""
-    row = row_at(key)
+    row = find_row(key)
     return "" if row is None else row.key
 
 
-def message_at(key: str) -> type[m.Message] | None:
+def find_message(key: str) -> type[m.Message] | None:
     """Return the message at `key`, or None when the key space has no such key."""
-    row = row_at(key)
+    row = find_row(key)
     return None if row is None else row.message
 
 
@@ -181,6 +187,6 @@ def split_namespace(full_key: str) -> tuple[str, str] | None:
     for cut in range(1, len(parts)):
         relative = "/".join(parts[cut:])
         is_token = parts[cut:-1] in (["alive"], ["hal", "host"])
-        if is_token or message_at(relative) is not None:
+        if is_token or find_message(relative) is not None:
             return "/".join(parts[:cut]), relative
     return None

@@ -71,7 +71,7 @@ class JointState(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]
 
-    def is_of(self, joints: int) -> bool:
+    def has_joint_count(self, joints: int) -> bool:
         """Return whether every list has an entry for each of so many joints."""
         return (
             len(self.angle_rad) == joints
@@ -154,7 +154,7 @@ class MountedSample(Message, frozen=True, kw_only=True):
     position_l: Annotated[q.Vector, about("of the sensor")]
     orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
 
-    def contradiction(self) -> str:
+    def find_contradiction(self) -> str:
         """Describe what is impossible although each number is within its bounds; empty if nothing is.
 
         The contract suite of backends calls it.
@@ -192,7 +192,7 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
         ),
     ]
 
-    def contradiction(self) -> str:
+    def find_contradiction(self) -> str:
         whole_pixels = self.depth[: len(self.depth) // 2 * 2]
         counts = set(memoryview(whole_pixels).cast("H")) - {0}
         distances_m = [count * self.scale_m for count in counts]
@@ -224,7 +224,7 @@ class Ranges(MountedSample, frozen=True, kw_only=True):
         about("one entry a beam; null: nothing within range, or the beam dropped out"),
     ]
 
-    def contradiction(self) -> str:
+    def find_contradiction(self) -> str:
         distances_m = [distance_m for distance_m in self.range_m if distance_m is not None]
         return _describe_beyond_range(self.range_min_m, self.range_max_m, distances_m)
 
@@ -364,7 +364,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
     serial: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
     firmware: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
 
-    def has(self, mode: Mode) -> bool:
+    def supports_mode(self, mode: Mode) -> bool:
         """Return whether the joint may be commanded in a mode. It can always be passive."""
         return mode is Mode.PASSIVE or mode in self.modes
 
@@ -564,7 +564,7 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     ] = False
 
 
-def request_to_arm(robot: Description, who: str, *, unchecked: bool = False) -> LifecycleRequest:
+def make_arm_request(robot: Description, who: str, *, unchecked: bool = False) -> LifecycleRequest:
     """Make a request to arm exactly the robot, backend, configuration and host process that are described.
 
     Args:

@@ -10,11 +10,11 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.base.errors import WireError, did_you_mean, short
+from snakesim_hal.base.errors import WireError, shorten, suggest_word
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, Message, OwnSample
-from snakesim_hal.wire.own_sample import OwnKind
+from snakesim_hal.wire.own_sample import CustomMessage
 
 NOT_PLAIN = (TypeError, ValueError, OverflowError, RecursionError)  # what the encoder raises
 MAX_VALUE_LENGTH = 100  # characters of a value that an error quotes
@@ -25,7 +25,7 @@ ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 _decoder = cache(Decoder[Any])
 
 
-def checked(key: str, message: Message, own: OwnKind | None = None) -> bytes:
+def encode_checked(key: str, message: Message, own: CustomMessage | None = None) -> bytes:
     """Encode a message, after a check that readers of its key accept it.
 
     Args:
@@ -37,19 +37,19 @@ def checked(key: str, message: Message, own: OwnKind | None = None) -> bytes:
         WireError: readers would reject it; names field, value, and what is allowed.
     """
     expected = _find_message_type(key, message, own)
-    payload = packed(message)
+    payload = encode_unchecked(message)
     try:
-        _decoder(expected).decode(payload, encoding_of(expected))
+        _decoder(expected).decode(payload, format_encoding(expected))
     except WireError as error:
-        raise WireError(error.reason, what_is_wrong(message) or error.detail) from None
+        raise WireError(error.reason, find_wrong_value(message) or error.detail) from None
     return payload
 
 
-def _find_message_type(key: str, message: Message, own: OwnKind | None) -> type[Message]:
+def _find_message_type(key: str, message: Message, own: CustomMessage | None) -> type[Message]:
     """Return the type that readers of a key expect. Raises WireError if the message is of another one."""
-    expected = keys.message_at(key)
+    expected = keys.find_message(key)
     if expected is None:
-        known = did_you_mean(key, keys.ROW_AT)
+        known = suggest_word(key, keys.ROW_AT)
         raise WireError("unknown_key", f"there is no such key; {known}`snakesim echo` lists them")
     if expected is OwnSample and isinstance(message, OwnSample):
         return type(message) if own is None else own.message
@@ -58,17 +58,17 @@ def _find_message_type(key: str, message: Message, own: OwnKind | None) -> type[
     return expected
 
 
-def packed(message: Message) -> bytes:
+def encode_unchecked(message: Message) -> bytes:
     """Encode a message, within bounds or not. Raises WireError for values that no message can carry."""
     if type(message) not in VERSIONS and not isinstance(message, OwnSample):
         raise WireError("unknown_message", f"a {type(message).__name__} is no message")
     try:
         return encode(message)
     except NOT_PLAIN as error:
-        raise WireError("malformed", what_is_wrong(message) or f"{type(error).__name__}: {error}") from None
+        raise WireError("malformed", find_wrong_value(message) or f"{type(error).__name__}: {error}") from None
 
 
-def what_is_wrong(message: Message, called: str = "") -> str:
+def find_wrong_value(message: Message, called: str = "") -> str:
     """Describe the first value that no reader accepts, and what is allowed; empty if each is right by itself.
 
     Args:
@@ -105,4 +105,4 @@ def _follow_path(value: Any, where: str, path: str) -> tuple[Any, str]:
 
 
 def _describe_wrong_value(where: str, value: object, expected: str) -> str:
-    return f"{where} is {short(repr(value), MAX_VALUE_LENGTH)}, must be {expected}"
+    return f"{where} is {shorten(repr(value), MAX_VALUE_LENGTH)}, must be {expected}"

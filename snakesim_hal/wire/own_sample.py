@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.base.errors import ConfigError, WireError, short
+from snakesim_hal.base.errors import ConfigError, WireError, shorten
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Message, OwnSample
 from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_OWN_SCHEMA
@@ -35,7 +35,7 @@ _BOUNDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiv
 
 
 @dataclass(frozen=True)
-class OwnKind:
+class CustomMessage:
     """What is known of a custom message from its schema alone."""
 
     message: type[OwnSample]
@@ -65,7 +65,7 @@ def _to_number(value: float | None) -> float:
 # --- from a class to a schema, and back ------------------------------------------------------------------------
 
 
-def schema_of(message: Any, whose: str) -> str:
+def make_message_schema(message: Any, whose: str) -> str:
     """Return the JSON Schema of an author's message.
 
     Args:
@@ -77,14 +77,14 @@ def schema_of(message: Any, whose: str) -> str:
     """
     if not (isinstance(message, type) and issubclass(message, OwnSample) and message is not OwnSample):
         raise ConfigError(
-            f"{whose}: `message` is {short(repr(message))}, must be a class derived from OwnSample of "
+            f"{whose}: `message` is {shorten(repr(message))}, must be a class derived from OwnSample of "
             "snakesim_hal.wire.messages, frozen and keyword-only"
         )
     try:
         schema = msgspec.json.schema(message)["$defs"][message.__name__]
         schema["description"] = cleandoc(schema.get("description", ""))[:MAX_TEXT_LENGTH]
         text = msgspec.json.encode(schema).decode()
-        own_kind(text)
+        parse_custom_message(text)
     except WireError as error:
         raise ConfigError(f"{whose}: {message.__name__}{error.detail}") from None
     except UNBUILDABLE as error:
@@ -93,7 +93,7 @@ def schema_of(message: Any, whose: str) -> str:
 
 
 @lru_cache(SCHEMAS_CACHED)
-def own_kind(schema: str) -> OwnKind:
+def parse_custom_message(schema: str) -> CustomMessage:
     """Make the message that a schema describes.
 
     Raises:
@@ -106,10 +106,10 @@ def own_kind(schema: str) -> OwnKind:
     except WireError:
         raise
     except (*UNBUILDABLE, KeyError, AttributeError, msgspec.DecodeError) as error:
-        raise WireError("malformed", f" has a schema that cannot be used: {short(str(error))}") from None
+        raise WireError("malformed", f" has a schema that cannot be used: {shorten(str(error))}") from None
 
 
-def _make_kind(schema: str) -> OwnKind:
+def _make_kind(schema: str) -> CustomMessage:
     """Make the message of a schema. Raises any of UNBUILDABLE and more for a schema that is not one of a message."""
     content = msgspec.json.decode(schema, type=dict[str, Any])
     fields = {name: field for name, field in content["properties"].items() if name not in SHARED_FIELDS}
@@ -120,7 +120,7 @@ def _make_kind(schema: str) -> OwnKind:
     units: dict[str, str] = {}
     for name, field in fields.items():
         if not _FIELD_NAME.fullmatch(name) or hasattr(OwnSample, name):
-            raise WireError("malformed", f".{short(name)} is no name of a field: lower case, at most 40 characters")
+            raise WireError("malformed", f".{shorten(name)} is no name of a field: lower case, at most 40 characters")
         field_type = _make_type(field, name, units)
         if name in required:
             definitions.append((name, field_type))
@@ -128,7 +128,7 @@ def _make_kind(schema: str) -> OwnKind:
             definitions.append((name, field_type | None, None))
     message: Any = msgspec.defstruct(content["title"], definitions, bases=(OwnSample,), frozen=True, kw_only=True)
     msgspec.msgpack.Decoder(message)  # refuses bounds that it cannot check
-    return OwnKind(message, units, schema)
+    return CustomMessage(message, units, schema)
 
 
 def _make_type(field: dict[str, Any], name: str, units: dict[str, str], *, in_list: bool = False) -> Any:
@@ -186,28 +186,28 @@ def _make_number_type(field: dict[str, Any], name: str, units: dict[str, str]) -
 # --- of a robot ------------------------------------------------------------------------------------------------
 
 
-def own_kind_at(key: str, robot: Description) -> OwnKind | None:
+def find_custom_message(key: str, robot: Description) -> CustomMessage | None:
     """Return the message of a robot's custom sensor; None if this key has none, or its schema is of no use."""
     if key not in robot.own:
         return None
     with suppress(WireError):
-        return own_kind(robot.own[key])
+        return parse_custom_message(robot.own[key])
     return None
 
 
-def own_kinds(robot: Description) -> dict[str, OwnKind]:
+def find_custom_messages(robot: Description) -> dict[str, CustomMessage]:
     """Return the messages of all custom sensors of a robot, by key."""
-    kinds: dict[str, OwnKind] = {}
+    kinds: dict[str, CustomMessage] = {}
     for key in robot.own:
-        kind = own_kind_at(key, robot)
+        kind = find_custom_message(key, robot)
         if kind is not None:
             kinds[key] = kind
     return kinds
 
 
-def message_of(key: str, robot: Description | None) -> type[Message] | None:
+def find_message_type(key: str, robot: Description | None) -> type[Message] | None:
     """Return the message at a key: as the robot describes it if it is known, else that of the key space."""
-    kind = None if robot is None else own_kind_at(key, robot)
+    kind = None if robot is None else find_custom_message(key, robot)
     if kind is None:
-        return keys.message_at(key)
+        return keys.find_message(key)
     return kind.message

@@ -24,7 +24,7 @@ class Role(StrEnum):
     ADMINISTRATOR = "administrator"
 
 
-ABOUT: dict[Role, str] = {
+ROLE_DESCRIPTIONS: dict[Role, str] = {
     Role.ROBOT: "the HAL host on the robot's computer, with what runs beside it there",
     Role.GNC: "guidance, navigation and control of one robot",
     Role.OPERATOR: "a person who arms, disarms, clears, stops, and asks for a speed or a direction",
@@ -79,7 +79,7 @@ class Permission(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Line:
+class KeyRights:
     """What the roles may do at one key of the key space."""
 
     key: str
@@ -119,15 +119,15 @@ class Line:
         return self.kind == "liveliness" or self.key in _WITH_TOKEN
 
 
-def _make_line(row: keys.Row) -> Line:
+def _make_line(row: keys.KeyRow) -> KeyRights:
     if row.kind == "query":
         writers = _ASKERS.get(row.key, ())
         answerers = _ANSWERERS.get(row.key, (Role.ROBOT,))
-        return Line(row.key, row.kind, writers, answerers)
-    return Line(row.key, row.kind, _WRITERS.get(row.writer, ()), answerers=())
+        return KeyRights(row.key, row.kind, writers, answerers)
+    return KeyRights(row.key, row.kind, _WRITERS.get(row.writer, ()), answerers=())
 
 
-TABLE: tuple[Line, ...] = tuple(_make_line(row) for row in keys.SPACE)
+TABLE: tuple[KeyRights, ...] = tuple(_make_line(row) for row in keys.SPACE)
 
 _CACHE = "/@adv/**"  # where a latched key keeps its last value, and has the token of its publisher
 # Zenoh's messages for each act, as (flow, message, what follows the key).
@@ -163,7 +163,7 @@ MESSAGES_OF_LATCHED: dict[str, tuple[tuple[str, str, str], ...]] = {
 }
 
 
-def permissions(role: Role, services: Iterable[str] = (), *, faults: bool = False) -> Iterator[Permission]:
+def list_permissions(role: Role, services: Iterable[str] = (), *, faults: bool = False) -> Iterator[Permission]:
     """Yield everything that a router lets pass for a role of a robot.
 
     Args:
@@ -208,7 +208,7 @@ def _places_of_names(key: str, names: list[str]) -> list[str]:
     return [key[:-1] + name + suffix for name in names]
 
 
-def _messages_of_act(line: Line, act: str) -> tuple[tuple[str, str, str], ...]:
+def _messages_of_act(line: KeyRights, act: str) -> tuple[tuple[str, str, str], ...]:
     """Return Zenoh's messages for an act at a key, as in MESSAGES."""
     if line.kind == "latched":
         return (*MESSAGES[act], *MESSAGES_OF_LATCHED.get(act, ()))

@@ -21,7 +21,7 @@ def open_port(port: int | None) -> socket.socket:
     raise NotConnectedError(f"--port {port}: another program listens there; choose another, or leave --port out")
 
 
-def address_of(listening: socket.socket) -> str:
+def page_address(listening: socket.socket) -> str:
     """Return the address of the console's page, for a browser."""
     port = listening.getsockname()[1]
     return f"http://{LOOPBACK}:{port}"

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from snakesim_hal.base.errors import ConfigError, NotConnectedError, short
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, shorten
 
 if TYPE_CHECKING:  # takes a second to import, and most commands only check an address
     from distributed import Client
@@ -16,7 +16,7 @@ MEET_S = 20.0
 def check_address(address: str | None) -> None:
     """Before anything is begun for it. Raises ConfigError."""
     if address is not None and not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
-        raise ConfigError(f"--cluster {short(address)}: give the scheduler as tcp://HOST:PORT")
+        raise ConfigError(f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT")
 
 
 @contextmanager

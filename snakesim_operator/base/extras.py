@@ -30,12 +30,12 @@ BRINGS = {  # import names; messages about a package name the first extra with i
 }
 
 
-def has(extra: str) -> bool:
+def is_installed(extra: str) -> bool:
     """Return whether an extra is installed."""
     return not _missing_packages(extra)
 
 
-def check(extra: str, who: str, otherwise: str = "") -> None:
+def require(extra: str, who: str, otherwise: str = "") -> None:
     """Raise ConfigError when an extra is missing.
 
     Args:

@@ -13,7 +13,7 @@ LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IG
 MAX_CHARACTERS_SHOWN = 80
 
 
-def why_refused(host: str | None, origin: str | None, also: Collection[str] = ()) -> str | None:
+def explain_refusal(host: str | None, origin: str | None, also: Collection[str] = ()) -> str | None:
     """Return why a connection is refused; None when it may be opened.
 
     Args:
@@ -30,13 +30,13 @@ def why_refused(host: str | None, origin: str | None, also: Collection[str] = ()
     return f"the page is of the origin {_shown(origin)}; only pages of http://{host} may connect"
 
 
-def why_head_refused(head: bytes, also: Collection[str] = ()) -> str | None:
+def explain_head_refusal(head: bytes, also: Collection[str] = ()) -> str | None:
     """Return why a connection is refused, from the head of its HTTP request; None when it may be opened."""
     headers: dict[str, str] = {}
     for line in head.decode("latin-1").split("\r\n")[1:]:
         name, _, value = line.partition(":")
         headers[name.strip().lower()] = value.strip()
-    return why_refused(headers.get("host"), headers.get("origin"), also)
+    return explain_refusal(headers.get("host"), headers.get("origin"), also)
 
 
 def _shown(text: str | None) -> str:

@@ -9,7 +9,7 @@ GREY, RGB = 0, 2  # color types
 NO_FILTER = b"\0"  # precedes each row
 
 
-def png(width: int, height: int, pixels: bytes, *, bits: int, color: bool) -> bytes:
+def encode_png(width: int, height: int, pixels: bytes, *, bits: int, color: bool) -> bytes:
     """Encode an image as PNG.
 
     Args:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.local_registry import LocalRobot, local_robots
-from snakesim_hal.programs.arguments import check_network, session_given
+from snakesim_hal.programs.arguments import check_network, read_session_option
 
 if TYPE_CHECKING:
     from snakesim_hal.network.session import Link
@@ -47,10 +47,10 @@ class RobotSelection:
         return list(links.values())
 
 
-def selection_of(arguments: argparse.Namespace) -> RobotSelection:
+def select_robots(arguments: argparse.Namespace) -> RobotSelection:
     """Return the robots that the arguments of `add_network` address. Raises ConfigError."""
     check_network(arguments)
-    session = session_given(arguments, or_environment=True)
+    session = read_session_option(arguments, or_environment=True)
     if session is not None:
         return RobotSelection(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return RobotSelection(arguments.router or arguments.endpoint, arguments.namespace)
@@ -63,7 +63,7 @@ def _link_to(robot: LocalRobot, namespace: str | None) -> "Link":
 
     if robot.session:
         try:
-            return Link.of_file(read_session(Path(robot.session)), namespace)
+            return Link.from_session_file(read_session(Path(robot.session)), namespace)
         except ConfigError:
             pass
     return Link(robot.endpoint, namespace)

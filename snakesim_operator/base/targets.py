@@ -12,7 +12,7 @@ from snakesim_operator.base.robot_selection import RobotSelection
 
 CONNECT_S = 1.0
 SEARCH_S = 3.0  # to connect, and to answer: a busy computer takes more than a second, and its robot is there
-HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
+HAL_EVERYWHERE = f"**/{keys.alive_key('hal')}"
 
 
 def flags_of(link: Link, robot: str | None) -> str:
@@ -44,7 +44,7 @@ def find_robots(where: RobotSelection) -> list[Link]:
             with open_session(link, SEARCH_S) as session:
                 if link.namespace is None:
                     found += [replace(link, namespace=name) for name in robots_on(session)]
-                elif session.present(keys.alive("hal"), SEARCH_S):
+                elif session.present(keys.alive_key("hal"), SEARCH_S):
                     found.append(link)
         except NotConnectedError:
             continue

@@ -212,7 +212,7 @@ class _Worker:
             self._process = subprocess.Popen(
                 python_command("-c", BEGIN, str(theirs.fileno()), str(os.getpid())),
                 env=child_environment(
-                    arithmetic.environment(), arithmetic.ONE_THREAD, {TEMPORARY_FILES: str(self.folder)}
+                    arithmetic.common_environment(), arithmetic.ONE_THREAD, {TEMPORARY_FILES: str(self.folder)}
                 ),
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # so that Ctrl-C reaches the command alone, also while this one starts

@@ -12,8 +12,8 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, WireError, did_you_mean, short
-from snakesim_hal.base.terminal import print_stderr, say
+from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_word
+from snakesim_hal.base.terminal import print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Session, intersects, key_expression
 from snakesim_hal.wire import keys
@@ -40,15 +40,15 @@ def echo(key: str | None, where: RobotSelection, *, rate_only: bool, count: int 
     """
     if key is None:
         for line in _key_lines():
-            say(line)
+            print_line(line)
         print_stderr("`snakesim echo KEY` prints the messages, --hz their rate; `snakesim top` shows all rates at once")
         return 0
     relative_key = key_expression(key.strip("/"))
     rows = [row for row in _published_rows() if intersects(relative_key, row.key)]
     if not rows:
-        hint = did_you_mean(key, [row.key for row in _published_rows()]).strip()
+        hint = suggest_word(key, [row.key for row in _published_rows()]).strip()
         lines = [*_key_lines(), hint] if hint else _key_lines()
-        raise ConfigError(f"there is no key {short(key)!r}; available keys:", *lines)
+        raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines)
     prefix = "" if where.namespace is not None else "**/"
     queue = OutputQueue()
     with contextlib.ExitStack() as stack:
@@ -61,7 +61,7 @@ def echo(key: str | None, where: RobotSelection, *, rate_only: bool, count: int 
     return 0
 
 
-def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.Row]) -> None:
+def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.KeyRow]) -> None:
     """Subscribe to the latched keys and to the streams separately.
 
     A latched value is older than the streams: a subscriber to both would drop it as too old.
@@ -83,7 +83,7 @@ def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str
         )
 
 
-def _published_rows() -> list[keys.Row]:
+def _published_rows() -> list[keys.KeyRow]:
     """Return the rows of the key space whose messages are published."""
     return [row for row in keys.SPACE if row.kind in ("stream", "latched")]
 
@@ -136,7 +136,7 @@ def _print_messages(queue: OutputQueue, count: int | None) -> None:
     for _ in _repeat(count):
         arrival = queue.get()
         content = {"key": arrival.key, **_decode_content(arrival)}
-        say(json.dumps(content, ensure_ascii=False, separators=(",", ":")))
+        print_line(json.dumps(content, ensure_ascii=False, separators=(",", ":")))
 
 
 def _repeat(count: int | None) -> Iterable[int]:
@@ -146,11 +146,11 @@ def _repeat(count: int | None) -> Iterable[int]:
 
 def _decode_content(arrival: Arrival) -> dict[str, Any]:
     """Return the message, or the error that prevents its decoding, for JSON."""
-    message = keys.message_at(arrival.key)
+    message = keys.find_message(arrival.key)
     if message is None:
         namespace_and_key = keys.split_namespace(arrival.key)
         if namespace_and_key is not None:
-            message = keys.message_at(namespace_and_key[1])
+            message = keys.find_message(namespace_and_key[1])
     if message is None:
         return {"error": "no message is known on this key"}
     try:
@@ -169,7 +169,7 @@ def _print_rates(queue: OutputQueue, count: int | None) -> None:
         for key, key_times_ns in sorted(times_ns.items()):
             _print_rate(key, key_times_ns)
         if not times_ns:
-            say("nothing arrives")
+            print_line("nothing arrives")
 
 
 def _collect_times(queue: OutputQueue) -> dict[str, list[int]]:
@@ -191,7 +191,7 @@ def _print_rate(key: str, times_ns: list[int]) -> None:
         return
     rate_hz = 1000 / statistics.fmean(gaps_ms)
     deviation_ms = statistics.pstdev(gaps_ms)
-    say(
+    print_line(
         f"{key}: {rate_hz:.1f} Hz  gap {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms"
         f"  deviation {deviation_ms:.2f} ms  over {len(times_ns)}"
     )

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.terminal import say
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Publisher, Reader, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
@@ -35,7 +35,7 @@ QUEUED_IMAGES = 4  # a few invalid images do not displace the valid one
 
 def preview(where: RobotSelection, hz: float, width: int) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    extras.check("preview", "`snakesim preview`")
+    extras.require("preview", "`snakesim preview`")
     if not MIN_HZ <= hz <= MAX_HZ:
         raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz")
     if not MIN_WIDTH_PX <= width <= MAX_WIDTH_PX:
@@ -47,13 +47,13 @@ def preview(where: RobotSelection, hz: float, width: int) -> int:
             raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s")
         cameras = cameras_of(session, robot, width)
         if not cameras:
-            raise ConfigError(f"{link.namespace} has no camera: nothing at {keys.DEPTH_ALL} or {keys.COLOUR_ALL}")
-        say(f"{link.namespace}: previews of {', '.join(camera.key for camera in cameras)}; Ctrl-C ends it")
+            raise ConfigError(f"{link.namespace} has no camera: nothing at {keys.DEPTH_ALL} or {keys.COLOR_ALL}")
+        print_line(f"{link.namespace}: previews of {', '.join(camera.key for camera in cameras)}; Ctrl-C ends it")
         while True:
             for camera in cameras:
                 problem = camera.publish_preview()
                 if problem is not None:
-                    say(problem)
+                    print_line(problem)
             time.sleep(1.0 / hz)
 
 
@@ -61,7 +61,7 @@ def cameras_of(session: Session, robot: Description, width: int) -> list["Camera
     """Return a camera for each stream of images that the robot publishes."""
     cameras: dict[str, Camera] = {}
     for sensor in robot.sensors:
-        message = keys.message_at(sensor.key)
+        message = keys.find_message(sensor.key)
         if message in (DepthImage, ColorImage) and sensor.key not in cameras:
             cameras[sensor.key] = Camera(session, robot, sensor.key, message, width)
     return list(cameras.values())
@@ -77,7 +77,7 @@ class Camera:
         self._robot = robot
         self._kind = kind
         self._width = width
-        self._publisher: Publisher[Preview] = session.publisher(keys.preview(key), Preview)
+        self._publisher: Publisher[Preview] = session.publisher(keys.preview_key(key), Preview)
         self._reader: Reader[Any] | None = None
 
     def publish_preview(self) -> str | None:
@@ -86,14 +86,14 @@ class Camera:
         Returns:
             Why the image was left out, or None.
         """
-        if not self._publisher.heard():
+        if not self._publisher.has_subscriber():
             if self._reader is not None:
                 self._session.stop_reading(self._reader)
                 self._reader = None
             return None
         if self._reader is None:
             self._reader = self._session.reader(self.key, self._kind, depth=QUEUED_IMAGES)
-        image = self._reader.newest(lambda image: mismatch(image, self._robot) is None)
+        image = self._reader.newest(lambda image: find_mismatch(image, self._robot) is None)
         if image is None:
             return None
         preview = preview_of(image, self._width)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from snakesim_hal.base.terminal import Say, overwrite_lines, say, say_json
+from snakesim_hal.base.terminal import PrintLine, overwrite_lines, print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
@@ -25,7 +25,7 @@ TIMES_HEAD = (
 BARS = "▁▂▃▄▅▆▇█"
 
 
-def top(where: RobotSelection, say: Say = say, *, once: bool, as_json: bool) -> int:
+def top(where: RobotSelection, say: PrintLine = print_line, *, once: bool, as_json: bool) -> int:
     """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError.
 
     once: listen for a moment, print one table, end. as_json: a line of JSON for each table.
@@ -49,7 +49,7 @@ def top(where: RobotSelection, say: Say = say, *, once: bool, as_json: bool) -> 
                     "tick_times": times,
                     "left_out": left_out,
                 }
-                say_json(msgspec.to_builtins(content), say)
+                print_json(msgspec.to_builtins(content), say)
             else:
                 table = table_of(lines, latencies, times, left_out, descriptions)
                 if sys.stdout.isatty() and not once:

@@ -221,7 +221,7 @@ class Traffic:
 
     def is_known(self, key: str) -> bool:
         """Return whether a robot publishes at this key, by the key space."""
-        row = keys.row_at(self._split(key)[1])
+        row = keys.find_row(self._split(key)[1])
         return row is not None and row.kind in ("stream", "latched")
 
     def _split(self, key: str) -> tuple[str, str]:
@@ -235,11 +235,11 @@ def _find_writer(relative_key: str, lease_holder: str | None) -> str | None:
     """Return the process that writes at a key; None for a key that is not in the key space."""
     if relative_key == keys.JOINT_COMMAND and lease_holder:
         return f"{lease_holder} (lease)"
-    row = keys.row_at(relative_key)
+    row = keys.find_row(relative_key)
     if row is None:
         return None
     if row.writer.startswith("each "):
-        return keys.service_of(relative_key)
+        return keys.parse_service(relative_key)
     return row.writer
 
 
@@ -273,7 +273,7 @@ def _measure_rhythm(times_ns: list[int]) -> dict[str, float | None]:
 
 def _decode(relative_key: str, arrival: Arrival) -> Any:
     """Return the message; or, as text, why it cannot be read."""
-    message = keys.message_at(relative_key)
+    message = keys.find_message(relative_key)
     if message is None:
         return "not in the key space"
     try:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.programs.arguments import add_json, add_network, number
-from snakesim_operator.base.robot_selection import selection_of
+from snakesim_hal.programs.arguments import add_json, add_network, number_type
+from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.recording.message import RAW_ONLY
 
 MAX_TASK = 200
@@ -29,7 +29,7 @@ def add_commands(commands: Any) -> None:
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
     echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
     echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
-    echo.add_argument("--count", type=number(1, 10**9), help="end after this many messages")
+    echo.add_argument("--count", type=number_type(1, 10**9), help="end after this many messages")
     add_network(echo)
     echo.set_defaults(act=_echo)
 
@@ -43,13 +43,13 @@ def add_commands(commands: Any) -> None:
     )
     record.add_argument("--task", metavar="TEXT", help="with --episodes: what is demonstrated, in words")
     record.add_argument(
-        "--duration", type=number(0.0, 1e9, "s"), metavar="S", help="end after this time by the wall clock"
+        "--duration", type=number_type(0.0, 1e9, "s"), metavar="S", help="end after this time by the wall clock"
     )
     viewers = record.add_mutually_exclusive_group()
     viewers.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
     viewers.add_argument(
         "--foxglove",
-        type=number(0, 65535),
+        type=number_type(0, 65535),
         nargs="?",
         const=8765,
         metavar="PORT",
@@ -77,19 +77,19 @@ def add_commands(commands: Any) -> None:
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.status import show_status
 
-    return show_status(selection_of(arguments), as_json=arguments.json)
+    return show_status(select_robots(arguments), as_json=arguments.json)
 
 
 def _top(arguments: argparse.Namespace) -> int:
     from snakesim_operator.monitoring.top import top
 
-    return top(selection_of(arguments), once=arguments.once, as_json=arguments.json)
+    return top(select_robots(arguments), once=arguments.once, as_json=arguments.json)
 
 
 def _echo(arguments: argparse.Namespace) -> int:
     from snakesim_operator.monitoring.echo import echo
 
-    return echo(arguments.key, selection_of(arguments), rate_only=arguments.hz, count=arguments.count)
+    return echo(arguments.key, select_robots(arguments), rate_only=arguments.hz, count=arguments.count)
 
 
 def _record(arguments: argparse.Namespace) -> int:
@@ -100,11 +100,11 @@ def _record(arguments: argparse.Namespace) -> int:
     if arguments.task is not None:
         raise ConfigError("--task is for --episodes DIR; add it, or leave --task out")
     if arguments.foxglove is not None:
-        extras.check("foxglove", "--foxglove")
+        extras.require("foxglove", "--foxglove")
     from snakesim_operator.playback.record_command import record_robot
 
     return record_robot(
-        selection_of(arguments),
+        select_robots(arguments),
         arguments.out,
         arguments.duration,
         arguments.foxglove,
@@ -124,10 +124,10 @@ def _record_episodes(arguments: argparse.Namespace) -> int:
         )
     from snakesim_operator.playback.demonstrations import record_demonstrations
 
-    return record_demonstrations(selection_of(arguments), arguments.episodes, task, iter(sys.stdin))
+    return record_demonstrations(select_robots(arguments), arguments.episodes, task, iter(sys.stdin))
 
 
 def _preview(arguments: argparse.Namespace) -> int:
     from snakesim_operator.monitoring.preview import preview
 
-    return preview(selection_of(arguments), arguments.hz, arguments.width)
+    return preview(select_robots(arguments), arguments.hz, arguments.width)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.programs.arguments import add_json, number
+from snakesim_hal.programs.arguments import add_json, number_type
 
 
 def add_commands(commands: Any) -> None:
@@ -59,7 +59,7 @@ def _add_replay(commands: Any) -> None:
     )
     _add_recording(replay)
     replay.add_argument(
-        "--rate", type=number(0.001, 1e6), default=1.0, metavar="X", help="robot time over wall time (1)"
+        "--rate", type=number_type(0.001, 1e6), default=1.0, metavar="X", help="robot time over wall time (1)"
     )
     replay.add_argument("--step", action="store_true", help="play one tick at each Enter")
     replay.add_argument("--endpoint", help="Zenoh endpoint to listen on (default: tcp/127.0.0.1:7447)")
@@ -91,7 +91,7 @@ def _add_export(commands: Any) -> None:
     exported.add_argument("--task", metavar="TEXT", help="lerobot: the task, in words (default: the scenario's name)")
     exported.add_argument(
         "--fps",
-        type=number(1.0, 1000.0, "Hz"),
+        type=number_type(1.0, 1000.0, "Hz"),
         metavar="HZ",
         help="lerobot: frames a second (default: the robot's rate)",
     )
@@ -102,11 +102,21 @@ def _add_video(commands: Any) -> None:
     video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
     video.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
     video.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
-    video.add_argument("--width", type=number(16, 4096), default=1280, help="pixels, an even number (default: 1280)")
-    video.add_argument("--height", type=number(16, 4096), default=720, help="pixels, an even number (default: 720)")
-    video.add_argument("--fps", type=number(1.0, 240.0, "Hz"), default=30.0, help="pictures a second (default: 30)")
     video.add_argument(
-        "--speed", type=number(0.01, 100.0), default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)"
+        "--width", type=number_type(16, 4096), default=1280, help="pixels, an even number (default: 1280)"
+    )
+    video.add_argument(
+        "--height", type=number_type(16, 4096), default=720, help="pixels, an even number (default: 720)"
+    )
+    video.add_argument(
+        "--fps", type=number_type(1.0, 240.0, "Hz"), default=30.0, help="pictures a second (default: 30)"
+    )
+    video.add_argument(
+        "--speed",
+        type=number_type(0.01, 100.0),
+        default=1.0,
+        metavar="X",
+        help="2: twice as fast as it was (default: 1)",
     )
     add_span(video)
     video.set_defaults(act=_video)
@@ -116,7 +126,7 @@ def add_span(parser: argparse.ArgumentParser) -> None:
     """Add `--from` and `--to`, which select a part of a run."""
     for flag, name, default, verb in (("--from", "from_s", 0.0, "begin"), ("--to", "to_s", inf, "end")):
         about = f"{verb} S seconds in"
-        parser.add_argument(flag, dest=name, type=number(0.0, inf, "s"), default=default, metavar="S", help=about)
+        parser.add_argument(flag, dest=name, type=number_type(0.0, inf, "s"), default=default, metavar="S", help=about)
 
 
 def _add_recording(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +136,7 @@ def _add_recording(parser: argparse.ArgumentParser) -> None:
 def _info(arguments: argparse.Namespace) -> int:
     from snakesim_operator.playback.info import show
 
-    return show(arguments.recording, say, as_json=arguments.json)
+    return show(arguments.recording, print_line, as_json=arguments.json)
 
 
 def _report(arguments: argparse.Namespace) -> int:
@@ -141,7 +151,7 @@ def _report(arguments: argparse.Namespace) -> int:
     record = RunRecord.load(given)
     out = arguments.out or (given / REPORT if given.is_dir() else given.with_suffix(".html"))
     write_text(out, page(record, summarise(record, ended(record))))
-    say(str(out))
+    print_line(str(out))
     return exit_code(given, record.lacks)
 
 
@@ -165,17 +175,17 @@ def _export(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
     if arguments.format in ("parquet", "lerobot"):
-        extras.check("export", f"--format {arguments.format}")
+        extras.require("export", f"--format {arguments.format}")
     from snakesim_operator.playback.export import export, export_dataset
 
     if arguments.format == "lerobot":
         choice = {"images": arguments.images, "task": arguments.task, "fps": arguments.fps}
-        return export_dataset(arguments.recordings, arguments.out, say, **choice)
+        return export_dataset(arguments.recordings, arguments.out, print_line, **choice)
     if arguments.images or arguments.task is not None or arguments.fps is not None:
         raise ConfigError(
             f"--images, --task and --fps are for --format lerobot, not {arguments.format}; leave them out"
         )
-    return export(arguments.recordings, arguments.format, arguments.out, say)
+    return export(arguments.recordings, arguments.format, arguments.out, print_line)
 
 
 def _replay(arguments: argparse.Namespace) -> int:
@@ -190,7 +200,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         if arguments.controller is not None:
             overrides.append(Override("controller", arguments.controller, "--controller"))
         trusted = arguments.run_recorded_code
-        return replay_control(path, overrides, arguments.out, say, run_recorded_code=trusted)
+        return replay_control(path, overrides, arguments.out, print_line, run_recorded_code=trusted)
     if arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code:
         raise ConfigError(
             "--set, --controller, --run-recorded-code and --out are for --control, which runs the services; add it, or "
@@ -204,7 +214,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         return play(
             path,
             iter(sys.stdin),
-            say,
+            print_line,
             endpoint=arguments.endpoint,
             namespace=arguments.namespace,
             rate=arguments.rate,

@@ -16,16 +16,16 @@ from typing import Any
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from snakesim_hal.base.errors import ConfigError, SnakesimError, short
-from snakesim_hal.base.terminal import Say
+from snakesim_hal.base.errors import ConfigError, SnakesimError, shorten
+from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.model.plugins import in_file
-from snakesim_hal.model.scenario import CHOSEN, Override, RunConfig, load, write, written
+from snakesim_hal.model.scenario import CHOSEN, Override, RunConfig, encode_config, load, write_config
 from snakesim_hal.network.local_network import LocalNetwork, LocalQuery
-from snakesim_hal.network.session import Arrival, Publisher, Question
+from snakesim_hal.network.session import Arrival, Publisher, Query
 from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
@@ -140,8 +140,8 @@ def _refuse_recorded_files(path: Path, config: RunConfig, overridden: set[str]) 
     for key, flag, what, code in named:
         if in_file(code) and key not in overridden:
             raise ConfigError(
-                f"{path}: the recording names {short(code)!r} as {what}, and would have that Python file run on this "
-                f"computer. If you trust the file, name it yourself, with {flag}{short(code)}, or run what the "
+                f"{path}: the recording names {shorten(code)!r} as {what}, and would have that Python file run on this "
+                f"computer. If you trust the file, name it yourself, with {flag}{shorten(code)}, or run what the "
                 f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME"
             )
 
@@ -178,7 +178,7 @@ class Replay:
         self._path = path
         self._services = [name for name in SERVICE_OUTPUTS if name in self.config.own_services]
         self._output_keys = {key for name in self._services for key in SERVICE_OUTPUTS[name]}
-        self._output_keys |= {keys.done(name) for name in self._services}
+        self._output_keys |= {keys.done_key(name) for name in self._services}
         clocks: list[tuple[int, Clock]] = sorted(contents.at[keys.CLOCK].items())
         self._last_tick = clocks[-1][0] if clocks else -1
         self._epochs = [(tick, clock.lease_epoch) for tick, clock in clocks if clock.lease_epoch]
@@ -213,8 +213,8 @@ class Replay:
             if self._recording is not None:
                 opened.callback(self._recording.close, {"replay_of": str(self._path)})
                 for row in keys.SPACE:
-                    self._session.on_latched_arrival(row.key, self._recording.take)
-            self._session.on_question(keys.LEASE, self._grant_lease)
+                    self._session.on_latched_arrival(row.key, self._recording.write_arrival)
+            self._session.on_query(keys.LEASE, self._grant_lease)
             self._session.on_arrival(keys.JOINT_COMMAND, self._keep_command)
             self._publish_description()
             for name in self._services:
@@ -233,7 +233,7 @@ class Replay:
 
     def _publish_description(self) -> None:
         """Publish configuration and description, as a host does."""
-        effective = Configuration(config_hash=self.robot.config_hash, content=written(self.config).decode())
+        effective = Configuration(config_hash=self.robot.config_hash, content=encode_config(self.config).decode())
         self._session.latched_publisher(keys.CONFIG, Configuration).put(effective)
         self._session.latched_publisher(keys.DESCRIPTION, Description).put(self.robot)
 
@@ -245,8 +245,8 @@ class Replay:
 
     def _replay_message(self, recorded: RecordedMessage) -> None:
         """Publish a recorded message, unless a replayed service publishes it; at a clock, let the services act."""
-        message_type = keys.message_at(recorded.key)
-        if message_type is None or recorded.encoding != encoding_of(message_type):
+        message_type = keys.find_message(recorded.key)
+        if message_type is None or recorded.encoding != format_encoding(message_type):
             return  # from an unknown node
         self._now_ns = recorded.time_ns
         if recorded.key == keys.JOINT_COMMAND:
@@ -298,7 +298,7 @@ class Replay:
             controller=recorded.controller,
             settings=msgspec.json.encode(values).decode(),
         )
-        self._pending_changes.append((recorded, self._session.put_question(keys.SETTINGS, request)))
+        self._pending_changes.append((recorded, self._session.send_query(keys.SETTINGS, request)))
 
     def _applied_payload(self, recorded: RecordedMessage) -> bytes:
         """Return the setpoints that the host would have applied.
@@ -326,7 +326,7 @@ class Replay:
         command = self._command_decoder.decode(arrival.payload, arrival.encoding)
         self.comparison.replayed[command.tick] = command
 
-    def _grant_lease(self, question: Question) -> None:
+    def _grant_lease(self, question: Query) -> None:
         """Grant the lease with the epoch that the recording has next."""
         now_tick = self._now_ns // self.robot.period_ns
         epoch = next((epoch for tick, epoch in self._epochs if tick >= now_tick), 1)
@@ -334,7 +334,7 @@ class Replay:
 
 
 def replay_control(
-    path: Path, overrides: list[Override], out: Path | None, say: Say, *, run_recorded_code: bool = False
+    path: Path, overrides: list[Override], out: Path | None, say: PrintLine, *, run_recorded_code: bool = False
 ) -> int:
     """Replay a recording, and print how the commands differ: `snakesim replay --control`.
 
@@ -361,7 +361,7 @@ def replay_control(
         raise ConfigError(f"--out {out}: holds a recording already; choose another folder") from None
     comparison = replay.run()
     if out is not None:
-        write(replay.config, out / CONFIG)
+        write_config(replay.config, out / CONFIG)
         say(f"replayed: {out}; `snakesim compare {path} {out}` shows the difference")
     if replay.stopped:
         say(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
@@ -373,7 +373,7 @@ def replay_control(
     return exit_code(path, replay.lacks, 1)
 
 
-def _print_comparison(comparison: Comparison, replay: Replay, say: Say) -> bool:
+def _print_comparison(comparison: Comparison, replay: Replay, say: PrintLine) -> bool:
     """Print how the commands differ, and return whether they are the same."""
     different = comparison.different
     count = len(comparison.recorded.keys() | comparison.replayed.keys())

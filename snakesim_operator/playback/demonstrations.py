@@ -16,12 +16,12 @@ from queue import Queue
 
 import msgspec
 
-from snakesim_hal.base.process import on_stop_signal, stop_signals, user_name
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.process import get_user_name, on_stop_signal, stop_signals
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.session import Link
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, only_robot
-from snakesim_operator.recording.process import record
+from snakesim_operator.recording.process import record_to_file
 
 EPISODES = "episodes.jsonl"
 SUCCESS_BY_KEY = {"s": True, "f": False, "d": None}  # None: the episode is dropped
@@ -95,7 +95,7 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     keyboard = _Keyboard(lines)
     on_stop_signal(keyboard.interrupt)
     demonstrations = _Demonstrations(link, folder, task, keyboard)
-    say(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {HELP}")
+    print_line(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {HELP}")
     try:
         while not demonstrations.failure:
             keyboard.next_line()
@@ -105,7 +105,9 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     finally:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
-    say(f"{demonstrations.kept} episodes; `snakesim export {folder} --format lerobot` makes a data set of {folder}")
+    print_line(
+        f"{demonstrations.kept} episodes; `snakesim export {folder} --format lerobot` makes a data set of {folder}"
+    )
     return 1 if demonstrations.failure else 0
 
 
@@ -124,20 +126,20 @@ class _Demonstrations:
         """Record from now to Enter, and keep the episode unless the operator drops it. Raises _InputEnded."""
         path = self._free_path()
         began = datetime.now(UTC).isoformat(timespec="seconds")
-        say(f"{path.name}: recording; Enter ends it")
+        print_line(f"{path.name}: recording; Enter ends it")
         success = None
         try:
-            recorder = record(self._link, path, lambda: not self._keyboard.take_line())
+            recorder = record_to_file(self._link, path, lambda: not self._keyboard.take_line())
             self.failure = recorder.recording.failure
             if not self.failure:
-                say(f"{path.name}: {recorder.recording.counts.total()} messages. s, f or d?")
+                print_line(f"{path.name}: {recorder.recording.counts.total()} messages. s, f or d?")
                 success = self._read_judgment()
         finally:
             if success is None:
                 path.unlink(missing_ok=True)
-                say(f"{path.name}: dropped")
+                print_line(f"{path.name}: dropped")
         if success is not None:
-            self._keep(EpisodeLabel(file=path.name, task=self._task, success=success, who=user_name(), began=began))
+            self._keep(EpisodeLabel(file=path.name, task=self._task, success=success, who=get_user_name(), began=began))
 
     def _free_path(self) -> Path:
         """Return the first numbered path at which no recording is yet."""
@@ -153,11 +155,11 @@ class _Demonstrations:
             key = self._keyboard.next_line()
             if key in SUCCESS_BY_KEY:
                 return SUCCESS_BY_KEY[key]
-            say(f"{key!r}: s if it succeeded, f if it failed, d to drop it")
+            print_line(f"{key!r}: s if it succeeded, f if it failed, d to drop it")
 
     def _keep(self, label: EpisodeLabel) -> None:
         with (self._folder / EPISODES).open("ab") as file:
             file.write(msgspec.json.encode(label) + b"\n")
         self.kept += 1
         result = "succeeded" if label.success else "failed"
-        say(f"{label.file}: {result}. Enter begins the next one")
+        print_line(f"{label.file}: {result}. Enter begins the next one")

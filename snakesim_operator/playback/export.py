@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import Say, printable
+from snakesim_hal.base.terminal import PrintLine, escape_invisible
 from snakesim_hal.model.textfiles import exported
-from snakesim_hal.wire.own_sample import own_kinds
+from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
-from snakesim_operator.recording.recover import recover
+from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
 
@@ -45,7 +45,7 @@ UNITS = {
 }
 
 
-def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
+def export(runs: Sequence[Path], form: str, out: Path | None, say: PrintLine) -> int:
     """Write a run in a format.
 
     Args:
@@ -66,7 +66,7 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
     path = _reserve(out or _default_path(run, form))
     if form == "mcap":
         with exported(path) as partial:
-            count, lacks = recover(recording_of(run), partial)
+            count, lacks = recover_recording(recording_of(run), partial)
         say(f"{count} messages: {path}")
         return exit_code(run, lacks)
     record = RunRecord.load(run)
@@ -85,7 +85,7 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
 
 
 def export_dataset(
-    runs: Sequence[Path], out: Path | None, say: Say, *, images: bool, task: str | None, fps: float | None
+    runs: Sequence[Path], out: Path | None, say: PrintLine, *, images: bool, task: str | None, fps: float | None
 ) -> int:
     """Write a LeRobot dataset: an episode for each run or demonstration, and one more for each gap.
 
@@ -149,7 +149,7 @@ def unit_of(name: str, record: RunRecord) -> str:
     """Return the unit of a column, or of a whole signal."""
     signal = name.partition(".")[0]
     units: dict[str, str] = {}
-    for kind in own_kinds(record.description).values():
+    for kind in find_custom_messages(record.description).values():
         units |= kind.units
     units |= UNITS  # the robot's own signals win
     return units[signal]
@@ -187,7 +187,7 @@ def _write_npz(record: RunRecord, path: Path) -> None:
 def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str]) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
         for lack in lacks:
-            file.write(f"# incomplete: {printable(lack)}\n")
+            file.write(f"# incomplete: {escape_invisible(lack)}\n")
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):

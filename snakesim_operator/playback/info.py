@@ -13,19 +13,19 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from snakesim_hal.base.arithmetic import digest_text, foreign
+from snakesim_hal.base.arithmetic import find_differing_parts, format_digest
 from snakesim_hal.base.errors import ConfigError, WireError
-from snakesim_hal.base.terminal import Say
+from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import ControlSettings, Status
-from snakesim_operator.recording.losses import Gap
+from snakesim_operator.recording.losses import LossGap
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.missing_data import describe_undecodable, exit_code
 from snakesim_operator.results.record import GIVE
 from snakesim_operator.results.recording_contents import ALL, Contents
-from snakesim_operator.robot_commands.parameters import PREFIX, differing
+from snakesim_operator.robot_commands.parameters import PREFIX, find_changed_parameters
 
 # Published on a change too, so that nothing is missing there.
 IRREGULAR = (keys.CONTROL_STATE, keys.STATUS, keys.INTENT)
@@ -62,7 +62,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     size_bytes: int
     finished: bool
     lacks: list[str]
-    gaps: list[Gap]  # what of it is lost in between, by time and key
+    gaps: list[LossGap]  # what of it is lost in between, by time and key
     robot: str | None
     backend: str | None
     scenario: str | None
@@ -94,7 +94,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
     by_key: dict[str, KeyInfo] = {}
     settings_in_force: list[ControlSettings] = []
     settings_decoder = Decoder(ControlSettings)
-    for recorded in reader.messages():
+    for recorded in reader.read_messages():
         key_info = by_key.setdefault(recorded.key, KeyInfo())
         key_info.time_ns.append(recorded.time_ns)
         key_info.bytes += len(recorded.payload)
@@ -115,8 +115,8 @@ def inspect_recording(path: Path) -> RecordingInfo:
     if robot is not None and status is not None:
         host = contents.host(contents.columns(robot))
     lacks = [
-        *reader.lacks,
-        *_describe_skipped(by_key, reader.losses.lost, irregular),
+        *reader.missing,
+        *_describe_skipped(by_key, reader.losses.lost_by_key, irregular),
         *describe_undecodable(contents.refused),
     ]
     numbers_by_key: dict[str, dict[str, float]] = {}
@@ -137,7 +137,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         duration_s=duration_s,
         ticks=0 if host is None else host.ticks,
         command_digest=None if host is None or not host.ticks else host.command_digest,
-        own_arithmetic=[] if robot is None else foreign(robot.arithmetic),
+        own_arithmetic=[] if robot is None else find_differing_parts(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_lifecycle_reason(status)}",
         settings=_settings_changes(settings_in_force),
         dropped=reader.losses.dropped,
@@ -163,7 +163,7 @@ def _settings_changes(in_force: Sequence[ControlSettings]) -> list[SettingsChang
     for before, now in pairwise(in_force):
         if now.who is None or now.changes == before.changes:
             continue
-        changed = {PREFIX + new.name: (old.value, new.value) for old, new in differing(before, now)}
+        changed = {PREFIX + new.name: (old.value, new.value) for old, new in find_changed_parameters(before, now)}
         changes.append(SettingsChange(time_s=now.timestamp_ns * 1e-9, who=now.who, changed=changed))
     return changes
 
@@ -189,7 +189,7 @@ def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
     }
 
 
-def show(given: Path, say: Say, *, as_json: bool = False) -> int:
+def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
     """Print what a recording holds, and return the exit code: 3 if it is incomplete."""
     info = inspect_recording(recording_of(given))
     if as_json:
@@ -199,7 +199,7 @@ def show(given: Path, say: Say, *, as_json: bool = False) -> int:
     say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}")
     say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     say(f"  ended     {info.lifecycle or 'unknown'}")
-    digest = digest_text(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
+    digest = format_digest(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
     of_what = " of these ticks alone" if info.lacks else ""
     say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
     for change in info.settings:

@@ -10,7 +10,7 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import ColorImage, DepthImage
-from snakesim_operator.base.png import png
+from snakesim_operator.base.png import encode_png
 from snakesim_operator.recording.reader import RecordingReader
 
 _DECODERS = {"depth": Decoder(DepthImage), "color": Decoder(ColorImage)}
@@ -38,7 +38,7 @@ class Pictures:
         """Add a picture, (height * width * 3,) or (height, width, 3)."""
         pixels = rgb.reshape(-1, 3) / 255.0
         self.ticks.append(tick)
-        self.png.append(png(self.width, self.height, rgb.tobytes(), bits=8, color=True))
+        self.png.append(encode_png(self.width, self.height, rgb.tobytes(), bits=8, color=True))
         self.channel_means.append(pixels.mean(axis=0))
         self.channel_squares.append(np.square(pixels).mean(axis=0))
         self.channel_min = np.minimum(self.channel_min, pixels.min(axis=0))
@@ -51,7 +51,7 @@ def read_pictures(path: Path) -> dict[str, Pictures]:
     Pictures are left out if they are damaged, older than the one before, or of another size than the camera's first.
     """
     by_camera: dict[str, Pictures] = {}
-    for recorded in RecordingReader(path).messages((keys.COLOUR_ALL, keys.DEPTH_ALL)):
+    for recorded in RecordingReader(path).read_messages((keys.COLOR_ALL, keys.DEPTH_ALL)):
         _, kind, name = recorded.key.split("/")
         try:
             image = _DECODERS[kind].decode(recorded.payload, recorded.encoding)

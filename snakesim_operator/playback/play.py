@@ -10,10 +10,10 @@ from itertools import count, groupby
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.base.terminal import Say
+from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Publisher, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, format_encoding
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.missing_data import exit_code
@@ -32,7 +32,7 @@ def in_robot_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
     waiting: list[tuple[int, int, int, RecordedMessage]] = []
     arrival_number = count()
     clock_ns = 0
-    for recorded in reader.messages():
+    for recorded in reader.read_messages():
         rank = ORDER_WITHIN_TICK.get(recorded.key, 0)
         heapq.heappush(waiting, (recorded.time_ns, rank, next(arrival_number), recorded))
         if recorded.key == keys.CLOCK:
@@ -44,7 +44,14 @@ def in_robot_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
 
 
 def play(
-    path: Path, lines: Iterator[str], say: Say, *, endpoint: str | None, namespace: str | None, rate: float, step: bool
+    path: Path,
+    lines: Iterator[str],
+    say: PrintLine,
+    *,
+    endpoint: str | None,
+    namespace: str | None,
+    rate: float,
+    step: bool,
 ) -> int:
     """Play a recording once.
 
@@ -85,7 +92,7 @@ def play(
             for recorded in simultaneous:
                 player.publish(recorded)
         say(f"{player.count} messages played")
-    return exit_code(path, reader.lacks)
+    return exit_code(path, reader.missing)
 
 
 class _Timing:
@@ -116,8 +123,8 @@ class _Player:
 
     def publish(self, recorded: RecordedMessage) -> None:
         """Publish a message as it was. Ignores messages of keys that are not SnakeSIM's."""
-        row = keys.row_at(recorded.key)
-        if row is None or row.message is None or recorded.encoding != encoding_of(row.message):
+        row = keys.find_row(recorded.key)
+        if row is None or row.message is None or recorded.encoding != format_encoding(row.message):
             return
         publisher = self._publishers.get(recorded.key)
         if publisher is None:

@@ -9,11 +9,11 @@ from datetime import datetime
 from pathlib import Path
 
 from snakesim_hal.base.process import on_stop_signal, stop_signals
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, only_robot
 from snakesim_operator.recording.live import LiveServer
-from snakesim_operator.recording.process import record
+from snakesim_operator.recording.process import record_to_file
 
 
 def record_robot(
@@ -52,19 +52,19 @@ def record_robot(
         with (
             nullcontext()
             if foxglove_port is None
-            else LiveServer(link.namespace or "robot", foxglove_port, foxglove_origins, say) as live
+            else LiveServer(link.namespace or "robot", foxglove_port, foxglove_origins, print_line) as live
         ):
             end = "" if duration_s else "; Ctrl-C ends it"
-            say(f"recording {link.namespace} on {link.endpoint} into {path}{end}")
+            print_line(f"recording {link.namespace} on {link.endpoint} into {path}{end}")
             show = None
             if live is not None:
-                say(f"Foxglove: open connection {live.address}")
-                show = live.show
-            recorder = record(link, path, goes_on, show, raw_only=raw_only)
+                print_line(f"Foxglove: open connection {live.address}")
+                show = live.send
+            recorder = record_to_file(link, path, goes_on, show, raw_only=raw_only)
     finally:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
     messages = recorder.recording.counts.total()
     size_bytes = path.stat().st_size
-    say(f"{messages} messages in {time.monotonic() - began:.1f} s, {size_bytes / 1e6:.1f} MB: {path}")
+    print_line(f"{messages} messages in {time.monotonic() - began:.1f} s, {size_bytes / 1e6:.1f} MB: {path}")
     return 1 if recorder.recording.failure else 0

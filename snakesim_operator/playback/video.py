@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import Say, say
+from snakesim_hal.base.terminal import PrintLine, print_line
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.textfiles import exported
 from snakesim_operator.base import extras
@@ -50,12 +50,12 @@ Span = tuple[float, float]  # from and to in seconds, since the first tick
 def video(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span) -> int:
     """Film a run from its folder or recording, and return the exit code. Takes and raises what `film` does."""
     record = RunRecord.load(run)
-    film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=say)
+    film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=print_line)
     return exit_code(run, record.lacks)
 
 
 def film(
-    record: RunRecord, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: Say
+    record: RunRecord, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: PrintLine
 ) -> None:
     """Film a record.
 
@@ -73,7 +73,7 @@ def film(
     """
     if out.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
-    extras.check("video", "a film")
+    extras.require("video", "a film")
     times = times_of_pictures(record, fps, speed, span_s)
     picture_s = speed / fps
     for sentence in standstills_in_words(times, picture_s, record.config.period_ns * 1e-9):

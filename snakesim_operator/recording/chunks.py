@@ -54,7 +54,7 @@ def read_chunk_length(head: bytes) -> int:
     return _CHUNK_HEAD.size + name_bytes + _PACKED_LENGTH.size + packed_bytes
 
 
-def unpack(content: bytes) -> bytearray:
+def unpack_chunk(content: bytes) -> bytearray:
     """Return the records within a chunk, in bytes.
 
     Args:

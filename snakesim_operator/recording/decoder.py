@@ -10,7 +10,7 @@ from mcap.records import Schema
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire.messages import VERSIONS
-from snakesim_hal.wire.own_sample import own_kind
+from snakesim_hal.wire.own_sample import parse_custom_message
 
 PREFIX = "snakesim."  # of the names of all schemas of the robot's messages
 CUSTOM_PREFIX = f"{PREFIX}own."  # of the schemas of custom sensors
@@ -35,7 +35,7 @@ class DecoderFactory(McapDecoderFactory):
             return msgspec.json.decode
         if schema.name.startswith(CUSTOM_PREFIX):
             with suppress(WireError):
-                custom_type = own_kind(schema.data.decode(errors="replace"))
+                custom_type = parse_custom_message(schema.data.decode(errors="replace"))
                 return msgspec.msgpack.Decoder(custom_type.message).decode
         decoder = self._decoders.get(schema.name)
         if decoder is None:

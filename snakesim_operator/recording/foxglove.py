@@ -20,8 +20,8 @@ from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.model.scenario import RunConfig, capsules_at_start
-from snakesim_hal.model.scene import place
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.model.scene import place_scene
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import (
@@ -36,7 +36,7 @@ from snakesim_hal.wire.messages import (
     World,
     WorldContact,
 )
-from snakesim_hal.wire.own_sample import OwnKind, own_kinds
+from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
@@ -76,7 +76,7 @@ class FoxgloveChannels:
         self._newest: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
         self._robot: Description | None = None
         self._frames: BodyMessages | None = None
-        self._custom_types: dict[str, OwnKind] = {}  # messages of the robot's custom sensors, by key
+        self._custom_types: dict[str, CustomMessage] = {}  # messages of the robot's custom sensors, by key
         self._true_obstacles = shapes.draw_obstacles([], "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
 
         # What has been shown.
@@ -125,7 +125,7 @@ class FoxgloveChannels:
             robot: Description = _get_decoder(Description).decode(payload)
             if len(robot.links) == len(robot.joints) + 1:
                 frames = BodyMessages(robot)
-                custom_types = own_kinds(robot)
+                custom_types = find_custom_messages(robot)
                 self._robot = robot
                 self._frames = frames
                 self._custom_types = custom_types
@@ -135,7 +135,7 @@ class FoxgloveChannels:
         with suppress(SnakesimError, *UNDECODABLE):
             content = _get_decoder(Configuration).decode(payload).content
             config = msgspec.json.decode(content, type=RunConfig)
-            placed = place(config.scene, capsules_at_start(config))  # checked when the run began
+            placed = place_scene(config.scene, capsules_at_start(config))  # checked when the run began
             obstacles = [body.obstacle for body in placed]
             self._true_obstacles = shapes.draw_obstacles(obstacles, "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
 
@@ -173,7 +173,7 @@ class FoxgloveChannels:
     def _convert_joints(self, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
         joints: JointState | None = _decode(JointState, payload)
         frames = self._frames
-        if frames is None or joints is None or not joints.is_of(frames.joint_count):
+        if frames is None or joints is None or not joints.has_joint_count(frames.joint_count):
             return []
         encoded = frames.encode_joint_states(joints, time_ns)
         topic = make_topic(self._robot_name, "joint_states")
@@ -227,7 +227,7 @@ class FoxgloveChannels:
         message_type = DepthImage if key.startswith(DEPTH_PREFIX) else ColorImage
         image: Any = _decode(message_type, payload)
         robot = self._robot
-        if robot is None or image is None or mismatch(image, robot) is not None:
+        if robot is None or image is None or find_mismatch(image, robot) is not None:
             return []
         _, kind, camera = key.split("/", 2)
         topic = f"{make_name_part(camera)}/{kind}"
@@ -251,7 +251,7 @@ class FoxgloveChannels:
         frames = self._frames
         joints: JointState | None = self._decode_fresh(keys.JOINTS, JointState, time_ns)
         world: PoseAndContacts | None = self._decode_fresh(keys.WORLD, PoseAndContacts, time_ns)
-        if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
+        if robot is None or frames is None or joints is None or not joints.has_joint_count(len(robot.joints)):
             return []
         base = self._find_base(world, time_ns)
         transforms = frames.fill_transforms(joints.angle_rad, base, time_ns)
@@ -325,7 +325,7 @@ def _decode(message_type: type[Any], payload: bytes) -> Any:
     return None
 
 
-def _decode_custom(kind: OwnKind, payload: bytes) -> Any:
+def _decode_custom(kind: CustomMessage, payload: bytes) -> Any:
     """Return the decoded sample of a custom sensor, or None if the payload does not fit its type."""
     with suppress(*UNDECODABLE):
         return msgspec.msgpack.decode(payload, type=kind.message)

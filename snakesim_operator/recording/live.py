@@ -53,7 +53,7 @@ class LiveServer:
         self._relay = OriginRelay(port, (hidden_host, self._server.port), origins, report)
         self.address = f"ws://{HOST}:{self._relay.port}"
 
-    def show(self, message: FoxgloveMessage, time_ns: int) -> None:
+    def send(self, message: FoxgloveMessage, time_ns: int) -> None:
         """Send one message to the viewers. time_ns: robot time."""
         channel = self._channels.get(message.topic)
         if channel is None:

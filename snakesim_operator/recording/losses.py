@@ -12,7 +12,7 @@ UNKNOWN_KEYS = "keys that are not known"  # of messages whose channel is lost to
 
 
 @dataclass
-class Gap:
+class LossGap:
     """Messages that are lost in one place."""
 
     begin_ns: int  # robot time of the newest message before the gap
@@ -24,16 +24,16 @@ class Gap:
 class Losses:
     """Everything that one file has lost."""
 
-    gaps: list[Gap] = field(default_factory=list[Gap])
-    damaged: list[str] = field(default_factory=list[str])  # position and kind of the first damages
-    places: int = 0  # number of all damages
+    gaps: list[LossGap] = field(default_factory=list[LossGap])
+    damages: list[str] = field(default_factory=list[str])  # position and kind of the first damages
+    damage_count: int = 0  # number of all damages
     cut_ns: int | None = None  # the file has no end; robot time of its newest message
     misplaced: int = 0  # messages behind later ones of their key
     earlier: list[str] = field(default_factory=list[str])  # losses of the file that this one was copied from
     dropped: dict[str, int] = field(default_factory=dict[str, int])  # by key: the disk was too slow
 
     @property
-    def lost(self) -> Counter[str]:
+    def lost_by_key(self) -> Counter[str]:
         """Return the number of messages that are known to be lost, by key."""
         return sum((gap.lost for gap in self.gaps), Counter[str]())
 
@@ -45,22 +45,22 @@ class Losses:
             reason: What is damaged.
             newest_ns: Robot time of the newest message before it.
         """
-        self.places += 1
-        if len(self.damaged) < MAX_GAPS_SHOWN:
-            self.damaged.append(f"{reason} at byte {position}")
+        self.damage_count += 1
+        if len(self.damages) < MAX_GAPS_SHOWN:
+            self.damages.append(f"{reason} at byte {position}")
         self.open_gap(newest_ns)
 
     def open_gap(self, begin_ns: int, end_ns: int | None = None) -> None:
         """Begin a gap at this robot time; beyond MAX_GAPS, extend the last one."""
         if len(self.gaps) < MAX_GAPS:
-            self.gaps.append(Gap(begin_ns, end_ns))
+            self.gaps.append(LossGap(begin_ns, end_ns))
         else:
             self.gaps[-1].end_ns = end_ns
 
     def describe(self) -> list[str]:
         """Return what is lost in words, one text for each kind of loss; empty if nothing is lost."""
         texts: list[str] = []
-        if self.places:
+        if self.damage_count:
             texts.append(self._describe_damages())
         texts += self._describe_gaps()
         if self.cut_ns is not None:
@@ -79,9 +79,9 @@ class Losses:
         return texts + earlier_texts
 
     def _describe_damages(self) -> str:
-        text = f"damaged in {_format_count(self.places, 'place')}: {'; '.join(self.damaged)}"
-        if self.places > len(self.damaged):
-            text += f" and {self.places - len(self.damaged)} more"
+        text = f"damaged in {_format_count(self.damage_count, 'place')}: {'; '.join(self.damages)}"
+        if self.damage_count > len(self.damages):
+            text += f" and {self.damage_count - len(self.damages)} more"
         return text
 
     def _describe_gaps(self) -> list[str]:
@@ -96,7 +96,7 @@ class Losses:
         return texts
 
 
-def _describe_gap(gap: Gap) -> str:
+def _describe_gap(gap: LossGap) -> str:
     begin_s = gap.begin_ns * 1e-9
     if gap.end_ns is None:
         interval = f"after {begin_s:.2f} s"

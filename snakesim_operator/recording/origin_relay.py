@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Collection
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_operator.base.page_origin import why_head_refused
+from snakesim_operator.base.page_origin import explain_head_refusal
 
 HOST = "127.0.0.1"
 MAX_HEAD_BYTES = 16 * 1024
@@ -92,7 +92,7 @@ class OriginRelay:
 
     async def _check_and_relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         head = await asyncio.wait_for(reader.readuntil(END_OF_HEAD), HEAD_TIMEOUT_S)
-        refusal = why_head_refused(head, self._origins)
+        refusal = explain_head_refusal(head, self._origins)
         if refusal is not None:
             self._report_refusal(refusal)
             writer.write(FORBIDDEN)

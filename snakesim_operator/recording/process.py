@@ -20,14 +20,14 @@ import msgspec
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import on_stop_signal
-from snakesim_hal.base.terminal import exit_code, print_stderr
+from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import ProcessOptions, process_options
-from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
@@ -68,7 +68,7 @@ class Recorder:
             self._latched[arrival.key] = arrival
             if arrival.key == keys.DESCRIPTION:
                 self._read_host(arrival.payload)
-        self.recording.take(arrival)
+        self.recording.write_arrival(arrival)
         if arrival.key == keys.CLOCK:
             has_restarted = self._restarted_clock is not None or self.recording.time.went_back
             if has_restarted:
@@ -113,7 +113,7 @@ class Recorder:
         self.path.rename(self._find_free_path())
         self.recording = Recording(self.path, self._shown_as, self._show)
         for arrival in (*self._latched.values(), clock):
-            self.recording.take(arrival)
+            self.recording.write_arrival(arrival)
 
     def _find_free_path(self) -> Path:
         """Return the first of NAME-1, NAME-2 and so on that does not exist."""
@@ -124,7 +124,7 @@ class Recorder:
                 return path
 
 
-def record(
+def record_to_file(
     link: Link,
     path: Path,
     goes_on: Callable[[], bool],
@@ -157,7 +157,7 @@ def record(
         recorder = Recorder(path, shown_as, show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
-    with open_session(link, connect_timeout_s=START_LIMIT_S) as session:
+    with open_session(link, connect_timeout_s=SERVICE_START_LIMIT_S) as session:
         tap = Tap(session)
         hosts = _watch_hosts(session)
         session.declare_alive(RECORDER)
@@ -186,7 +186,7 @@ def _watch_hosts(session: Session) -> set[str]:
         else:
             hosts.discard(key)
 
-    session.on_alive(update, keys.alive(HAL))
+    session.on_alive(update, keys.alive_key(HAL))
     return hosts
 
 
@@ -231,7 +231,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_network(parser, "")
     add_parent(parser)
     arguments = parser.parse_args(argv)
-    return exit_code(f"snakesim {RECORDER}", lambda: _record_run(process_options(arguments)))
+    return run_tool(f"snakesim {RECORDER}", lambda: _record_run(process_options(arguments)))
 
 
 def _record_run(options: ProcessOptions) -> int:
@@ -243,7 +243,7 @@ def _record_run(options: ProcessOptions) -> int:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     path = options.arguments.out / RECORDING
     raw_only = options.arguments.raw_only
-    recorder = record(options.link, path, lambda: not stop_signals, raw_only=raw_only, after_host=True)
+    recorder = record_to_file(options.link, path, lambda: not stop_signals, raw_only=raw_only, after_host=True)
     if recorder.recording.failure:
         return EXIT_DISK_FULL
     return 0

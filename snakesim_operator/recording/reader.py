@@ -16,8 +16,8 @@ from mcap.records import Channel, DataEnd, Header, McapRecord, Message, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.keys import row_key
-from snakesim_operator.recording.chunks import DamagedError, parse_chunk, parse_record, unpack
+from snakesim_hal.wire.keys import find_row_key
+from snakesim_operator.recording.chunks import DamagedError, parse_chunk, parse_record, unpack_chunk
 from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, Losses
 from snakesim_operator.recording.mcap_file import PROFILE
 from snakesim_operator.recording.message import RecordedMessage
@@ -51,7 +51,7 @@ class RecordingReader:
     path: Path
     finished: bool = False  # else its recorder was killed, the disk was full, or the file was cut
     losses: Losses = field(default_factory=Losses)
-    about: dict[str, Any] = field(default_factory=dict[str, Any])
+    metadata: dict[str, Any] = field(default_factory=dict[str, Any])
 
     # What has been read.
     _channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
@@ -68,11 +68,11 @@ class RecordingReader:
     _summary: list[McapRecord] | None = None  # None: not read
 
     @property
-    def lacks(self) -> list[str]:
+    def missing(self) -> list[str]:
         """Return what is missing, in words; empty if nothing is."""
         return self.losses.describe()
 
-    def messages(self, keys: Collection[str] | None = None) -> Iterator[RecordedMessage]:
+    def read_messages(self, keys: Collection[str] | None = None) -> Iterator[RecordedMessage]:
         """Yield the messages of the robot.
 
         Args:
@@ -81,17 +81,17 @@ class RecordingReader:
         Raises:
             ConfigError: The file is no recording, or cannot be read.
         """
-        for record in self.records():
+        for record in self.read_records():
             if not isinstance(record, Message):
                 continue
             channel = self._channels[record.channel_id]
             encoding = channel.metadata.get("encoding")
             if encoding is None:  # a topic made for viewers
                 continue
-            if keys is None or channel.topic in keys or row_key(channel.topic) in keys:
+            if keys is None or channel.topic in keys or find_row_key(channel.topic) in keys:
                 yield RecordedMessage(channel.topic, record.data, encoding, record.log_time, record.publish_time)
 
-    def records(self) -> Iterator[McapRecord]:
+    def read_records(self) -> Iterator[McapRecord]:
         """Yield every schema, channel, message and metadata that can be read, a channel before its messages.
 
         Raises:
@@ -138,7 +138,7 @@ class RecordingReader:
         """Yield the record, or the records of a chunk. Raises DamagedError, ConfigError."""
         opcode = raw_record.opcode
         if opcode == Opcode.CHUNK:
-            data = unpack(raw_record.content)
+            data = unpack_chunk(raw_record.content)
             self._count_unpacked_bytes(len(data), raw_record.end)
             yield from parse_chunk(data)
         elif opcode == Opcode.DATA_END:
@@ -215,16 +215,16 @@ class RecordingReader:
         """Read the recorder's metadata; entries that are no JSON are ignored."""
         for name, value in metadata.items():
             try:
-                self.about[name] = json.loads(value)
+                self.metadata[name] = json.loads(value)
             except (ValueError, RecursionError):
                 continue
-        dropped = self.about.get("dropped")
+        dropped = self.metadata.get("dropped")
         if isinstance(dropped, dict):
             self.losses.dropped = {}
             for key, count in dropped.items():
                 if isinstance(count, int) and count > 0:
                     self.losses.dropped[str(key)[:MAX_KEY_LENGTH]] = count
-        earlier = self.about.get(COPIED)
+        earlier = self.metadata.get(COPIED)
         if isinstance(earlier, list):
             self.losses.earlier = [str(text)[:MAX_EARLIER_LENGTH] for text in earlier[:MAX_EARLIER_LOSSES]]
 

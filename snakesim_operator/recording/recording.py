@@ -20,7 +20,7 @@ from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.own_sample import OwnKind, own_kinds
+from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, make_schema
@@ -65,7 +65,7 @@ class Recording:
 
         # The robot's messages.
         self.counts: Counter[str] = Counter()  # messages written, by key
-        self._custom_types: dict[str, OwnKind] = {}  # messages of custom sensors, by key
+        self._custom_types: dict[str, CustomMessage] = {}  # messages of custom sensors, by key
         self._early_samples: list[Arrival] | None = []  # of custom sensors; None once the description is known
 
         # Messages made for viewers.
@@ -76,7 +76,7 @@ class Recording:
 
         self.flush()
 
-    def take(self, arrival: Arrival) -> None:
+    def write_arrival(self, arrival: Arrival) -> None:
         """Write one message, unless its key is not in the key space.
 
         A custom sensor's sample waits until the robot's description has said what it means.
@@ -84,7 +84,7 @@ class Recording:
         if self.failure:
             return
         early = self._early_samples
-        if early is not None and keys.row_key(arrival.key) == keys.OWN_ALL and len(early) < MAX_EARLY_SAMPLES:
+        if early is not None and keys.find_row_key(arrival.key) == keys.OWN_ALL and len(early) < MAX_EARLY_SAMPLES:
             early.append(arrival)
             return
         self._write(arrival)
@@ -128,7 +128,7 @@ class Recording:
         """Write one message, and what is made of it for viewers."""
         if arrival.key == keys.DESCRIPTION:
             with suppress(*UNDECODABLE):
-                self._custom_types = own_kinds(msgspec.msgpack.decode(arrival.payload, type=Description))
+                self._custom_types = find_custom_messages(msgspec.msgpack.decode(arrival.payload, type=Description))
         channel = self._channels.get(arrival.key)
         if channel is None:
             channel = self._open_channel(arrival)
@@ -163,7 +163,7 @@ class Recording:
 
     def _open_channel(self, arrival: Arrival) -> int | None:
         """Return the number of a new channel for a key, or None if the key is not in the key space."""
-        message_type = keys.message_at(arrival.key)
+        message_type = keys.find_message(arrival.key)
         if message_type is None:
             return None
         custom_type = self._custom_types.get(arrival.key)
@@ -183,7 +183,7 @@ class Recording:
             self._schemas[name] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
         return self._schemas[name]
 
-    def _add_custom_schema(self, custom_type: OwnKind) -> int:
+    def _add_custom_schema(self, custom_type: CustomMessage) -> int:
         """Return the number of a custom message's schema. Its text identifies it: two authors may choose one name."""
         text = custom_type.schema
         if text not in self._schemas:

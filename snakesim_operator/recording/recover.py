@@ -14,7 +14,7 @@ from snakesim_operator.recording.recording import ABOUT, COPIED
 FLUSH_BYTES = 4 * 1024 * 1024  # bounds the memory that waiting messages take
 
 
-def recover(path: Path, out: Path) -> tuple[int, list[str]]:
+def recover_recording(path: Path, out: Path) -> tuple[int, list[str]]:
     """Copy the readable messages of a recording, without change, into a new file.
 
     Args:
@@ -34,10 +34,10 @@ def recover(path: Path, out: Path) -> tuple[int, list[str]]:
     try:
         reader = RecordingReader(path)
         copy = _Copy(file)
-        for record in reader.records():
+        for record in reader.read_records():
             copy.add(record)
-        missing = reader.lacks
-        copy.finish(reader.about, missing)
+        missing = reader.missing
+        copy.finish(reader.metadata, missing)
     except BaseException:
         out.unlink(missing_ok=True)  # half a copy would refuse the next try
         raise

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.network.local_registry import state_folder
 from snakesim_hal.wire.codec import UNDECODABLE
 
@@ -34,7 +34,7 @@ def remember(folder: str, ended: str) -> None:
 def _write(noted: LastRun) -> None:
     with contextlib.suppress(OSError, ValueError):  # the latter: a folder whose name is not text
         _file().parent.mkdir(parents=True, exist_ok=True)
-        write_whole(_file(), msgspec.json.encode(noted))
+        write_atomically(_file(), msgspec.json.encode(noted))
 
 
 def recall() -> LastRun | None:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.kinematics import nodes_w
+from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scenario import RunConfig, place_all, read
-from snakesim_hal.model.scene import Placed, route_of
-from snakesim_hal.run_log.black_box import Layout, digest_of, read_black_box
+from snakesim_hal.model.scenario import RunConfig, place_obstacles, read_config
+from snakesim_hal.model.scene import Placed, make_route
+from snakesim_hal.run_log.black_box import Layout, compute_digest, read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
@@ -99,15 +99,15 @@ class RunRecord:
 
     @staticmethod
     def _load_folder(folder: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
-        config = read(folder / CONFIG)
+        config = read_config(folder / CONFIG)
         description = msgspec.json.decode((folder / DESCRIPTION).read_bytes(), type=Description)
         layout, columns = read_black_box(folder / BLACK_BOX)
-        if layout != Layout.of(description):
+        if layout != Layout.for_robot(description):
             raise ConfigError(f"{folder / BLACK_BOX} is of another robot than {DESCRIPTION} beside it")
         if host is None:
             host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
         if host.ended == "running":
-            host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
+            host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=compute_digest(columns))
         path = folder / RECORDING
         if path.is_file():
             contents = read_recording(path, OUTPUTS, hear)
@@ -175,12 +175,12 @@ class RunRecord:
     @cached_property
     def route(self) -> Route | None:
         """The route through the scene; None if it has none."""
-        return route_of(self.config.scene)
+        return make_route(self.config.scene)
 
     @cached_property
     def placed(self) -> list[Placed]:
         """The obstacles, each at its place in the scene."""
-        return place_all(self.config)
+        return place_obstacles(self.config)
 
     @cached_property
     def feels_contacts(self) -> bool:
@@ -215,4 +215,4 @@ class RunRecord:
         """Return tail end, joints and head end in the world, (joints + 2, 3), or None if the pose is unknown."""
         if len(self.time_s) == 0 or not self.posed[row]:
             return None
-        return nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])
+        return find_nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])

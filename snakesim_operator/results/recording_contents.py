@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError, WireError
-from snakesim_hal.run_log.black_box import digest_of, touching
+from snakesim_hal.run_log.black_box import compute_digest, summarize_contacts
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import (
     Trajectory,
     World,
 )
-from snakesim_hal.wire.own_sample import OwnKind, own_kinds
+from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.results.missing_data import describe_undecodable
 
@@ -83,10 +83,10 @@ class Contents:
 
     def add(self, recorded: RecordedMessage) -> None:
         """Add one message at a key of ALL, in the order of the file."""
-        if keys.row_key(recorded.key) == keys.OWN_ALL:
+        if keys.find_row_key(recorded.key) == keys.OWN_ALL:
             self.own.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
             return
-        message_type = keys.message_at(recorded.key)
+        message_type = keys.find_message(recorded.key)
         if message_type is None:
             return
         try:
@@ -170,7 +170,7 @@ class Contents:
             if tick in poses:
                 pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
             if tick in contacts:
-                peak_n, touched = touching(contacts[tick])
+                peak_n, touched = summarize_contacts(contacts[tick])
             if tick not in joints or tick not in applied or tick not in clocks:
                 continue
             state = joints[tick]
@@ -189,7 +189,7 @@ class Contents:
             time_s: (n,) robot time of each row.
         """
         columns: dict[str, NDArray[np.float64]] = {}
-        for key, kind in own_kinds(robot).items():
+        for key, kind in find_custom_messages(robot).items():
             sensor = key.rpartition("/")[2]
             samples = self._own_samples(key, kind)
             ticks = np.array(sorted(samples), dtype=np.int64)
@@ -204,7 +204,7 @@ class Contents:
             columns[f"age_s.{sensor}"] = time_s - sampled_at_s
         return columns
 
-    def _own_samples(self, key: str, kind: OwnKind) -> dict[int, tuple[int, dict[str, float]]]:
+    def _own_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
         """Return the samples of a custom sensor: tick -> timestamp in ns, and numbers by name."""
         decoder = Decoder(kind.message)
         samples: dict[int, tuple[int, dict[str, float]]] = {}
@@ -237,7 +237,7 @@ class Contents:
             overruns=status.overruns,
             answered_ticks=len(armed & self.at[keys.JOINT_COMMAND].keys()),
             armed_ticks=len(armed),
-            command_digest=digest_of(columns),
+            command_digest=compute_digest(columns),
             state_to_command_us={"p50": None, "p99": None},
             tick_times=status.tick_times,
             rejected_commands=status.commands_rejected,
@@ -290,19 +290,19 @@ def read_recording(
     contents = Contents(path)
     reader = RecordingReader(path)
     read_keys = {*wanted, keys.APPLIED} if hear is None else None
-    for recorded in reader.messages(read_keys):
+    for recorded in reader.read_messages(read_keys):
         if recorded.key == keys.APPLIED:
             contents.ticks += 1
             contents.last_tick_ns = recorded.time_ns
         if hear is not None:
             hear(recorded)
-        if recorded.key in wanted or keys.row_key(recorded.key) in wanted:
+        if recorded.key in wanted or keys.find_row_key(recorded.key) in wanted:
             contents.add(recorded)
     contents.lacks += describe_undecodable(contents.refused)
-    contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
+    contents.lacks += [f"recording: {lack}" for lack in reader.missing]
     contents.whole = reader.finished
     contents.ticks_lost = _count_lost_ticks(reader)
-    contents.replay_of = str(reader.about.get("replay_of", ""))[:500]
+    contents.replay_of = str(reader.metadata.get("replay_of", ""))[:500]
     if reader.losses.misplaced:
         for messages in contents.streams.values():
             messages.sort(key=lambda message: message.timestamp_ns or 0)
@@ -312,11 +312,11 @@ def read_recording(
 def _count_lost_ticks(reader: "RecordingReader") -> int | None:
     """Return how many ticks the file itself reports as lost, or None if it cannot report that."""
     losses = reader.losses
-    chosen_keys = reader.about.get("keys")  # of a recording that was to have these alone
+    chosen_keys = reader.metadata.get("keys")  # of a recording that was to have these alone
     leaves_ticks_out = isinstance(chosen_keys, list) and keys.APPLIED not in chosen_keys
-    if not reader.finished or losses.places or leaves_ticks_out:
+    if not reader.finished or losses.damage_count or leaves_ticks_out:
         return None
-    return losses.lost[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
+    return losses.lost_by_key[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
 
 
 def _is_news(before: Any, message: Any) -> bool:

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from snakesim_hal.base.arithmetic import foreign
+from snakesim_hal.base.arithmetic import find_differing_parts
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, Mode, Timing
 from snakesim_operator.results.metrics.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
@@ -259,7 +259,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         restarts=list(restarts),
         ended=ended,
         lacks=record.lacks,
-        own_arithmetic=foreign(record.description.arithmetic),
+        own_arithmetic=find_differing_parts(record.description.arithmetic),
         config=msgspec.to_builtins(config),
     )
 

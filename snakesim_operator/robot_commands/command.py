@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
-from snakesim_hal.base.process import user_name
-from snakesim_hal.base.terminal import Say, say
-from snakesim_hal.host.latch import forget_stop, stops_kept
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.base.terminal import PrintLine, print_line
+from snakesim_hal.host.latch import find_latched_stops, remove_latched_stop
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, request_to_arm
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, make_arm_request
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -24,7 +24,9 @@ SHOWN_S = 1.5  # until the host's status must show what its answer says
 DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
 
 
-def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unchecked: bool = False) -> int:
+def arm(
+    robot: str, backend: str, where: RobotSelection, say: PrintLine = print_line, *, unchecked: bool = False
+) -> int:
     """Arm a robot, if its name and its backend are those that the operator has given.
 
     Args:
@@ -50,17 +52,17 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unch
                 f"not armed: {'; '.join(mismatches)}. To arm, name robot and backend: "
                 f"`snakesim arm {description.robot} {description.backend}`"
             )
-        request = request_to_arm(description, user_name(), unchecked=unchecked)
-        return ask_host(session, keys.LIFECYCLE, request, "armed", link, say)
+        request = make_arm_request(description, get_user_name(), unchecked=unchecked)
+        return request_from_host(session, keys.LIFECYCLE, request, "armed", link, say)
 
 
-def disarm(where: RobotSelection, say: Say = say) -> int:
+def disarm(where: RobotSelection, say: PrintLine = print_line) -> int:
     """Make the joints passive; later commands do not move them."""
-    request = LifecycleRequest(action="disarm", who=user_name())
+    request = LifecycleRequest(action="disarm", who=get_user_name())
     return _request_from_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
 
 
-def clear(where: RobotSelection, say: Say = say) -> int:
+def clear(where: RobotSelection, say: PrintLine = print_line) -> int:
     """Clear a fault or an emergency stop. The robot is disarmed then.
 
     If no robot runs, an emergency stop stored by the last run is removed.
@@ -68,32 +70,41 @@ def clear(where: RobotSelection, say: Say = say) -> int:
     try:
         link = only_robot(where, "clear")
     except NotConnectedError:
-        kept = [path for path in stops_kept() if where.namespace in (None, path.parent.name)]
+        kept = [path for path in find_latched_stops() if where.namespace in (None, path.parent.name)]
         if not kept or where.endpoint is not None:
             raise
         for path in kept:
-            say(f"{path.parent.name}: {forget_stop(path)}; cleared by {user_name()}. No robot of that name runs here")
+            say(
+                f"{path.parent.name}: {remove_latched_stop(path)}; cleared by {get_user_name()}. No robot of "
+                "that name runs here"
+            )
         return 0
-    return _request_from_robot(link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", say)
+    return _request_from_robot(
+        link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=get_user_name()), "cleared", say
+    )
 
 
-def simulator(order: SimulatorOrder, where: RobotSelection, say: Say = say) -> int:
+def simulator(order: SimulatorOrder, where: RobotSelection, say: PrintLine = print_line) -> int:
     """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses."""
-    request = SimulatorRequest(action=order.action, who=order.who or user_name(), ticks=order.ticks, speed=order.speed)
+    request = SimulatorRequest(
+        action=order.action, who=order.who or get_user_name(), ticks=order.ticks, speed=order.speed
+    )
     return _request_from_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
 
 
-def _request_from_robot(link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: Say) -> int:
+def _request_from_robot(
+    link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: PrintLine
+) -> int:
     with open_session(link, CONNECT_S) as session:
-        return ask_host(session, key, request, done, link, say)
+        return request_from_host(session, key, request, done, link, say)
 
 
-def ask_host(
-    session: Session, key: str, request: LifecycleRequest | SimulatorRequest, done: str, link: Link, say: Say
+def request_from_host(
+    session: Session, key: str, request: LifecycleRequest | SimulatorRequest, done: str, link: Link, say: PrintLine
 ) -> int:
     """Query the robot's host, and check who answers. done: in words. Raises RefusedError, NotConnectedError."""
     statuses = session.latched_reader(keys.STATUS, Status)
-    answers = [answer for _, answer in session.ask_all(key, request, ANSWER_S)]
+    answers = [answer for _, answer in session.request_all(key, request, ANSWER_S)]
     doubt, shown = judge(answers, statuses)
     name = link.namespace
     if not answers:
@@ -110,12 +121,12 @@ def ask_host(
     return 0
 
 
-def ask_meanwhile(
+def request_while_driving(
     session: Session, request: LifecycleRequest, done: str, link: Link, turn: Callable[[], object]
 ) -> None:
     """Query the host, as `ask_host`, and call `turn` meanwhile: without commands an armed robot would get a fault."""
     with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(ask_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
+        answer = pool.submit(request_from_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
         while not answer.done():
             turn()
         answer.result()

@@ -8,7 +8,7 @@ from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.programs.arguments import add_network, add_unchecked
-from snakesim_operator.base.robot_selection import RobotSelection, selection_of
+from snakesim_operator.base.robot_selection import RobotSelection, select_robots
 from snakesim_operator.robot_commands.simulator_order import add_command as add_sim
 from snakesim_operator.robot_commands.simulator_order import order_of
 
@@ -84,19 +84,19 @@ def _add_param(commands: Any) -> None:
 def _arm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.command import arm
 
-    return arm(arguments.robot, arguments.backend, selection_of(arguments), unchecked=arguments.unchecked)
+    return arm(arguments.robot, arguments.backend, select_robots(arguments), unchecked=arguments.unchecked)
 
 
 def _disarm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.command import disarm
 
-    return disarm(selection_of(arguments))
+    return disarm(select_robots(arguments))
 
 
 def _clear(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.command import clear
 
-    return clear(selection_of(arguments))
+    return clear(select_robots(arguments))
 
 
 def _estop(arguments: argparse.Namespace) -> int:
@@ -106,7 +106,7 @@ def _estop(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.stop import estop
 
     try:
-        return estop(selection_of(arguments))
+        return estop(select_robots(arguments))
     finally:
         os.setpriority(os.PRIO_PROCESS, 0, before)  # a program may call the command, and go on
 
@@ -114,21 +114,21 @@ def _estop(arguments: argparse.Namespace) -> int:
 def _teleop(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.teleop.command import teleop
 
-    return teleop(selection_of(arguments), arguments.fastest, arguments.joystick)
+    return teleop(select_robots(arguments), arguments.fastest, arguments.joystick)
 
 
 def _sim(arguments: argparse.Namespace) -> int:
     order = order_of(arguments)
     from snakesim_operator.robot_commands.command import simulator
 
-    return simulator(order, selection_of(arguments))
+    return simulator(order, select_robots(arguments))
 
 
 def _fault(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.fault import FaultOrder, fault
 
     order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
-    return fault(order, selection_of(arguments))
+    return fault(order, select_robots(arguments))
 
 
 def _param_list(arguments: argparse.Namespace) -> int:
@@ -154,4 +154,4 @@ def _robot_of(arguments: argparse.Namespace) -> RobotSelection:
     if arguments.namespace not in (None, arguments.robot):
         raise ConfigError(f"{arguments.robot} and --namespace {arguments.namespace}: name one robot; leave one out")
     arguments.namespace = arguments.robot
-    return selection_of(arguments)
+    return select_robots(arguments)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from math import inf
 
-from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, did_you_mean, short
-from snakesim_hal.base.terminal import Say, say
-from snakesim_hal.model.fault_kinds import KINDS, Injection, checked, explain
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, shorten, suggest_word
+from snakesim_hal.base.terminal import PrintLine, print_line
+from snakesim_hal.model.fault_kinds import KINDS, Injection, check_injection, explain_kinds
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
@@ -26,21 +26,23 @@ class FaultOrder:
     end: bool = False
 
 
-def fault(order: FaultOrder, where: RobotSelection, say: Say = say) -> int:
+def fault(order: FaultOrder, where: RobotSelection, say: PrintLine = print_line) -> int:
     """Send the request to the responsible part. Raises RefusedError if it refuses, NotConnectedError without answer."""
     if order.kind == LIST and order.target is None:
-        for line in explain().splitlines():
+        for line in explain_kinds().splitlines():
             say(line)
         return 0
     kinds = sorted({kind for of_target in KINDS.values() for kind in of_target})
     if order.kind not in kinds:
-        meant = did_you_mean(order.kind, kinds)
+        meant = suggest_word(order.kind, kinds)
         raise ConfigError(
-            f"fault {short(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
+            f"fault {shorten(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
         )
     if order.target is None:
         raise ConfigError(f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`")
-    injection = checked(Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}")
+    injection = check_injection(
+        Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}"
+    )
     if order.for_s is not None and not 0.0 < order.for_s < inf:
         raise ConfigError(f"--for {order.for_s:g}: give more than 0 s")
     if injection.about.once and (order.end or order.for_s is not None):
@@ -48,7 +50,7 @@ def fault(order: FaultOrder, where: RobotSelection, say: Say = say) -> int:
     request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
     with open_session(only_robot(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
         try:
-            answer = session.ask(keys.fault(injection.part), request, ANSWER_S)
+            answer = session.request(keys.fault_key(injection.part), request, ANSWER_S)
         except NotConnectedError:
             raise NotConnectedError(
                 f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "

@@ -13,9 +13,16 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, ControllerError, NotConnectedError, RefusedError, did_you_mean, short
-from snakesim_hal.base.process import user_name
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.errors import (
+    ConfigError,
+    ControllerError,
+    NotConnectedError,
+    RefusedError,
+    shorten,
+    suggest_word,
+)
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.network.session import Reader, Session, open_session
 from snakesim_hal.wire import keys
@@ -41,11 +48,11 @@ class Parameter:
     name: str
     value: Any
     unit: str = ""
-    about: str = ""
+    description: str = ""
     choices: tuple[str, ...] = ()
-    least: float | None = None
-    most: float | None = None
-    above_least: bool = False  # `least` itself is not allowed
+    minimum: float | None = None
+    maximum: float | None = None
+    excludes_minimum: bool = False  # `least` itself is not allowed
 
     @property
     def range(self) -> str:
@@ -55,27 +62,27 @@ class Parameter:
         if isinstance(self.value, str):
             return "a text"
         limits: list[str] = []
-        if self.least is not None:
-            sign = ">" if self.above_least else ">="
-            limits.append(f"{sign} {self.least:g}")
-        if self.most is not None:
-            limits.append(f"<= {self.most:g}")
+        if self.minimum is not None:
+            sign = ">" if self.excludes_minimum else ">="
+            limits.append(f"{sign} {self.minimum:g}")
+        if self.maximum is not None:
+            limits.append(f"<= {self.maximum:g}")
         return ", ".join(limits)
 
     @property
-    def shown(self) -> str:
+    def value_with_unit(self) -> str:
         """The value as TOML has it, with its unit."""
         if self.unit == "1":
-            return in_text(self.value)
-        return f"{in_text(self.value)} {self.unit}".strip()
+            return format_value(self.value)
+        return f"{format_value(self.value)} {self.unit}".strip()
 
 
-def in_text(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value as `param set` takes it."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def parameters_of(settings: ControlSettings) -> list[Parameter]:
+def read_parameters(settings: ControlSettings) -> list[Parameter]:
     """Return the parameters in force; none if their schema cannot be read."""
     try:
         schema = json.loads(settings.schema)
@@ -106,11 +113,11 @@ def _read_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter:
         name[:MAX_NAME_CHARACTERS],
         value,
         unit=str(schema.get("unit", ""))[:MAX_NAME_CHARACTERS],
-        about=str(schema.get("description", ""))[:MAX_DESCRIPTION_CHARACTERS],
+        description=str(schema.get("description", ""))[:MAX_DESCRIPTION_CHARACTERS],
         choices=tuple(str(choice) for choice in choices) if isinstance(choices, list) else (),
-        least=_find_number(schema, "minimum", "exclusiveMinimum"),
-        most=_find_number(schema, "maximum", "exclusiveMaximum"),
-        above_least="exclusiveMinimum" in schema,
+        minimum=_find_number(schema, "minimum", "exclusiveMinimum"),
+        maximum=_find_number(schema, "maximum", "exclusiveMaximum"),
+        excludes_minimum="exclusiveMinimum" in schema,
     )
 
 
@@ -123,18 +130,18 @@ def _find_number(schema: dict[str, Any], *names: str) -> float | None:
     return None
 
 
-def differing(before: ControlSettings, now: ControlSettings) -> list[tuple[Parameter, Parameter]]:
+def find_changed_parameters(before: ControlSettings, now: ControlSettings) -> list[tuple[Parameter, Parameter]]:
     """Return the parameters whose values differ, each as it was before and as it is now."""
-    old_parameters = {parameter.name: parameter for parameter in parameters_of(before)}
+    old_parameters = {parameter.name: parameter for parameter in read_parameters(before)}
     pairs: list[tuple[Parameter, Parameter]] = []
-    for new in parameters_of(now):
+    for new in read_parameters(now):
         old = old_parameters.get(new.name)
         if old is not None and old.value != new.value:
             pairs.append((old, new))
     return pairs
 
 
-def in_force(session: Session) -> ControlSettings:
+def read_settings(session: Session) -> ControlSettings:
     """Return the settings of the running controller. Raises NotConnectedError when no controller publishes any."""
     settings = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, PUBLISHED_S)
     if settings is None:
@@ -145,7 +152,9 @@ def in_force(session: Session) -> ControlSettings:
     return settings
 
 
-def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[ControlSettings, ControlSettings]:
+def change_parameters(
+    session: Session, changes: Mapping[str, Any], who: str
+) -> tuple[ControlSettings, ControlSettings]:
     """Change parameters of the running controller, all of them or none.
 
     Args:
@@ -162,7 +171,7 @@ def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[Cont
         ControllerError: The controller cannot go on with what it has accepted, so control has ended.
         NotConnectedError: No controller publishes its settings.
     """
-    before = in_force(session)
+    before = read_settings(session)
     values = msgspec.json.decode(before.settings, type=dict[str, Any])
     for name, value in changes.items():
         values[known_name(name, before)] = value
@@ -170,7 +179,7 @@ def change(session: Session, changes: Mapping[str, Any], who: str) -> tuple[Cont
     request = SettingsRequest(who=who, controller=before.controller, settings=settings)
     states = session.reader(keys.CONTROL_STATE, ControlState)
     try:
-        answer = session.ask(keys.SETTINGS, request, ANSWER_S)
+        answer = session.request(keys.SETTINGS, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)
         now = _wait_for_change(session, before)
@@ -209,7 +218,7 @@ def _check_controller_continues(
         reported = states.drain()
         for state in reported:
             if state.failed:
-                given = ", ".join(f"{name}={in_text(value)}" for name, value in changes.items())
+                given = ", ".join(f"{name}={format_value(value)}" for name, value in changes.items())
                 raise ControllerError(
                     f"{given}: accepted, and then control has ended: {state.reason}. The robot stops. Start control "
                     "again with another value"
@@ -221,10 +230,10 @@ def _check_controller_continues(
 
 def known_name(name: str, settings: ControlSettings) -> str:
     """Return the field that `control.NAME` refers to. Raises ConfigError if there is no such parameter."""
-    known = [PREFIX + parameter.name for parameter in parameters_of(settings)]
+    known = [PREFIX + parameter.name for parameter in read_parameters(settings)]
     if name not in known:
         raise ConfigError(
-            f"controller {settings.controller} has no parameter {short(name)!r}; {did_you_mean(name, known)}it has "
+            f"controller {settings.controller} has no parameter {shorten(name)!r}; {suggest_word(name, known)}it has "
             f"{', '.join(known) or 'none'}"
         )
     return name.removeprefix(PREFIX)
@@ -233,29 +242,29 @@ def known_name(name: str, settings: ControlSettings) -> str:
 def list_parameters(where: RobotSelection) -> int:
     """Print all parameters for `snakesim param list`."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
-        settings = in_force(session)
-    parameters = parameters_of(settings)
+        settings = read_settings(session)
+    parameters = read_parameters(settings)
     if settings.who is None:
         origin = "from its configuration"
     else:
         origin = f"set by {settings.who} at {settings.timestamp_ns * 1e-9:g} s"
-    say(f"controller {settings.controller}, {len(parameters)} parameters, {origin}")
-    rows = [(PREFIX + parameter.name, parameter.shown, parameter.range) for parameter in parameters]
+    print_line(f"controller {settings.controller}, {len(parameters)} parameters, {origin}")
+    rows = [(PREFIX + parameter.name, parameter.value_with_unit, parameter.range) for parameter in parameters]
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row, parameter in zip(rows, parameters, strict=True):
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-        line = "  ".join([*cells, parameter.about])
-        say("  " + line.rstrip())
+        line = "  ".join([*cells, parameter.description])
+        print_line("  " + line.rstrip())
     return 0
 
 
 def get_parameter(name: str, where: RobotSelection) -> int:
     """Print one value alone, for scripts that use `snakesim param get`."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
-        settings = in_force(session)
+        settings = read_settings(session)
     field = known_name(name, settings)
-    value = next(parameter.value for parameter in parameters_of(settings) if parameter.name == field)
-    say(in_text(value))
+    value = next(parameter.value for parameter in read_parameters(settings) if parameter.name == field)
+    print_line(format_value(value))
     return 0
 
 
@@ -274,10 +283,12 @@ def set_parameters(texts: list[str], where: RobotSelection) -> int:
     overrides = [parse_set(text) for text in texts]
     changes = {override.key: override.value for override in overrides}
     with open_session(only_robot(where, "param set"), CONNECT_S) as session:
-        before, now = change(session, changes, user_name())
-    changed = differing(before, now)
+        before, now = change_parameters(session, changes, get_user_name())
+    changed = find_changed_parameters(before, now)
     for old, new in changed:
-        say(f"{PREFIX}{new.name}: {in_text(old.value)} -> {new.shown}, by {now.who}, tick {now.tick}")
+        print_line(
+            f"{PREFIX}{new.name}: {format_value(old.value)} -> {new.value_with_unit}, by {now.who}, tick {now.tick}"
+        )
     if not changed:
-        say(f"controller {now.controller} has these values already")
+        print_line(f"controller {now.controller} has these values already")
     return 0

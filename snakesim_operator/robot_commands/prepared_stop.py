@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
-from snakesim_hal.base.process import user_name
+from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.workers import Worker
 from snakesim_hal.network.session import Link, Session
-from snakesim_hal.network.stop_port import Address, Stopped, StopRequester
+from snakesim_hal.network.stop_port import Address, StopAnswer, StopRequester
 from snakesim_hal.wire import keys
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.robot_commands.stop import (
@@ -91,7 +91,7 @@ class PreparedStop:
         self._where = where
         self._link = link
         self._on_result = on_result
-        self._user = user_name()  # looked up in a file
+        self._user = get_user_name()  # looked up in a file
         # Threads.
         self._coordinator = Worker("stop")
         self._datagrams = Worker("stop datagrams")
@@ -191,7 +191,7 @@ class PreparedStop:
         if session is None:
             return
         try:
-            problem = "" if session.present(keys.alive("hal"), PRESENT_S) else "the robot's host does not answer"
+            problem = "" if session.present(keys.alive_key("hal"), PRESENT_S) else "the robot's host does not answer"
         except Exception as error:
             self._network_test = _Test(time.monotonic(), f"{type(error).__name__}: {error}"[:200])
             raise
@@ -237,8 +237,8 @@ class PreparedStop:
         return stopped, "; ".join(searched)
 
     def _ask_ports(self) -> _PortResults:
-        def ask(address: Address) -> Stopped | None:
-            return self._requester.ask(address, self._user, LIMIT_S)
+        def ask(address: Address) -> StopAnswer | None:
+            return self._requester.request_stop(address, self._user, LIMIT_S)
 
         here = [stop_at_port(ask, address, robot) for address, robot in self._local.items()]
         there = [stop_at_port(ask, address, robot) for address, robot in self._elsewhere.items()]

@@ -9,10 +9,10 @@ from queue import Empty
 from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError, WireError
-from snakesim_hal.base.terminal import say, say_json
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.process_entries import HOST, differences
+from snakesim_hal.network.process_entries import HOST, find_differences
 from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
@@ -54,10 +54,10 @@ def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
     without_faults = bool(robots) and all(robot.status.lifecycle in ("armed", "disarmed") for robot in robots)
     exit_code = 0 if without_faults and not silent else 1
     if as_json:
-        say_json({"robots": [_as_json(robot) for robot in robots], "silent": silent})
+        print_json({"robots": [_as_json(robot) for robot in robots], "silent": silent})
         return exit_code
     for robot in silent:
-        say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
+        print_line(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
     if not robots and not silent:
         _print_no_robot(where)
     for robot in robots:
@@ -69,8 +69,8 @@ def _print_no_robot(where: RobotSelection) -> None:
     """Print how the last run on this computer ended, and how to start another."""
     last = last_run.recall()
     ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
-    say(f"no robot answers on {', '.join(where.endpoints())}{ending}")
-    say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
+    print_line(f"no robot answers on {', '.join(where.endpoints())}{ending}")
+    print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
 
 
 def _print_robot(robot: _Robot) -> None:
@@ -79,7 +79,7 @@ def _print_robot(robot: _Robot) -> None:
         lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
     lines += _next_commands(robot.link, robot.status)
     for line in lines:
-        say(line)
+        print_line(line)
 
 
 class _NetworkMessages:
@@ -166,7 +166,7 @@ def processes_in_words(processes: Sequence[Process]) -> list[str]:
             f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {age}"
         )
         if host is not None:
-            lines += [f"    DIFFERS: {difference}" for difference in differences(entry, host)]
+            lines += [f"    DIFFERS: {difference}" for difference in find_differences(entry, host)]
     return lines
 
 

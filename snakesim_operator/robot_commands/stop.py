@@ -10,24 +10,24 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.base.process import user_name
-from snakesim_hal.base.terminal import Say, say
-from snakesim_hal.network.stop_port import Address, Stopped, ask_to_stop, stop_address
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.base.terminal import PrintLine, print_line
+from snakesim_hal.network.stop_port import Address, StopAnswer, request_stop, stop_address
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.robot_commands.stop_result import StopResult
 
 LIMIT_S = 5.0
 Named = tuple[str, str | None]  # endpoint and namespace of a robot
-AskPort = Callable[[Address], Stopped | None]  # raises NotConnectedError when the port is closed
+AskPort = Callable[[Address], StopAnswer | None]  # raises NotConnectedError when the port is closed
 
 
-def estop(where: RobotSelection, say: Say = say) -> int:
+def estop(where: RobotSelection, say: PrintLine = print_line) -> int:
     """Stop the addressed robots. Returns 0 when every known robot has confirmed that it is stopped, else 1."""
     local = local_stop_ports(where)
     elsewhere = stop_ports_elsewhere(where, local)
 
-    def ask(address: Address) -> Stopped | None:
-        return ask_to_stop(*address, user_name(), LIMIT_S)
+    def ask(address: Address) -> StopAnswer | None:
+        return request_stop(*address, get_user_name(), LIMIT_S)
 
     with ThreadPoolExecutor(2 * len(local) + len(elsewhere) + 1) as pool:
         local_futures = [pool.submit(stop_at_port, ask, address, robot) for address, robot in local.items()]
@@ -55,7 +55,7 @@ def _collect(futures: Sequence[Future[StopResult | None]]) -> list[StopResult]:
     return [result for result in results if result is not None]
 
 
-def _print_other_robots(where: RobotSelection, say: Say) -> None:
+def _print_other_robots(where: RobotSelection, say: PrintLine) -> None:
     """Print which robots there are, because the operator may have given a wrong name."""
     from snakesim_operator.base.targets import find_robots
 

@@ -4,7 +4,7 @@ import socket
 import time
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.base.process import user_name
+from snakesim_hal.base.process import get_user_name
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.network.stop_port import stop_address
 from snakesim_hal.wire import keys
@@ -71,7 +71,7 @@ def _query_hosts(session: Session, link: Link, limit_s: float, *, repeat: bool) 
     answers: dict[str, list[Answer]] = {}
     deadline = time.monotonic() + limit_s
     while not answers and time.monotonic() < deadline:
-        for answer_key, answer in session.ask_all(key, EstopRequest(who=user_name()), ASK_S):
+        for answer_key, answer in session.request_all(key, EstopRequest(who=get_user_name()), ASK_S):
             name = link.namespace or namespace_of(answer_key)
             answers.setdefault(name, []).append(answer)
         if not repeat:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import output_may_fail
+from snakesim_hal.base.terminal import tolerate_failed_output
 from snakesim_hal.programs.arguments import (
     add_host,
     add_insecure,
@@ -15,7 +15,7 @@ from snakesim_hal.programs.arguments import (
     add_unchecked,
     check_network,
     load_scenario,
-    session_given,
+    read_session_option,
 )
 from snakesim_operator.recording.message import RAW_ONLY
 
@@ -84,9 +84,9 @@ def add_commands(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     check_network(arguments)
     if arguments.in_process:
-        from snakesim_operator.run.guarded_process import guarded  # before anything large is loaded
+        from snakesim_operator.run.guarded_process import run_guarded  # before anything large is loaded
 
-        return guarded(lambda pulse: _run_in_process(arguments, pulse), owns_process=arguments.owns_process)
+        return run_guarded(lambda pulse: _run_in_process(arguments, pulse), owns_process=arguments.owns_process)
     config = _config_of(arguments)
 
     from snakesim_operator.run.run import RunRequest, run
@@ -96,7 +96,7 @@ def _run(arguments: argparse.Namespace) -> int:
         out=arguments.out,
         endpoint=arguments.endpoint,
         router=arguments.router,
-        session=session_given(arguments),
+        session=read_session_option(arguments),
         namespace=arguments.namespace,
         stay=arguments.stay,
         unchecked=arguments.unchecked,
@@ -106,7 +106,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raw_only=arguments.raw_only,
         console=arguments.console,
     )
-    with output_may_fail():
+    with tolerate_failed_output():
         return run(request)
 
 
@@ -118,7 +118,7 @@ def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int
 
     from snakesim_operator.run.in_process import run_in_process
 
-    with output_may_fail():
+    with tolerate_failed_output():
         return run_in_process(
             config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only, pulse=pulse
         )
@@ -134,7 +134,7 @@ def _config_of(arguments: argparse.Namespace) -> "RunConfig":
 def _host(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.host import run_host
 
-    with output_may_fail():
+    with tolerate_failed_output():
         return run_host(arguments)
 
 

@@ -31,7 +31,7 @@ class ProcessOutput:
         self._tail = b""
         self._thread = start_worker("words", self._read_pipe)
 
-    def last(self) -> list[str]:
+    def last_lines(self) -> list[str]:
         """Return the last lines of stdout and stderr, once the process has ended."""
         self._thread.join(1.0)
         text = self._tail.decode(errors="replace").strip()
@@ -52,9 +52,9 @@ class Child:
 
     name: str
     process: subprocess.Popen[bytes]
-    words: ProcessOutput
+    output: ProcessOutput
 
-    def how_it_ended(self) -> str | None:
+    def describe_end(self) -> str | None:
         """Return the exit of the process as text, with its last error message; None while it runs."""
         code = self.process.poll()
         if code is None:
@@ -62,14 +62,14 @@ class Child:
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}"
         text = f"{self.name} ended with exit code {code}"
-        lines = self.words.last()
+        lines = self.output.last_lines()
         error_prefix = f"snakesim {self.name}: "
         if lines and lines[-1].startswith(error_prefix):
             text += f": {lines[-1].removeprefix(error_prefix)}"
         return text
 
 
-def start(
+def start_child(
     name: str,
     arguments: Sequence[str],
     keep: Callable[[bytes], object],
@@ -90,7 +90,7 @@ def start(
         more: environment variables.
     """
     reproducible = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
-    environment = child_environment(arithmetic.environment(), arithmetic.ONE_THREAD, reproducible, more)
+    environment = child_environment(arithmetic.common_environment(), arithmetic.ONE_THREAD, reproducible, more)
     read_end, write_end = os.pipe()
     old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits the blocked signal
     try:

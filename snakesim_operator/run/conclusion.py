@@ -6,9 +6,9 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.arithmetic import digest_text
+from snakesim_hal.base.arithmetic import format_digest
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.scenario import RunConfig
@@ -59,7 +59,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
     missing: list[str] = []
     verdict = ""
     if host is not None:
-        explain(ending, host, config, stay=stay)
+        note_reasons(ending, host, config, stay=stay)
         missing, verdict = _write_and_print(files, ending, outcome, host)
     lost_by_files = files.close()
     for loss in (*outcome.lost, lost_by_files):
@@ -78,7 +78,7 @@ def _exit_code(ending: Ending, host: HostRecord | None, missing: Sequence[str]) 
     return INCOMPLETE if missing else DONE
 
 
-def explain(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
+def note_reasons(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
     """Note why a run is not complete. It is complete only if it was armed for all of its time.
 
     Args:
@@ -118,7 +118,7 @@ def _write_and_print(files: RunFiles, ending: Ending, outcome: Outcome, host: Ho
         _print_host(host)
         return [*describe_unwritten(host), str(error)], ""
     missing = [*describe_unwritten(record.host), *record.unreached]
-    if not extras.has("report"):
+    if not extras.is_installed("report"):
         return missing, ""
     from snakesim_operator.results.report.verdict import verdict
 
@@ -146,7 +146,7 @@ def write_results(
     if outcome.too_slow:
         summary = msgspec.structs.replace(summary, too_slow=list(outcome.too_slow))
     files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
-    if report and extras.has("report"):
+    if report and extras.is_installed("report"):
         # Templates take a while to import, and the start of a run does not wait for them.
         from snakesim_operator.results.report import page
 
@@ -158,15 +158,15 @@ def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, missing: Seque
     if files.folder is not None:
         _print_paths(files.folder)
     if verdict:
-        say(verdict)
+        print_line(verdict)
     if outcome.host is None:
         reason = ending.reason or "the host ended early"
         logs = f"; the logs of its processes are in {files.folder}" if files.folder is not None else ""
-        say(f"the run left no record: {reason}{logs}")
+        print_line(f"the run left no record: {reason}{logs}")
     elif ending.reason is not None and not ending.interrupted:
-        say(f"fault: {ending.reason}")
+        print_line(f"fault: {ending.reason}")
     if missing:
-        say(f"record: incomplete: {'; '.join(missing)}")
+        print_line(f"record: incomplete: {'; '.join(missing)}")
     if outcome.robot is not None:
         _print_kept_stop(outcome.robot)
 
@@ -176,16 +176,16 @@ def _print_paths(folder: Path) -> None:
     for title, name in (("summary", SUMMARY), ("report", REPORT)):
         path = folder / name
         if path.is_file():
-            say(f"{title + ':':<9}{path}")
-    if (folder / SUMMARY).is_file() and not extras.has("report"):
-        say(f"report:  not written; {pip_install('report')}, then `snakesim report {folder}`")
+            print_line(f"{title + ':':<9}{path}")
+    if (folder / SUMMARY).is_file() and not extras.is_installed("report"):
+        print_line(f"report:  not written; {pip_install('report')}, then `snakesim report {folder}`")
 
 
 def _print_kept_stop(robot: Description) -> None:
     """Print how to clear an emergency stop, if one is stored."""
     stop = robot_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
     if stop.is_file():
-        say(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` ends that")
+        print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` ends that")
 
 
 def _print_host(host: HostRecord) -> None:
@@ -197,7 +197,7 @@ def _print_host(host: HostRecord) -> None:
 
 
 def _print_row(name: str, value: str) -> None:
-    say(f"  {name:<22}{value}")
+    print_line(f"  {name:<22}{value}")
 
 
 def print_summary(summary: RunSummary) -> None:
@@ -240,7 +240,7 @@ def _state_rows(summary: RunSummary) -> list[tuple[str, str]]:
     reported = (summary.reported_state, summary.reported_reason)
     if summary.reported_state is not None and reported != measured:
         rows.append(("control reported", f"{summary.reported_state}: {summary.reported_reason}"))
-    rows.append(("command digest", digest_text(summary.command_digest, summary.own_arithmetic)))
+    rows.append(("command digest", format_digest(summary.command_digest, summary.own_arithmetic)))
     rows += [("too slow", service) for service in summary.too_slow]
     rows += [("estimated", text) for text in estimates_of(summary).in_words()]
     return rows

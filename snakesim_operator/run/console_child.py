@@ -7,7 +7,7 @@ from functools import partial
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.base import extras
-from snakesim_operator.base.console_port import address_of, open_port
+from snakesim_operator.base.console_port import open_port, page_address
 from snakesim_operator.run import children
 from snakesim_operator.run.run_files import RunFiles
 
@@ -19,7 +19,7 @@ def check_console() -> None:
     """Raise ConfigError when the console, or what it needs, is not installed."""
     if importlib.util.find_spec(CONSOLE) is None:
         raise ConfigError("--console: this installation is one without the console; leave it out")
-    extras.check("console", "--console", "; or leave it out")
+    extras.require("console", "--console", "; or leave it out")
 
 
 @contextlib.contextmanager
@@ -28,8 +28,8 @@ def console_beside(common: Sequence[str], files: RunFiles, say: Callable[[str], 
     with open_port(None) as listening:  # only the console keeps it open: when that has ended, browsers are told at once
         handle = listening.fileno()
         arguments = [CONSOLE, *common, "--listening", str(handle)]
-        child = children.start("console", arguments, partial(files.append, LOG), inherits=[handle])
-        say(f"console: {address_of(listening)}")
+        child = children.start_child("console", arguments, partial(files.append, LOG), inherits=[handle])
+        say(f"console: {page_address(listening)}")
     try:
         yield
     finally:

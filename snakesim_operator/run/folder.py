@@ -20,14 +20,14 @@ LEFT = (CONFIG, HOST_RECORD, BLACK_BOX, RECORDING, SUMMARY, REPORT, *OLDER)
 TIME = "%Y%m%d-%H%M%S"
 
 
-def named_after(name: str) -> Path:
+def default_folder(name: str) -> Path:
     """The default folder of a run: runs/NAME-TIME."""
     out = Path("runs") / f"{name}-{datetime.now().strftime(TIME)}"
     return _free(out)
 
 
 @contextlib.contextmanager
-def claimed(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
+def locked_folder(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
     """Lock a folder for a run, after renaming an earlier run there; the kernel unlocks it after a SIGKILL.
 
     Raises ConfigError when another run has locked it or it is not usable, OSError when it is not writable.

@@ -24,7 +24,7 @@ FAILED, INTERRUPTED = 1, 130
 WHERE = "What was recorded until then is in the run's folder; `snakesim report FOLDER` shows it"
 
 
-def guarded(act: Callable[[Pulse | None], int], *, owns_process: bool) -> int:
+def run_guarded(act: Callable[[Pulse | None], int], *, owns_process: bool) -> int:
     """Call a function in a child process that can be ended whatever it does. Returns its exit code.
 
     Args:
@@ -86,7 +86,7 @@ class _Guard:
 
     def _why_to_kill(self) -> str:
         """Return why the child is to be killed; empty while it goes on."""
-        step_s = self._pulse.step_s()
+        step_s = self._pulse.read_step_times()
         if step_s is None:
             return ""
         began_s, due_s = step_s

@@ -3,13 +3,13 @@
 import argparse
 import contextlib
 
-from snakesim_hal.base.terminal import say
-from snakesim_hal.model.scenario import write
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.scenario import write_config
 from snakesim_hal.programs.host_program import host
 from snakesim_hal.programs.preflight import check_backend
 from snakesim_hal.programs.service_program import process_options
 from snakesim_operator.results.record import CONFIG
-from snakesim_operator.run.folder import claimed
+from snakesim_operator.run.folder import locked_folder
 
 
 def run_host(arguments: argparse.Namespace) -> int:
@@ -18,8 +18,8 @@ def run_host(arguments: argparse.Namespace) -> int:
     config = check_backend(given.config, given.loaded.table)
     with contextlib.ExitStack() as held:
         if arguments.out is not None:
-            arguments.out = held.enter_context(claimed(arguments.out, say))
-            write(config, arguments.out / CONFIG)
-        say(f"{given.link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
-        say(f"network: {given.link.endpoint}, namespace {given.link.namespace}; Ctrl-C ends it")
+            arguments.out = held.enter_context(locked_folder(arguments.out, print_line))
+            write_config(config, arguments.out / CONFIG)
+        print_line(f"{given.link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
+        print_line(f"network: {given.link.endpoint}, namespace {given.link.namespace}; Ctrl-C ends it")
         return host(given)

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any
 from snakesim_hal.base.arithmetic import is_pinned
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError
 from snakesim_hal.base.step_limit import Pulse
-from snakesim_hal.base.terminal import print_stderr, say
+from snakesim_hal.base.terminal import print_line, print_stderr
 from snakesim_hal.model.plugins import anything_offered
-from snakesim_hal.model.scenario import CONTROL, RunConfig, write
+from snakesim_hal.model.scenario import CONTROL, RunConfig, write_config
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
-from snakesim_hal.programs.host_program import record_of
+from snakesim_hal.programs.host_program import create_host_record
 from snakesim_hal.programs.preflight import check_plugins
 from snakesim_hal.programs.single_process import InProcessRun, check
 from snakesim_hal.run_log.writer import HostRecordWriter
@@ -40,7 +40,7 @@ from snakesim_operator.results.metrics.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.recording_contents import SERVICE_STREAMS
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import Outcome, conclude, explain, write_results
+from snakesim_operator.run.conclusion import Outcome, conclude, note_reasons, write_results
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.pinned_process import call_pinned
 from snakesim_operator.run.progress import Progress
@@ -50,7 +50,7 @@ from snakesim_operator.run.run_files import RunFiles
 if TYPE_CHECKING:
     from snakesim_operator.recording.recording import Recording
 
-WORDS = "run.log"  # gets what the parts of the run print to stderr
+LOG_FILE = "run.log"  # gets what the parts of the run print to stderr
 POLL_TICKS = 50  # between two looks at the progress, the goal and the recording
 
 
@@ -137,13 +137,13 @@ def simulate(
             give_up_s=give_up_s,
             turn_limit_s=turn_limit_s,
         )
-    extras.check("record", "`simulate`, whose results are read from a recording,")
+    extras.require("record", "`simulate`, whose results are read from a recording,")
     config = check_plugins(config)
     ending = Ending()
     with contextlib.ExitStack() as opened:
         if out is None:
             folder = Path(opened.enter_context(TemporaryDirectory(prefix="snakesim-")))
-            write(config, folder / CONFIG)
+            write_config(config, folder / CONFIG)
             files = RunFiles(folder, print_stderr)
         else:
             files, _ = opened.enter_context(opened_files(config, out))
@@ -162,7 +162,7 @@ def simulate(
             raw_only=out is None,
             turn_limit_s=turn_limit_s,
         )
-        explain(ending, record_of(run.host), config)
+        note_reasons(ending, create_host_record(run.host), config)
         record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
         # No local variable holds the failure: its traceback holds this function's frame.
         return Result(record, summary, gave_up, ControlFailure.of(run.take_errors().get(CONTROL)))
@@ -196,7 +196,7 @@ def run_in_process(
     check_recorder(record=record)
     ending = Ending()
     with opened_files(config, out) as (files, _):
-        say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
+        print_line(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
         with interruptible(ending):
             with Progress(config) as progress:
                 _, outcome, _ = _run_to_end(
@@ -253,12 +253,12 @@ def _run_to_end(
         host = run.host
         session = run.network.session()
         if progress is not None:
-            say(describe_what_moves(host.description))
+            print_line(describe_what_moves(host.description))
         control_states = session.reader(keys.CONTROL_STATE, ControlState)
         goal_watch = GoalWatch(config, host.description, give_up_s)
         ends_at_goal = until_goal or config.mission.until_goal
         with (
-            HostRecordWriter(host.black_box, host.description, partial(record_of, host), files.folder),
+            HostRecordWriter(host.black_box, host.description, partial(create_host_record, host), files.folder),
             _recording(session, files, recorded_keys, None if raw_only else config.robot.name) as recording,
         ):
             for turn, _ in enumerate(run.iterate_ticks()):
@@ -275,7 +275,7 @@ def _run_to_end(
     for failure in run.failed:
         ending.add_cause(failure)
     lost = [recording.failure] if recording is not None and recording.failure else []
-    outcome = Outcome(record_of(run.host), run.host.description, lost=lost, too_slow=run.too_slow())
+    outcome = Outcome(create_host_record(run.host), run.host.description, lost=lost, too_slow=run.too_slow())
     return run, outcome, goal_watch.gave_up
 
 
@@ -294,7 +294,7 @@ def _recording(
 
             recording = Recording(files.folder / RECORDING, shown_as)
             for key in recorded_keys:
-                session.on_latched_arrival(key, recording.take)
+                session.on_latched_arrival(key, recording.write_arrival)
     except OSError as error:
         files.warn(f"{files.folder}: {error.strerror}")
     try:
@@ -314,5 +314,5 @@ class _LogWriter(io.TextIOBase):
 
     def write(self, text: str) -> int:
         """Append a text to the log. May be called from any thread."""
-        self._files.append(WORDS, text.encode(errors="replace"))
+        self._files.append(LOG_FILE, text.encode(errors="replace"))
         return len(text)

@@ -47,7 +47,7 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
     """
     if lab is not None:
         with open_session(lab, CONNECT_S) as session:
-            if session.present(keys.alive("hal")) or session.present(keys.HOST_ALL):
+            if session.present(keys.alive_key("hal")) or session.present(keys.HOST_ALL):
                 raise RefusedError(
                     f"{lab.namespace} is on {lab.endpoint} already; end that run first, or give this one another "
                     f"--namespace"

@@ -8,9 +8,9 @@ from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
-from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory, request_to_arm
+from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory, make_arm_request
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.run_ending import AT_GOAL
 from snakesim_operator.run.ending import Ending
@@ -77,7 +77,7 @@ class RunMonitor:
         # The recorder.
         self._recorder_is_ready = RECORDER not in supervisor.names
         self._recorder_due_s: float | None = None
-        session.on_alive(self._on_recorder_alive, keys.alive(RECORDER))
+        session.on_alive(self._on_recorder_alive, keys.alive_key(RECORDER))
 
         # What the host published.
         self._status: Status | None = None
@@ -95,7 +95,7 @@ class RunMonitor:
 
     def run(self) -> None:
         """Monitor the run until it is over. Raises SnakesimError when it cannot continue."""
-        give_up_s = time.monotonic() + START_LIMIT_S
+        give_up_s = time.monotonic() + SERVICE_START_LIMIT_S
         with self._progress:
             try:
                 while self._supervisor.restart_ended_parts() and not self._ending.interrupted:
@@ -132,7 +132,7 @@ class RunMonitor:
             limit_s = self._startup_timeout.limit_s
             return f"not ready to arm within {limit_s:g} s (start_limit_s) with every service there: {reason}"
         if now > give_up_s:
-            return f"not ready to arm within {START_LIMIT_S:.0f} s: {reason}"
+            return f"not ready to arm within {SERVICE_START_LIMIT_S:.0f} s: {reason}"
         return None
 
     def _read_messages(self) -> None:
@@ -266,7 +266,7 @@ class RunMonitor:
         if self._trajectory is None or not self._armed or host is None:
             return
         if self._trajectory.newest(lambda trajectory: trajectory.finished) is not None:
-            host.ask(LifecycleRequest(action="finish", who=AT_GOAL))
+            host.send_request(LifecycleRequest(action="finish", who=AT_GOAL))
             self._trajectory = None
 
     def _waits_for_recorder(self) -> bool:
@@ -294,7 +294,7 @@ class RunMonitor:
         host = self._supervisor.host
         assert host is not None
         if self._arm_request_time_s is None:
-            host.ask(request_to_arm(robot, WHO, unchecked=self._unchecked))
+            host.send_request(make_arm_request(robot, WHO, unchecked=self._unchecked))
             self._arm_request_time_s = time.monotonic()
         elif host.answers:
             answer = host.answers.pop(0)

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from snakesim_hal.base import errors
-from snakesim_hal.base.arithmetic import environment
+from snakesim_hal.base.arithmetic import common_environment
 from snakesim_hal.base.process import child_environment, die_with_parent, python_command
 
 ResultT = TypeVar("ResultT")
@@ -30,7 +30,7 @@ def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
         (Path(folder) / CALL_FILE).write_bytes(pickle.dumps((function, arguments)))
         process = subprocess.Popen(
             python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
-            env=child_environment(environment(), {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}),
+            env=child_environment(common_environment(), {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}),
             stdin=subprocess.DEVNULL,
         )
         try:

@@ -12,10 +12,10 @@ from queue import SimpleQueue
 
 from snakesim_hal.base.errors import ConfigError, RefusedError, WireError
 from snakesim_hal.base.process import step_wall_clock
-from snakesim_hal.model.fault_kinds import RUN, Injection, Plan, checked
-from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.fault_kinds import RUN, Injection, InjectionPlan, check_injection
+from snakesim_hal.model.fault_plan import parse_planned
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Question, Session
+from snakesim_hal.network.session import Query, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, Description, FaultRequest, LifecycleState
@@ -55,14 +55,14 @@ class ProcessFaults:
         self._allowed = config.allow_fault_injection
         self._supervisor = supervisor
         self._say = say
-        self._plan = Plan(injection for injection in planned(config) if injection.part == RUN)
+        self._plan = InjectionPlan(injection for injection in parse_planned(config) if injection.part == RUN)
         self._time = RobotTime(session) if self._has_plan() else None  # each clock message wakes this process
         self._frozen: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
         self._requested: list[Injection] = []  # begin at the next `carry_out`
         self._stepped_s = 0.0
         self._decoder = Decoder(FaultRequest)
-        self._questions: SimpleQueue[Question] = SimpleQueue()
-        session.on_question(keys.fault(RUN), self._questions.put)
+        self._questions: SimpleQueue[Query] = SimpleQueue()
+        session.on_query(keys.fault_key(RUN), self._questions.put)
 
     def refusal(self, robot: Description) -> str | None:
         """Return why the scenario's faults are not allowed on this robot; None if they are, or if there are none."""
@@ -104,7 +104,7 @@ class ProcessFaults:
         if self._stepped_s:
             step_wall_clock(-self._stepped_s)
 
-    def _answer(self, question: Question, robot: Description | None, lifecycle: LifecycleState) -> Answer:
+    def _answer(self, question: Query, robot: Description | None, lifecycle: LifecycleState) -> Answer:
         """Check a request, begin or end its fault if that is allowed, and return the answer."""
 
         def refuse(reason: str, refusal: str) -> Answer:
@@ -115,7 +115,9 @@ class ProcessFaults:
             return refuse(prohibition, "not_allowed")
         try:
             request = self._decoder.decode(question.payload, question.encoding)
-            injection = checked(Injection(request.kind, request.target, 0.0, request.for_s or inf, request.amount))
+            injection = check_injection(
+                Injection(request.kind, request.target, 0.0, request.for_s or inf, request.amount)
+            )
             if request.end:
                 self._end(injection)
                 return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)
@@ -144,7 +146,7 @@ class ProcessFaults:
     def _check(self, injection: Injection) -> None:
         """Raise ConfigError for a requested fault that this run cannot carry out, or could not end."""
         if injection.part != RUN:
-            raise ConfigError(f"{injection.kind}:{injection.target} is carried out at {keys.fault(injection.part)}")
+            raise ConfigError(f"{injection.kind}:{injection.target} is carried out at {keys.fault_key(injection.part)}")
         if injection.target_type == "process" and injection.target not in self._supervisor.names:
             raise ConfigError(
                 f"there is no process {injection.target!r}; this run has {', '.join(self._supervisor.names)}"

@@ -4,7 +4,7 @@ import sys
 import time
 from typing import Self
 
-from snakesim_hal.base.terminal import overwrite_line, say
+from snakesim_hal.base.terminal import overwrite_line, print_line
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ControlState, Status
 
@@ -26,14 +26,14 @@ class OneLine:
 
     def __exit__(self, *_: object) -> None:
         if self._shown_characters:
-            say("")
+            print_line("")
 
-    def put(self, text: str) -> None:
+    def show_text(self, text: str) -> None:
         """Show a text now, in place of the one before."""
         if self.terminal:
             self._shown_characters = overwrite_line(text, LINE_CHARACTERS, self._shown_characters)
         else:
-            say(text)
+            print_line(text)
 
 
 class Progress(OneLine):
@@ -83,7 +83,7 @@ class Progress(OneLine):
         self._next = now + (TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S)
         text = self._describe_run(status, control, now) if armed else f"starting: {status.why}"
         if self.terminal or text != self._last:
-            self.put(text)
+            self.show_text(text)
         self._last = text
 
     def _count_armed_time(self, status: Status) -> None:
@@ -117,7 +117,7 @@ class Progress(OneLine):
         parts = [f"{speed:.1f}x real time"]
         left_s = max(self._duration_s - self._armed_s, 0.0)
         if speed > 0 and status.lifecycle == "armed" and left_s > 0:
-            parts.append(f"about {in_minutes(left_s / speed)} left")
+            parts.append(f"about {format_duration(left_s / speed)} left")
         return parts
 
 
@@ -132,7 +132,7 @@ def _describe_control(control: ControlState) -> list[str]:
     return parts
 
 
-def in_minutes(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration as 4:05, or 1:04:05 from one hour on."""
     minutes, rest = divmod(round(seconds), 60)
     if minutes >= 60:

@@ -11,24 +11,24 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, SnakesimError
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.fault_kinds import ROUTER
-from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.scenario import RunConfig, written
+from snakesim_hal.model.fault_plan import parse_planned
+from snakesim_hal.model.scenario import RunConfig, encode_config
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.local_registry import LocalRobot, registered
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.programs.preflight import check_plugins
-from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
-from snakesim_operator.run.folder import claimed, named_after
+from snakesim_operator.run.folder import default_folder, locked_folder
 from snakesim_operator.run.meeting import meeting_point, refuse_second_robot
 from snakesim_operator.run.monitor import AFTER_FAULT_S, RunMonitor
 from snakesim_operator.run.run_files import RunFiles
@@ -75,7 +75,7 @@ class RunRequest:
     def lab(self) -> Link | None:
         """How to reach the router that the run joins; None when its parts meet on this computer."""
         if self.session is not None:
-            return Link.of_file(self.session, self.network_name)
+            return Link.from_session_file(self.session, self.network_name)
         if self.router is not None:
             return Link(self.router, self.network_name)
         return None
@@ -95,18 +95,18 @@ def run(request: RunRequest) -> int:
     link, stop_port = meeting_point(request.endpoint, request.lab, request.network_name)
     ending = Ending()
     with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
-        supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
+        supervisor = Supervisor(files, ending, print_line, stop_port, stay=request.stay)
         processes = _RunProcesses(request, supervisor, link, files, config_file)
-        robot = LocalRobot.on(
+        robot = LocalRobot.describe(
             link, request.config.robot.name, request.config.backend, stop_port, str(config_file.absolute())
         )
         with interruptible(ending):
             with contextlib.ExitStack() as opened:
                 registry_failure = opened.enter_context(registered(robot))
                 if request.console:  # before the robot, because the operator waits for it
-                    opened.enter_context(console_beside(processes.common_arguments, files, say))
+                    opened.enter_context(console_beside(processes.common_arguments, files, print_line))
                 if registry_failure is not None:
-                    say(registry_failure)
+                    print_line(registry_failure)
                 _run_processes(processes, ending)
             return _conclude(request, supervisor, files, ending)
 
@@ -150,15 +150,15 @@ def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles
     Yields:
         The writer of the run's files, and the path of the configuration.
     """
-    out = out or named_after(config.name)
-    content = written(config)
+    out = out or default_folder(config.name)
+    content = encode_config(config)
     with contextlib.ExitStack() as held:
         try:
-            folder = held.enter_context(claimed(out, say))
-            write_whole(folder / CONFIG, content)
+            folder = held.enter_context(locked_folder(out, print_line))
+            write_atomically(folder / CONFIG, content)
         except OSError as error:
             held.close()
-            say(f"warning: --out {out}: {error.strerror}; the run goes on, but nothing of it is recorded")
+            print_line(f"warning: --out {out}: {error.strerror}; the run goes on, but nothing of it is recorded")
             memory = os.memfd_create("snakesim-config")
             held.callback(os.close, memory)
             os.write(memory, content)
@@ -170,11 +170,11 @@ def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles
 def check_recorder(*, record: bool) -> None:
     """Raise ConfigError when a recording is requested that cannot be written: a run cannot be recorded afterwards."""
     if record:
-        extras.check("record", "a recording of the run", "; or run with --no-record")
+        extras.require("record", "a recording of the run", "; or run with --no-record")
 
 
 def _warn(failure: str) -> None:
-    say(f"warning: {failure}; the run goes on, its record may lack something")
+    print_line(f"warning: {failure}; the run goes on, its record may lack something")
 
 
 def _check_router(request: RunRequest) -> None:
@@ -185,7 +185,7 @@ def _check_router(request: RunRequest) -> None:
                 "--with-router starts a router of the run's own, --router and --session join another: give one of them"
             )
         return
-    router_faults = [injection for injection in planned(request.config) if injection.target == ROUTER]
+    router_faults = [injection for injection in parse_planned(request.config) if injection.target == ROUTER]
     if router_faults:
         raise ConfigError(f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router")
 
@@ -263,7 +263,7 @@ def _run_processes(processes: _RunProcesses, ending: Ending) -> None:
         with _session_of_run(processes.link, supervisor, ending) as session:
             _print_start(request.config, processes.link)
             monitor = RunMonitor(
-                request.config, session, supervisor, ending, say, stay=request.stay, unchecked=request.unchecked
+                request.config, session, supervisor, ending, print_line, stay=request.stay, unchecked=request.unchecked
             )
             monitor.run()
     except SnakesimError as error:
@@ -274,10 +274,10 @@ def _run_processes(processes: _RunProcesses, ending: Ending) -> None:
 
 
 def _print_start(config: RunConfig, link: Link) -> None:
-    say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.clock_mode}")
-    say(f"network: {link.endpoint}, namespace {link.namespace}")
+    print_line(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.clock_mode}")
+    print_line(f"network: {link.endpoint}, namespace {link.namespace}")
     if not config.has_own_control:
-        say("no control service of its own: a client that takes the lease commands and arms the robot")
+        print_line("no control service of its own: a client that takes the lease commands and arms the robot")
 
 
 @contextlib.contextmanager
@@ -299,9 +299,9 @@ def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Itera
                 if ended is not None:
                     raise NotConnectedError(ended) from None
                 now = time.monotonic()
-                if now > began_s + START_LIMIT_S or ending.interrupted:
+                if now > began_s + SERVICE_START_LIMIT_S or ending.interrupted:
                     raise
                 if now > reported_s + REPORT_PERIOD_S:
-                    say(f"starting: the host has not opened its network yet, after {now - began_s:.0f} s")
+                    print_line(f"starting: the host has not opened its network yet, after {now - began_s:.0f} s")
                     reported_s = now
         yield session

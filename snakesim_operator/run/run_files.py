@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from snakesim_hal.base.atomic_write import write_whole
+from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.workers import start_worker
 
 MEMORY_BYTES = 8 * 2**20
@@ -148,7 +148,7 @@ class RunFiles:
             if task.kind == "append":
                 self._append(self.folder, task)
             elif task.kind == "put":
-                write_whole(self.folder / task.name, task.content)
+                write_atomically(self.folder / task.name, task.content)
             elif task.name in self._handles:
                 os.close(self._handles.pop(task.name))
                 (self.folder / task.name).rename(self.folder / task.content.decode())

@@ -50,7 +50,7 @@ class Part:
         """Return how the process ended; None while it runs, or when its restart is scheduled already."""
         if self.restart_due_s is not None:
             return None
-        return self.child.how_it_ended()
+        return self.child.describe_end()
 
     def schedule_restart(self) -> float:
         """Schedule the restart with exponential back-off. Returns the delay in s."""
@@ -126,7 +126,7 @@ class Supervisor:
         keep = partial(self._files.append, f"{name}.log")
         if name == HOST:
             return self._launch_host(arguments, keep)
-        return children.start(name, arguments, keep, more=self._secret)
+        return children.start_child(name, arguments, keep, more=self._secret)
 
     def _launch_host(self, arguments: Sequence[str], keep: Callable[[bytes], object]) -> Child:
         """Start a host that inherits the stop port and its end of a new private channel."""
@@ -134,7 +134,7 @@ class Supervisor:
         with host_end:
             inherits = (host_end.fileno(), self._stop_port.fileno())
             private = ["--channel", str(inherits[0]), "--stop-port", str(inherits[1])]
-            child = children.start(HOST, [*arguments, *private], keep, inherits=inherits, more=self._secret)
+            child = children.start_child(HOST, [*arguments, *private], keep, inherits=inherits, more=self._secret)
         if self.host is not None:
             self.host.close()
         self.host = StarterEnd(supervisor_end)
@@ -161,7 +161,7 @@ class Supervisor:
         if self.host is None:
             return
         resets_before = self.host.resets
-        self.host.take_in()
+        self.host.receive()
         for _ in range(self.host.resets - resets_before):
             self._note_restart(HOST, "host was reset", delay_s=0.0)
             robot = self.host.description
@@ -199,7 +199,7 @@ class Supervisor:
         for part in self._parts.values():
             if not part.vital:
                 continue
-            how = part.child.how_it_ended()
+            how = part.child.describe_end()
             if how is not None:
                 return how
         return None
@@ -238,7 +238,7 @@ class Supervisor:
         """Warn once that a part that the run does not need has ended."""
         if part.name in self.lost:
             return
-        lines = part.child.words.last() or [how]
+        lines = part.child.output.last_lines() or [how]
         self.lost[part.name] = lines[-1]
         self._files.warn(lines[-1])
 
@@ -267,7 +267,7 @@ class Supervisor:
         children.stop_all(running)
         for part in self._parts.values():
             if not part.vital and part.child.process.returncode:
-                self._continue_without(part, part.child.how_it_ended() or "")
+                self._continue_without(part, part.child.describe_end() or "")
         self._print_last_output()
 
     def _end_host(self) -> None:
@@ -278,7 +278,7 @@ class Supervisor:
         children.request_end(host.child)
         with contextlib.suppress(subprocess.TimeoutExpired):
             host.child.process.wait(children.STOP_LIMIT_S)
-        how = host.child.how_it_ended()
+        how = host.child.describe_end()
         if how is not None and host.child.process.returncode not in REGULAR_EXIT_CODES:
             self._ending.add_cause(how)
 
@@ -293,7 +293,7 @@ class Supervisor:
         if self._ending.reason is None or self._ending.interrupted:
             return
         for part in self._parts.values():
-            lines = part.child.words.last()
+            lines = part.child.output.last_lines()
             if not lines:
                 continue
             self._say(f"--- output of {part.name}:")

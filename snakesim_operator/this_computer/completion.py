@@ -15,16 +15,16 @@ from importlib.metadata import entry_points
 
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import KINDS
-from snakesim_hal.model.files import shipped
-from snakesim_hal.model.plugins import BACKENDS, COMMANDS, CONTROLLERS, installed
+from snakesim_hal.model.files import list_shipped
+from snakesim_hal.model.plugins import BACKENDS, COMMANDS, CONTROLLERS, list_installed
 from snakesim_hal.wire import keys
 
 KNOWN: dict[str, Callable[[], list[str]]] = {  # values of arguments, by the argument's name in any command
-    "scenario": lambda: shipped("scenarios"),
-    "robot": lambda: shipped("robots"),
-    "suite": lambda: shipped("suites"),
-    "backend": lambda: installed(BACKENDS),
-    "controller": lambda: installed(CONTROLLERS),
+    "scenario": lambda: list_shipped("scenarios"),
+    "robot": lambda: list_shipped("robots"),
+    "suite": lambda: list_shipped("suites"),
+    "backend": lambda: list_installed(BACKENDS),
+    "controller": lambda: list_installed(CONTROLLERS),
     "kind": lambda: sorted({kind for kinds in KINDS.values() for kind in kinds}),
     "key": lambda: [row.key for row in keys.SPACE if row.kind in ("stream", "latched")],
 }
@@ -100,7 +100,7 @@ def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Command]:
             here.options += action.option_strings
             here.values |= dict.fromkeys(action.option_strings, choices)
     if not path:
-        for name in sorted({*installed(COMMANDS)} - {*here.words}):
+        for name in sorted({*list_installed(COMMANDS)} - {*here.words}):
             here.words.append(name)
             below += _of_package(name)
     yield here

@@ -97,7 +97,7 @@ def packages() -> Iterator[Finding]:
 
 def opengl() -> Iterator[Finding]:
     """Whether MuJoCo can draw without a screen; only color images, videos and the model `rendered` need that."""
-    if not extras.has("sim"):
+    if not extras.is_installed("sim"):
         return
     detail: list[str] = []
     for kind in ("egl", "osmesa"):

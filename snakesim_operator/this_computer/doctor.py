@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from snakesim_hal.base.terminal import say, say_json
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.this_computer import computer
 from snakesim_operator.this_computer.computer import Finding
@@ -34,14 +34,14 @@ def doctor(where: RobotSelection, *, as_json: bool) -> int:
                 _print(finding)
     failed = [finding.what for finding in found if finding.state == "fail"]
     if as_json:
-        say_json({"ok": not failed, "findings": msgspec.to_builtins(found)})
+        print_json({"ok": not failed, "findings": msgspec.to_builtins(found)})
     else:
         warned = sum(finding.state == "warn" for finding in found)
-        say(f"{len(found)} checked; fail: {', '.join(failed) or 'none'}; warnings: {warned}")
+        print_line(f"{len(found)} checked; fail: {', '.join(failed) or 'none'}; warnings: {warned}")
     return 1 if failed else 0
 
 
 def _print(finding: Finding) -> None:
-    say(f"{finding.state:<5}{finding.what:<21}{finding.detail}")
+    print_line(f"{finding.state:<5}{finding.what:<21}{finding.detail}")
     for fix in finding.fix:
-        say(f"     {'':<21}$ {fix}")
+        print_line(f"     {'':<21}$ {fix}")

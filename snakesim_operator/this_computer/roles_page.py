@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
-from snakesim_hal.wire.roles import ABOUT, INJECTION, MESSAGES, MESSAGES_OF_LATCHED, TABLE, Line, Role
+from snakesim_hal.wire.roles import INJECTION, MESSAGES, MESSAGES_OF_LATCHED, ROLE_DESCRIPTIONS, TABLE, KeyRights, Role
 
 INTRODUCTION = """\
 # Roles
@@ -26,7 +26,7 @@ def roles_page() -> str:
     return "\n".join(
         [
             INTRODUCTION,
-            *_table(("role", "is"), ABOUT.items()),
+            *_table(("role", "is"), ROLE_DESCRIPTIONS.items()),
             "",
             *_table(("key", *Role), [_key_row(line) for line in TABLE]),
             "",
@@ -41,7 +41,7 @@ def roles_page() -> str:
     )
 
 
-def _key_row(line: Line) -> tuple[str, ...]:
+def _key_row(line: KeyRights) -> tuple[str, ...]:
     """Return a key, and what each role may do at it."""
     condition = " (if allowed)" if line.key in INJECTION else ""
     cells = [f"`{line.key}`{condition}"]

@@ -5,9 +5,9 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.base.errors import short
-from snakesim_hal.base.terminal import say, say_json
-from snakesim_hal.model.files import leaves, read_part, shipped
+from snakesim_hal.base.errors import shorten
+from snakesim_hal.base.terminal import print_json, print_line
+from snakesim_hal.model.files import leaves, list_shipped, read_part
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_installed, in_file, plugin_settings
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.programs.preflight import check_plugins
@@ -18,18 +18,20 @@ MAX_VALUE_CHARACTERS = 48  # longer values are not aligned
 Row = tuple[str, Any, str]  # key, value, and the file or flag that it came from
 
 
-def list_shipped(*, as_json: bool) -> int:
+def print_shipped_files(*, as_json: bool) -> int:
     """Print the name and the description of every shipped file."""
     shipped_files: dict[str, dict[str, str]] = {}
     for kind, description_key in DESCRIPTION_KEYS.items():
-        shipped_files[kind] = {name: read_part(name, kind).values.get(description_key, "") for name in shipped(kind)}
+        shipped_files[kind] = {
+            name: read_part(name, kind).values.get(description_key, "") for name in list_shipped(kind)
+        }
     if as_json:
-        say_json(shipped_files)
+        print_json(shipped_files)
         return 0
     for kind, descriptions in shipped_files.items():
-        say(f"{kind}:")
+        print_line(f"{kind}:")
         for name, description in descriptions.items():
-            say(f"  {name:<18}{description}")
+            print_line(f"  {name:<18}{description}")
     return 0
 
 
@@ -38,7 +40,7 @@ def show_config(loaded: Loaded, *, as_json: bool) -> int:
     check_plugins(loaded.config, loaded.table, run_files=False)
     rows = _find_values(loaded)
     if as_json:
-        say_json({key: {"value": value, "origin": origin} for key, value, origin in rows})
+        print_json({key: {"value": value, "origin": origin} for key, value, origin in rows})
         return 0
     _print_rows(rows)
     _print_unchecked(loaded.config)
@@ -47,11 +49,11 @@ def show_config(loaded: Loaded, *, as_json: bool) -> int:
 
 def _print_rows(rows: Sequence[Row]) -> None:
     """Print key, value and origin in three columns."""
-    texts = [short(repr(value) if isinstance(value, str) else str(value)) for _, value, _ in rows]
+    texts = [shorten(repr(value) if isinstance(value, str) else str(value)) for _, value, _ in rows]
     key_width = max(len(key) for key, _, _ in rows)
     value_width = min(max(len(text) for text in texts), MAX_VALUE_CHARACTERS)
     for (key, _, origin), text in zip(rows, texts, strict=True):
-        say(f"{key:<{key_width}}  {text:<{value_width}}  {origin}")
+        print_line(f"{key:<{key_width}}  {text:<{value_width}}  {origin}")
 
 
 def _print_unchecked(config: RunConfig) -> None:
@@ -63,7 +65,7 @@ def _print_unchecked(config: RunConfig) -> None:
     plugins += [(f"services.{name}", service.code) for name, service in config.own_services.items()]
     for section, plugin in plugins:
         if in_file(plugin):
-            say(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
+            print_line(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
 
 
 def _find_values(loaded: Loaded) -> list[Row]:

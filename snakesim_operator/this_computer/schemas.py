@@ -10,13 +10,13 @@ import msgspec
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import SCHEMAS
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_plugin, installed
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_plugin, list_installed
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.model.textfiles import read_text, write_text
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import encoding_of
+from snakesim_hal.wire.codec import format_encoding
 from snakesim_hal.wire.messages import VERSIONS
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.this_computer.roles_page import roles_page
@@ -55,14 +55,14 @@ def contract() -> Iterator[tuple[str, str]]:
     yield KEYS, _key_space()
     yield "roles.md", roles_page()
     for message in VERSIONS:
-        extra = {"encoding": encoding_of(message)}
+        extra = {"encoding": format_encoding(message)}
         yield f"messages/{message.__name__}.json", _schema(message, extra)
     yield "files/robot.json", _schema(RobotFile)
     yield "files/scene.json", _schema(SceneFile)
     yield "files/run.json", _schema(RunConfig)
     yield "files/summary.json", _schema(RunSummary)
     for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control")):
-        for name in installed(group):
+        for name in list_installed(group):
             plugin = find_plugin(group, name)
             if plugin.__module__.startswith("snakesim_"):
                 yield f"files/{section}.{name}.json", _schema(plugin.Settings)
@@ -98,7 +98,7 @@ def _key_space() -> str:
             message = "-"
         else:
             name = row.message.__name__
-            message = f"[{name}](messages/{name}.json) `{encoding_of(row.message).rpartition(';')[2]}`"
+            message = f"[{name}](messages/{name}.json) `{format_encoding(row.message).rpartition(';')[2]}`"
         rows.append(f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.about} |")
     rows += [
         "",

@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.programs.arguments import add_insecure, add_json, add_network, add_scenario, load_scenario
 
 
@@ -39,9 +39,9 @@ def add_commands(commands: Any) -> None:
 
 
 def _scenarios(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.this_computer.scenario_files import list_shipped
+    from snakesim_operator.this_computer.scenario_files import print_shipped_files
 
-    return list_shipped(as_json=arguments.json)
+    return print_shipped_files(as_json=arguments.json)
 
 
 def _config(arguments: argparse.Namespace) -> int:
@@ -51,10 +51,10 @@ def _config(arguments: argparse.Namespace) -> int:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.base.robot_selection import selection_of
+    from snakesim_operator.base.robot_selection import select_robots
     from snakesim_operator.this_computer.doctor import doctor
 
-    return doctor(selection_of(arguments), as_json=arguments.json)
+    return doctor(select_robots(arguments), as_json=arguments.json)
 
 
 def _router(arguments: argparse.Namespace) -> int:
@@ -63,7 +63,7 @@ def _router(arguments: argparse.Namespace) -> int:
 
     path: Path = arguments.config or ROUTER
     with open_router(path, insecure=arguments.insecure):
-        say(f"router running from {path}; Ctrl-C ends it")
+        print_line(f"router running from {path}; Ctrl-C ends it")
         threading.Event().wait()
     return 0
 
@@ -72,5 +72,5 @@ def _schemas(arguments: argparse.Namespace) -> int:
     from snakesim_operator.this_computer.schemas import published, write_schemas
 
     for path in published() if arguments.write is None else write_schemas(arguments.write):
-        say(str(path))
+        print_line(str(path))
     return 0

@@ -14,7 +14,7 @@ from snakesim_drivers.emulation.emulated_body import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
-from snakesim_hal.base.terminal import exit_code, say
+from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_hal.programs.preflight import backend_settings
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, emulator_on
@@ -32,9 +32,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
     if not arguments.load:
-        return exit_code("snakesim dynamixels", lambda: serve(arguments))
+        return run_tool("snakesim dynamixels", lambda: serve(arguments))
     for line in table():
-        say(line)
+        print_line(line)
     return 0
 
 

@@ -5,7 +5,7 @@ import math
 import mujoco
 
 from snakesim_hal.model.kinematics import tangents
-from snakesim_hal.model.measured_force import FeltForce
+from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
@@ -35,7 +35,7 @@ class ContactReader:
         self._noise: Normal | None = None
         if self._sigma_m or self._sigma_n:
             self._noise = noise
-        self._measured_force = FeltForce(sim.model.opt.timestep)
+        self._measured_force = MeasuredForce(sim.model.opt.timestep)
         physics.after_step = self._measure_force
 
     def read(self, tick: int, timestamp_ns: int) -> Contacts:

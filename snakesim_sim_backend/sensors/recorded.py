@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, expanded
+from snakesim_hal.model.files import FileStruct, expand_home
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.scope import Scope
@@ -55,7 +55,7 @@ class RecordedDepth:
 
 def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
     """Read the images of a recording. Raises ConfigError."""
-    path = expanded(file)
+    path = expand_home(file)
     decoder = msgspec.json.Decoder(Line)
     try:
         size = path.stat().st_size

@@ -87,7 +87,7 @@ def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
 
 def _find_model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
     """Return a sensor's class and its checked settings; None for both if `find` does not know the model."""
-    message = keys.message_at(key)
+    message = keys.find_message(key)
     if message is ColorImage:
         return RenderedColor, RenderedColor.Settings()
     assert message is not None

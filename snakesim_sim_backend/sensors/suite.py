@@ -60,7 +60,7 @@ class Sensors:
             if isinstance(sensor, Mounted):
                 channel = self._make_threaded(key, sensor, scope)
             else:
-                message = keys.message_at(key)
+                message = keys.find_message(key)
                 assert message is not None, key
                 channel = SynchronousSensor(SYNCHRONOUS[message](sensor, scope), sensor, config)
             self._channels.append((key, channel))

@@ -10,7 +10,7 @@ import msgspec
 from snakesim_hal.backend import Backend, BackendFactory
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import Override, RunConfig, Service, load, parse_set
-from snakesim_hal.programs.preflight import backend_settings, on_backend
+from snakesim_hal.programs.preflight import backend_settings, with_backend_modes
 from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.contract.loopback import Hosted
 from snakesim_testing.contract.rig import HOLDER, Rig
@@ -80,7 +80,7 @@ class Bench:
         """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
         overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
-        config = on_backend(load(self._scenario, overrides).config, self.factory)
+        config = with_backend_modes(load(self._scenario, overrides).config, self.factory)
         # The tests' own controller is the only service.
         paces = self.factory.check(config, backend_settings(config, self.factory))
         clock_mode = (

@@ -94,18 +94,18 @@ class Controller:
                 if clock is None:
                     continue
                 measured = client.read(joints)
-                if measured is None or not commander.holds(clock):
-                    client.done(clock.tick)
+                if measured is None or not commander.ensure_lease(clock):
+                    client.report_done(clock.tick)
                     continue
                 if clock.lifecycle != "armed" or held is None:
-                    held = commander.stay(measured)
+                    held = commander.hold_position(measured)
                 elif clock.arm_session != arm_session:
                     arm_session, armed_at = clock.arm_session, clock.tick
                 asked = self._asked(clock, held, clock.tick - armed_at)
                 if asked is not None:
                     commander.send(clock, measured, asked)
                     self.last_sent_tick, self.epoch, self.arm_session = clock.tick, clock.lease_epoch, clock.arm_session
-                    client.done(clock.tick)
+                    client.report_done(clock.tick)
 
     def _asked(self, clock: Clock, held: RequestedSetpoints, ticks: int) -> RequestedSetpoints | None:
         asked = self.plan(ticks) if clock.lifecycle == "armed" else {}
@@ -140,7 +140,7 @@ class Hosted:
             self.robot = self.host.description
             self.session: Session = self._open.enter_context(open_session(link))
             self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
-            wait_until(self._commands.heard, "the host receives our commands")  # earlier ones are lost
+            wait_until(self._commands.has_subscriber, "the host receives our commands")  # earlier ones are lost
             self._start("host", self.host.run, self.host.stop)
             self._start("controller", lambda: self.controller.run(link), self.controller.stopped.set)
         except BaseException:
@@ -158,7 +158,7 @@ class Hosted:
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
         )
-        return self.session.ask(keys.LIFECYCLE, request, timeout_s=10.0)
+        return self.session.request(keys.LIFECYCLE, request, timeout_s=10.0)
 
     def arm(self, plan: Plan) -> None:
         """Arm from any state; the controller acts by the plan from then on."""
@@ -179,13 +179,13 @@ class Hosted:
             lambda: self.host.authority.state == state or not self._threads_live(),
             f"lifecycle {state}",
         )
-        assert self.host.authority.state == state, self.host.authority.why
+        assert self.host.authority.state == state, self.host.authority.reason
 
     def passes(self, periods: int) -> list[JointState]:
         """Wait for this many more ticks, and return their joint states."""
         since = len(self.backend.seen)
         wait_until(lambda: len(self.backend.seen) >= since + periods or not self._threads_live(), f"{periods} ticks")
-        assert len(self.backend.seen) >= since + periods, f"the host ended: {self.host.authority.why}"
+        assert len(self.backend.seen) >= since + periods, f"the host ended: {self.host.authority.reason}"
         return self.backend.seen[since:]
 
     def forge(self, **wrong: Any) -> None:

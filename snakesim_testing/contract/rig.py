@@ -23,7 +23,7 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     LifecycleState,
     Mode,
-    request_to_arm,
+    make_arm_request,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract import tolerances as t
@@ -112,7 +112,7 @@ class Rig:
 
     def has(self, joint: int, mode: Mode) -> bool:
         """Whether a joint is described to have a mode."""
-        return self.robot.joints[joint].has(mode)
+        return self.robot.joints[joint].supports_mode(mode)
 
     def feels(self, joint: int = 0) -> bool:
         """Whether a joint is described to measure its torque."""
@@ -235,14 +235,14 @@ class Rig:
             self.idle(t.TRANSPORT_PERIODS)
         here = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.now.angle_rad)}
         self._offer(self.points(here))
-        answer = self.authority.on_lifecycle(request_to_arm(self.robot, "conformance"), self._now_ns)
+        answer = self.authority.on_lifecycle(make_arm_request(self.robot, "conformance"), self._now_ns)
         assert answer.ok, f"the robot cannot be armed: {answer.reason}"
         self.drive(here, t.ARMING_PERIODS)
         self.must_be_armed()
 
     def must_be_armed(self) -> None:
         """Fail with the reason when the robot has left `armed`."""
-        assert self.authority.state == "armed", f"no longer armed: {self.authority.why}"
+        assert self.authority.state == "armed", f"no longer armed: {self.authority.reason}"
 
     def disarm(self) -> None:
         """Disarm, or clear a stop."""
@@ -320,7 +320,7 @@ class Rig:
 
     def _offer(self, points: RequestedSetpoints) -> None:
         """Send a command; a rejection shows in the joint states."""
-        if self.authority.state == "disarmed" and not self.authority.lease.live(self._now_ns):
+        if self.authority.state == "disarmed" and not self.authority.lease.is_live(self._now_ns):
             self.authority.on_lease(LeaseRequest(action="acquire", holder=HOLDER), self._now_ns)
         self._sequence += 1
         command = JointCommand(
@@ -334,7 +334,7 @@ class Rig:
             target=points.target,
             torque_limit_nm=points.torque_limit_nm,
         )
-        self.authority.offer(command, now_ns=self._now_ns, tick=self.tick, age_ns=0)
+        self.authority.offer_command(command, now_ns=self._now_ns, tick=self.tick, age_ns=0)
 
     def _sample(self) -> Samples:
         samples = self._cycle.sample(self.tick, self._now_ns)

@@ -5,11 +5,11 @@ from collections import Counter
 import msgspec
 
 from snakesim_hal.model.robot import layout_hash
-from snakesim_hal.model.scenario import description_of
+from snakesim_hal.model.scenario import describe_run_robot
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Description, Imu
-from snakesim_hal.wire.own_sample import own_kinds
+from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.rig import Record, Rig
@@ -17,7 +17,7 @@ from snakesim_testing.contract.rig import Record, Rig
 
 def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:
     """Joints (count, order, names, axes, limits, gains), links, period, lease and safety come from the run's files."""
-    robot, wanted = rig.robot, description_of(bench.config)
+    robot, wanted = rig.robot, describe_run_robot(bench.config)
     assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
     for joint, expected in zip(robot.joints, wanted.joints, strict=True):
         drive = {"serial": joint.serial, "firmware": joint.firmware}  # which the drive says, not the file
@@ -41,17 +41,17 @@ def test_the_description_is_readable_at_once_and_stays(bench: Bench, rig: Rig, h
 def test_the_description_survives_the_wire(rig: Rig) -> None:
     """Encoded and decoded by the HAL's codec, with its bounds, it is the same."""
     description = rig.robot
-    assert Decoder(Description).decode(encode(description), encoding_of(Description)) == description
+    assert Decoder(Description).decode(encode(description), format_encoding(Description)) == description
 
 
 def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
     """Sensors are at the sensor keys, with a rate up to the control rate; the joints are always listed."""
     listed = [sensor.key for sensor in rig.robot.sensors]
     assert len(set(listed)) == len(listed), f"listed twice: {listed}"
-    assert own_kinds(rig.robot).keys() == rig.robot.own.keys(), "a schema in `own` describes no message"
+    assert find_custom_messages(rig.robot).keys() == rig.robot.own.keys(), "a schema in `own` describes no message"
     assert keys.JOINTS in listed
     for sensor in rig.robot.sensors:
-        assert sensor.key.startswith("sensor/") and keys.message_at(sensor.key), sensor.key
+        assert sensor.key.startswith("sensor/") and keys.find_message(sensor.key), sensor.key
         assert sensor.rate_hz <= 1.001e9 / rig.period_ns, f"{sensor.key}: faster than the control rate"
 
 
@@ -81,4 +81,4 @@ def test_nothing_comes_that_is_not_listed(rig: Rig, healthy: Record) -> None:
     for sample in healthy.samples:
         for key, message in sample.others.items():
             assert key in listed, f"{key} is published but not listed"
-            assert isinstance(message, keys.message_at(key) or ()), f"{key}: {type(message).__name__}"
+            assert isinstance(message, keys.find_message(key) or ()), f"{key}: {type(message).__name__}"

@@ -39,7 +39,7 @@ def moves_then(silent: bool, hosted: Hosted) -> int:
     wait_until(lambda: hosted.backend.seen, "a first sample")
     angle = hosted.backend.seen[-1].angle_rad[0]
     speed = -math.copysign(t.CRUISE_RAD_S, angle)  # away from the nearer stop
-    by_speed, period_s = hosted.robot.joints[0].has(Mode.VELOCITY), hosted.config.period_ns * 1e-9
+    by_speed, period_s = hosted.robot.joints[0].supports_mode(Mode.VELOCITY), hosted.config.period_ns * 1e-9
     ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
 
     def plan(since_arming: int) -> JointTargets | None:
@@ -80,7 +80,7 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -
     count = len(hosted.robot.joints)
     lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
     wait_until(lambda: hosted.tick > 2 * lease, "ticks enough to be late by")
-    refused = Counter(hosted.host.authority.rejected)
+    refused = Counter(hosted.host.authority.rejected_counts)
     home = hosted.backend.seen[-1].angle_rad
     wrong: dict[str, dict[str, Any]] = {
         "wrong_epoch": {"lease_epoch": hosted.controller.epoch + 7},
@@ -90,7 +90,7 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -
         "stale": {"tick": 0},
         "from_the_future": {"tick": hosted.tick + 1_000_000},
     }
-    rejected = hosted.host.authority.rejected
+    rejected = hosted.host.authority.rejected_counts
 
     def all_refused() -> bool:
         missing = [values for word, values in wrong.items() if rejected[word] <= refused[word]]
@@ -100,7 +100,7 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -
 
     wait_until(all_refused, f"all refused, so far: {rejected}")
     after = hosted.passes(t.ARMING_PERIODS)
-    assert hosted.host.authority.state == "armed", hosted.host.authority.why
+    assert hosted.host.authority.state == "armed", hosted.host.authority.reason
     away = np.array([state.angle_rad for state in after]) - home
     assert np.abs(away).max() < t.STILL_RAD, f"it moved by {np.abs(away).max():.3f} rad"
 
@@ -148,7 +148,7 @@ def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted)
     """In a pause no tick passes and no lease expires; whatever cannot stand still says so."""
     hosted.arm(stay)
     hosted.passes(t.ARMING_PERIODS)
-    answer = hosted.session.ask(keys.SIMULATOR, SimulatorRequest(action="pause", who="contract"), timeout_s=10.0)
+    answer = hosted.session.request(keys.SIMULATOR, SimulatorRequest(action="pause", who="contract"), timeout_s=10.0)
     if not hosted.robot.simulated_time:
         assert answer.refusal == "not_simulated", answer
         hosted.passes(t.ARMING_PERIODS)
@@ -158,6 +158,6 @@ def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted)
     tick = hosted.tick
     time.sleep(2 * hosted.robot.lease_ns * 1e-9)
     assert hosted.tick == tick, "time goes on in a pause"
-    assert hosted.session.ask(keys.SIMULATOR, SimulatorRequest(action="resume"), timeout_s=10.0).ok
+    assert hosted.session.request(keys.SIMULATOR, SimulatorRequest(action="resume"), timeout_s=10.0).ok
     hosted.passes(t.ARMING_PERIODS)
-    assert hosted.host.authority.state == "armed", hosted.host.authority.why
+    assert hosted.host.authority.state == "armed", hosted.host.authority.reason

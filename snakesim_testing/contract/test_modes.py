@@ -98,11 +98,11 @@ def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> Non
         pytest.skip(f"{rig.robot.joints[0].name} is described with every mode")
     rig.arm()
     for mode in lacking:
-        refused = rig.authority.rejected["wrong_mode"]
+        refused = rig.authority.rejected_counts["wrong_mode"]
         wrong = rig.points({})
         wrong.mode[0], wrong.target[0] = mode, t.CRUISE_RAD_S
         record = rig.offer(wrong)
-        assert rig.authority.rejected["wrong_mode"] == refused + 1, f"{mode.name.lower()} mode was accepted"
+        assert rig.authority.rejected_counts["wrong_mode"] == refused + 1, f"{mode.name.lower()} mode was accepted"
         assert np.abs(record.angle_rad - rig.home_rad).max() < t.REACHED_RAD, "it moved"
         assert all(mode not in points.mode for points in record.setpoints)
 

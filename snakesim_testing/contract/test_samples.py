@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import MountedSample
-from snakesim_hal.wire.outgoing import what_is_wrong
-from snakesim_hal.wire.own_sample import own_kind_at
+from snakesim_hal.wire.outgoing import find_wrong_value
+from snakesim_hal.wire.own_sample import find_custom_message
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.rig import Record, Rig
 
@@ -57,12 +57,12 @@ def test_every_sample_survives_the_wire(rig: Rig, healthy: Record) -> None:
     """
     for sample in healthy.samples:
         for key, message in ((keys.JOINTS, sample.joints), *sample.others.items()):
-            own = own_kind_at(key, rig.robot)
+            own = find_custom_message(key, rig.robot)
             decoder = Decoder(type(message) if own is None else own.message)
             try:
-                decoded = decoder.decode(encode(message), encoding_of(type(message)))
+                decoded = decoder.decode(encode(message), format_encoding(type(message)))
             except WireError as error:
-                pytest.fail(f"{key}: {what_is_wrong(message) or error}")
+                pytest.fail(f"{key}: {find_wrong_value(message) or error}")
             assert msgspec.to_builtins(decoded) == msgspec.to_builtins(message)
         assert all(math.isfinite(number) for name in COLUMNS[:3] for number in getattr(sample.joints, name))
 
@@ -71,7 +71,7 @@ def test_every_sample_fits_the_robot(rig: Rig, healthy: Record) -> None:
     """Links and joints are those of the description, rotations are rotations, an image has all of its pixels."""
     for sample in healthy.samples:
         for key, message in sample.others.items():
-            assert (why := mismatch(message, rig.robot)) is None, f"{key}: {why}"
+            assert (why := find_mismatch(message, rig.robot)) is None, f"{key}: {why}"
 
 
 def test_no_sample_contradicts_itself(healthy: Record) -> None:
@@ -79,7 +79,7 @@ def test_no_sample_contradicts_itself(healthy: Record) -> None:
     for sample in healthy.samples:
         for key, message in sample.others.items():
             if isinstance(message, MountedSample):
-                assert not (why := message.contradiction()), f"{key}: {why}"
+                assert not (why := message.find_contradiction()), f"{key}: {why}"
 
 
 def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record) -> None:

@@ -191,7 +191,7 @@ class WithSonar(Liar):
     link, found_m = 0, 1.0
 
     def describes(self, robot):
-        return listing(robot, keys.ranges("sonar"))
+        return listing(robot, keys.ranges_key("sonar"))
 
     def sample(self, tick, timestamp_ns):
         sonar = Ranges(
@@ -206,7 +206,7 @@ class WithSonar(Liar):
             range_max_m=2.0,
             range_m=[self.found_m],
         )
-        return Samples(super().sample(tick, timestamp_ns).joints, {keys.ranges("sonar"): sonar})
+        return Samples(super().sample(tick, timestamp_ns).joints, {keys.ranges_key("sonar"): sonar})
 
 
 @breaks("every_sample_fits_the_robot")

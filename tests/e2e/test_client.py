@@ -122,7 +122,7 @@ def settled(run: Running) -> None:
     with snakesim.Robot.connect(run.endpoint) as robot:
         wait_until(lambda: "control" in robot.status.waiting_for, "a run that waits for its controller")
         if robot.status.lifecycle != "disarmed":
-            robot.clear()
+            robot.reset_fault()
 
 
 def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running, tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(driven: Running
         before = robot.wait()
         assert robot.wait() > before
         joints = robot.joints
-        assert joints is not None and len(joints.angle_rad) == len(robot.names) == 13
+        assert joints is not None and len(joints.angle_rad) == len(robot.joint_names) == 13
         assert robot.pose is not None and robot.age_s(robot.pose) < 10
         assert robot.parameters["control.stall_s"].unit == "s"
         robot.set({"control.stall_s": 2.0})

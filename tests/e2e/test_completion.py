@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import shipped
-from snakesim_hal.model.plugins import CONTROLLERS, installed
+from snakesim_hal.model.files import list_shipped
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed
 from tests.harness.command import call
 from tests.whole.command import snakesim
 
@@ -18,10 +18,10 @@ ASK = {"bash": f'source "$1"; shift; {ASKED}', "zsh": f'source "$1"; shift; seto
 TYPED: dict[str, tuple[list[str], set[str]]] = {
     "command": (["ru"], {"run"}),
     "all commands": ([""], {"run", "echo", "fault", "can", "modules", "completion"}),
-    "scenario": (["run", ""], set(shipped("scenarios"))),
+    "scenario": (["run", ""], set(list_shipped("scenarios"))),
     "flag": (["run", "triplet", "--clo"], {"--clock-mode"}),
     "value of a flag": (["run", "triplet", "--clock-mode", "l"], {"lockstep"}),
-    "controller": (["run", "--controller", ""], set(installed(CONTROLLERS))),
+    "controller": (["run", "--controller", ""], set(list_installed(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),
     "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
     "of an installed package": (["can", ""], {"load", "scan", "replay", "expand"}),

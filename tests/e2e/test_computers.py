@@ -26,9 +26,9 @@ COMPUTERS: dict[str, dict[str, str]] = {
     "plain NumPy": {"NPY_DISABLE_CPU_FEATURES": PLAIN},
     "all enabled": {"NPY_ENABLE_CPU_FEATURES": PLAIN},
 }
-OWN = arithmetic.foreign(arithmetic.measured())
+OWN = arithmetic.find_differing_parts(arithmetic.measure_arithmetic())
 common = pytest.mark.skipif(
-    not arithmetic.environment() or bool(OWN),
+    not arithmetic.common_environment() or bool(OWN),
     reason=f"the digests of this computer are its own: {' and '.join(OWN) or 'without AVX2 and FMA'}",
 )
 OF_THIS_PROCESS = ["tests/whole/test_recordings.py", "tests/whole/test_compare.py"]
@@ -48,7 +48,7 @@ print(result.summary.command_digest, len(result.record.time_s))
 def on(computer: Mapping[str, str], folder: Path) -> dict[str, str]:
     """The environment of a user there, who has heard nothing of ours."""
     ours = environment(folder)
-    return {name: value for name, value in ours.items() if name not in arithmetic.environment()} | dict(computer)
+    return {name: value for name, value in ours.items() if name not in arithmetic.common_environment()} | dict(computer)
 
 
 def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None) -> Ended:

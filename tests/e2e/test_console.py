@@ -15,8 +15,8 @@ from snakesim_hal.wire.messages import ControlSettings, JointState, Status
 from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page.page import Page
-from snakesim_operator.features.console.robot_data.snapshot import expected_snapshot
-from snakesim_operator.features.console.web.server import page_server
+from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
+from snakesim_operator.features.console.web.server import serve_pages
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, running
 from tests.harness.endpoint import free_endpoint
@@ -80,7 +80,7 @@ TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab
 
 def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
-    with page_server(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
+    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, None, PageLog(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
@@ -101,8 +101,10 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
 def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_all_else() -> None:
     """And a wide screen shows the tabs in one line."""
     config, log = load("triplet").config, PageLog()
-    with page_server(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
-        Page(server, None, Operations(Link(free_endpoint(), "planar13"), log), log).show(expected_snapshot(config))
+    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
+        Page(server, None, Operations(Link(free_endpoint(), "planar13"), log), log).show_snapshot(
+            make_expected_snapshot(config)
+        )
         page = browser.open(address, 400, 800, 0.5)
         page.wait_for("planar13")
         for tab in ("Joints", "State", "Signals", "Log"):

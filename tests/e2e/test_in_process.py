@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import shipped
-from snakesim_hal.model.scenario import load, parse_set, read
+from snakesim_hal.model.files import list_shipped
+from snakesim_hal.model.scenario import load, parse_set, read_config
 from snakesim_hal.network.client import Client
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -23,7 +23,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
     """Run it in processes, then its effective configuration in this one; both must agree in every tick."""
     ended, summary = run_to_summary(out, scenario, *arguments)
     assert ended.code == 0, ended.out + ended.err
-    theirs, ours = Record.load(out), simulate(read(out / CONFIG))
+    theirs, ours = Record.load(out), simulate(read_config(out / CONFIG))
     assert ours.summary.ended == "complete"
     assert ours.summary.command_digest == summary.command_digest
     assert ours.summary.path_distance_m == summary.path_distance_m
@@ -46,7 +46,7 @@ def test_processes_and_one_process_drive_the_motors_alike(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", shipped("scenarios"))
+@pytest.mark.parametrize("scenario", list_shipped("scenarios"))
 def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> None:
     same_both_ways(tmp_path / "run", scenario)
 
@@ -60,12 +60,12 @@ def test_so_does_a_robot_with_a_camera_like_the_robot_without(tmp_path: Path) ->
     config = load("peg_row", [parse_set("duration_s=0.5"), parse_set("robot=planar13_camera")]).config
     with InProcessRun(config) as run:
         client = Client(run.network.session(), "onlooker")
-        images, client_ticks = client.subscribe(keys.depth("head"), DepthImage), client.ticks(0.0)
+        images, client_ticks = client.subscribe(keys.depth_key("head"), DepthImage), client.ticks(0.0)
         read: list[tuple[int, int]] = []
         for _ in run.iterate_ticks():
             while (clock := next(client_ticks)) is not None:
                 image = client.read(images)
-                if image is not None and clock.newest[keys.depth("head")] == clock.tick:
+                if image is not None and clock.newest[keys.depth_key("head")] == clock.tick:
                     read.append((clock.tick, image.tick))
     assert len(read) == 10 and all(tick == of for tick, of in read)
 

@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_gnc.guidance.service import Guidance
 from snakesim_hal.model.outlines import outline_distance_m
-from snakesim_hal.model.plugins import SERVICES, offered
+from snakesim_hal.model.plugins import SERVICES, offer_plugin
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.model.scene import Cylinder
 from snakesim_hal.network.client import Client
@@ -34,7 +34,7 @@ class Deceived(Guidance):
 def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], RunConfig]:
     """What guidance told in a run on a row of pegs."""
     config = load("peg_row", [parse_set(text) for text in (*HOW, f'mission.map="{map_}"', *more)]).config
-    with offered(SERVICES, "guidance", Deceived if deceived else Guidance):
+    with offer_plugin(SERVICES, "guidance", Deceived if deceived else Guidance):
         result = simulate(config)
     assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0) > 0.3
     record, last = result.record, result.record.worlds[-1]

@@ -74,7 +74,7 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
         lab.start("service", "control", str(path), *network)
     wait_until(lambda: lab.tell("status").out.count("next: `snakesim arm") == 2, "both ready")
     listener = Listener()
-    with open_session(Link.of_file(read_session(lab.session))) as session:
+    with open_session(Link.from_session_file(read_session(lab.session))) as session:
         session.on_arrival("**", listener.take)
         only_one_is_armed_when_one_is_named(lab)
         for namespace, (robot, _, _) in ROBOTS.items():

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 import snakesim
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
-from snakesim_operator.features.console.page.custom_sensors import sensor_table
+from snakesim_operator.features.console.page.custom_sensors import format_sensor_table
 from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.recording.decoder import DecoderFactory
 from tests.e2e.command import Ended, call, environment, running
@@ -33,7 +33,7 @@ PYTEST = (
     "--snakesim-backend",
     "sim",
 )
-LEFT = keys.own("left")
+LEFT = keys.custom_key("left")
 
 
 @pytest.fixture
@@ -59,13 +59,13 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             watch = LiveRobot(session)
 
             def shown() -> bool:
-                snapshot = watch.snapshot()
-                return snapshot is not None and {LEFT, keys.own("right")} <= snapshot.own.keys()
+                snapshot = watch.take_snapshot()
+                return snapshot is not None and {LEFT, keys.custom_key("right")} <= snapshot.own.keys()
 
             wait_until(shown, "whiskers on the console")
-            snapshot = watch.snapshot()
+            snapshot = watch.take_snapshot()
             assert snapshot is not None
-            text = sensor_table(snapshot)
+            text = format_sensor_table(snapshot)
             assert LEFT in text and "Whisker on link 13" in text and "bend_rad" in text and " rad" in text
         echoed = started.tell("echo", LEFT, "--count", "1")
         assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.said

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.base.process import user_name
+from snakesim_hal.base.process import get_user_name
 from tests.e2e.command import Ended, Running, armed_run
 from tests.whole.command import snakesim
 
@@ -41,10 +41,10 @@ def test_one_is_read_and_set_and_read_again(param) -> None:
     assert param("get", "control.propulsion_n").out == "35.0\n"
     done = param("set", "control.propulsion_n=30", "control.stall_s=2")
     assert done.code == 0, done.err
-    assert f"control.propulsion_n: 35.0 -> 30.0 N, by {user_name()}, tick " in done.out
+    assert f"control.propulsion_n: 35.0 -> 30.0 N, by {get_user_name()}, tick " in done.out
     assert "control.stall_s: 1.0 -> 2.0 s, by " in done.out
     assert param("get", "control.propulsion_n").out == "30.0\n"
-    assert f"set by {user_name()} at " in param("list").out.splitlines()[0]
+    assert f"set by {get_user_name()} at " in param("list").out.splitlines()[0]
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_pa
         assert links == [f"link_{i}" for i in range(14)]
         assert run.end() == 3, run.said()  # complete, but the record lacks something
     assert run.said().count("warning:") == 1 and "recorder was ended by SIGKILL" in run.said()
-    kept = list(RecordingReader(tmp_path / "run" / RECORDING).messages([keys.JOINTS]))
+    kept = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages([keys.JOINTS]))
     assert len(kept) > 10
     alone = RunRecord.load(tmp_path / "beside.mcap")
     assert alone.config.name == "triplet" and len(alone.time_s) > 40

@@ -12,7 +12,7 @@ from snakesim_hal.wire import keys
 from snakesim_operator.results.record import RECORDING
 from snakesim_operator.results.recording_contents import read_recording
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.in_process import WORDS
+from snakesim_operator.run.in_process import LOG_FILE
 from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary
 from tests.e2e.documents import REPOSITORY, sections
 from tests.harness.endpoint import free_endpoint
@@ -131,7 +131,7 @@ def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
     code = [*SHORT, "--duration", "60", "--set", "services.sensor.code=./lab/lost.py:Lost"]
     if clock_mode == "one":
         ended, summary = in_process.run_to_summary(home / "run", *code)
-        log = (home / "run" / WORDS).read_text()
+        log = (home / "run" / LOG_FILE).read_text()
     else:
         ended, summary = run_to_summary(home / "run", *code, "--clock-mode", clock_mode)
         log = (home / "run" / "sensor.log").read_text()
@@ -148,7 +148,7 @@ def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
     code = [*SHORT, "--set", "services.sensor.code=./lab/lost.py:Lost"]
     ended, summary = in_process.run_to_summary(home / "run", *code)
     said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
-    assert ended.code == 1 and said in summary.ended and said in (home / "run" / WORDS).read_text()
+    assert ended.code == 1 and said in summary.ended and said in (home / "run" / LOG_FILE).read_text()
 
 
 SILENT = """

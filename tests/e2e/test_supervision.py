@@ -54,7 +54,7 @@ class Robot:
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
         )
-        return self._session.ask(keys.LIFECYCLE, request)
+        return self._session.request(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
         wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
@@ -69,7 +69,7 @@ class Robot:
 
     def fault(self, kind: str, target: str, **more: object) -> Answer:
         request = FaultRequest(kind=kind, target=target, **more)  # pyright: ignore[reportArgumentType]
-        return self._session.ask(keys.fault("run"), request, 5.0)
+        return self._session.request(keys.fault_key("run"), request, 5.0)
 
 
 def pids(run: Running, *names: str) -> dict[str, int]:

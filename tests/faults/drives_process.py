@@ -27,7 +27,7 @@ from snakesim_drivers.kit.drive_settings import make_body
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, load
 from snakesim_hal.programs.preflight import backend_settings
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         tune_garbage_collector()
         with contextlib.suppress(OSError):  # real drives do not wait for a busy computer
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVICE_PRIORITY))
-        say(READY)
+        print_line(READY)
         before: list[bool] = []
         while running:
             drives.run()

@@ -177,14 +177,14 @@ class Observer:
         why = ""
         for _ in range(ASKED):
             try:
-                return self.session.ask(key, request, timeout_s=2.0)
+                return self.session.request(key, request, timeout_s=2.0)
             except NotConnectedError as error:
                 why = str(error)
         raise TrialError(f"{why}, asked {ASKED} times")
 
     def inject(self, part: str, kind: str, target: str, **more: Any) -> Answer:
         """Let something go wrong by the product's own injector. Raises TrialError when it refuses."""
-        answer = self.ask(keys.fault(part), FaultRequest(kind=kind, target=target, **more))
+        answer = self.ask(keys.fault_key(part), FaultRequest(kind=kind, target=target, **more))
         if not answer.ok:
             raise TrialError(f"{kind}:{target} was refused: {answer.reason}")
         return answer

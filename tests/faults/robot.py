@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.model.scenario import Override, RunConfig, load, write
+from snakesim_hal.model.scenario import Override, RunConfig, load, write_config
 from snakesim_hal.network.session import Link, open_session
 from snakesim_operator.run import children
 from snakesim_operator.run.children import Child
@@ -45,7 +45,7 @@ class Robot:
         self.host = HostWatch()  # of the first host
         self._stack.callback(self.host.close)
         self.random = random.Random(config.seed)
-        write(config, folder / "config.json")
+        write_config(config, folder / "config.json")
 
     def __enter__(self) -> "Robot":
         return self
@@ -78,7 +78,7 @@ class Robot:
             module = ["snakesim_hal.programs.service_program", name, *common]
         log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
         state = {"XDG_STATE_HOME": str(self.folder)}  # what outlives a run must not outlive this one
-        self.running[name] = children.start(name, module, log.write, inherits=inherits, more=state)
+        self.running[name] = children.start_child(name, module, log.write, inherits=inherits, more=state)
         return self.running[name]
 
     def start_all(self) -> None:
@@ -101,12 +101,12 @@ class Robot:
 
     def ended(self) -> list[str]:
         """Which of its processes are gone, and how."""
-        return [how for child in self.running.values() if (how := child.how_it_ended()) is not None]
+        return [how for child in self.running.values() if (how := child.describe_end()) is not None]
 
     def last_words(self) -> str:
         """Of those that are gone."""
-        ended = [child for child in self.running.values() if child.how_it_ended()]
-        return " | ".join(line for child in ended for line in child.words.last())
+        ended = [child for child in self.running.values() if child.describe_end()]
+        return " | ".join(line for child in ended for line in child.output.last_lines())
 
     def signal(self, name: str, number: signal.Signals) -> int:
         """Send a signal to one of its processes; when, by the monotonic clock."""

@@ -9,7 +9,7 @@ import msgspec
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
 from tests.faults.observer import Observer
 
@@ -19,7 +19,7 @@ HUGE = MAX_PAYLOAD_BYTES + 1024
 
 def send_raw(session: Session, payload: bytes, encoding: str | None = None) -> None:
     """Put bytes where commands go."""
-    session._zenoh.put(keys.JOINT_COMMAND, payload, encoding=encoding or encoding_of(JointCommand))
+    session._zenoh.put(keys.JOINT_COMMAND, payload, encoding=encoding or format_encoding(JointCommand))
 
 
 class Stranger:
@@ -120,8 +120,8 @@ class Stranger:
 
     def unknown_version(self) -> None:
         """A good command that says that it is of version 2."""
-        version = encoding_of(JointCommand).replace("/1", "/2")
-        assert version != encoding_of(JointCommand)
+        version = format_encoding(JointCommand).replace("/1", "/2")
+        assert version != format_encoding(JointCommand)
         send_raw(self.observer.session, encode(self.forged()), version)
 
     def other_message(self) -> None:

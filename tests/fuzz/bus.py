@@ -26,7 +26,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from tests.fuzz.texts import flipped
 from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
 
@@ -149,5 +149,5 @@ def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:
     words.update(f"fault {fault.what}" for fault in run.faults[reported:])
     samples = run.samples[-1]
     for message in (samples.joints, *samples.others.values()):
-        assert Decoder(type(message)).decode(encode(message), encoding_of(type(message))) == message
+        assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
     del run.samples[:-1]

@@ -27,8 +27,8 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.network.local_registry import LocalRobot, local_robots
 from snakesim_hal.network.router import router_settings
-from snakesim_hal.network.stop_port import REQUEST, ask_to_stop, open_stop_port, serve_stops
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.network.stop_port import REQUEST, open_stop_port, request_stop, serve_stops
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import EstopRequest, Pose
 from snakesim_operator.results.last_run import recall
 from snakesim_operator.results.record import RunRecord
@@ -124,7 +124,7 @@ def mocap() -> Iterator[Input]:
             stranger.sendto(payload, (host, int(port)))
             pose = receiver.read_newest(now_ns // 10_000_000, now_ns)
             if pose is not None:
-                assert Decoder(Pose).decode(encode(pose), encoding_of(Pose)) == pose
+                assert Decoder(Pose).decode(encode(pose), format_encoding(Pose)) == pose
                 return "a pose"
             return next(iter(receiver.refused - before), "no velocity yet")
 
@@ -147,7 +147,7 @@ def stop_port() -> Iterator[Input]:
     count = 0
 
     def stop(who: str, reply: Callable[[str], None]) -> None:
-        assert Decoder(EstopRequest).decode(encode(EstopRequest(who=who[:64])), encoding_of(EstopRequest))
+        assert Decoder(EstopRequest).decode(encode(EstopRequest(who=who[:64])), format_encoding(EstopRequest))
         heard.append(who)
         reply("stopped")
 
@@ -159,7 +159,7 @@ def stop_port() -> Iterator[Input]:
             stranger.sendto(payload, (host, port))
             count += 1
             if count % STOP_EVERY == 0:
-                answer = ask_to_stop(host, port, "a person", 5.0)
+                answer = request_stop(host, port, "a person", 5.0)
                 assert answer is not None and answer.text == "stopped", "the stop port is dead"
             heard_now = len(heard)
             heard.clear()
@@ -189,7 +189,7 @@ def texts() -> list[Input]:
         Input(
             "a fault",
             FAULTS,
-            typed(lambda text: (injection.parse(text), twin_faults.parse_fault(text, 13))),
+            typed(lambda text: (injection.parse_injection(text), twin_faults.parse_fault(text, 13))),
             LARGEST // 8,
         ),
         Input(
@@ -204,7 +204,7 @@ def written(folder: Path) -> list[Input]:
     """Files that people write, and those that the product keeps for itself."""
 
     def shipped(kind: str) -> list[bytes]:
-        return [files.find(name, kind).read_bytes() for name in files.shipped(kind)]
+        return [files.find_file(name, kind).read_bytes() for name in files.list_shipped(kind)]
 
     def file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], str]:
         def take(payload: bytes) -> str:
@@ -216,7 +216,7 @@ def written(folder: Path) -> list[Input]:
     def latch(_path: Path) -> bool:
         found = EstopLatch(folder)
         found.close()
-        assert found.found is not None, "a stop that cannot be read counts as one"
+        assert found.left_by_earlier_host is not None, "a stop that cannot be read counts as one"
         return True
 
     def live(path: Path) -> object:

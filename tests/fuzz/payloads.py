@@ -9,7 +9,7 @@ from typing import Any
 from msgspec import inspect
 from msgspec.msgpack import Ext
 
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, encode, encoding_of
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, JointCommand, JointState, LeaseRequest, LifecycleRequest, Message
 from tests.fuzz.texts import flipped
 from tests.unit.hal.rig import LEASE_NS, command, description, state
@@ -134,7 +134,7 @@ class Maker:
         rng = self._rng
         seed = rng.choice(self._seeds)
         kind = rng.choice(list(self._kinds))
-        encoding = encoding_of(seed.message)
+        encoding = format_encoding(seed.message)
         if rng.random() < 0.02:
             at = rng.randrange(len(encoding))
             encoding = rng.choice([encoding[:at], encoding + "0", encoding[:at] + chr(rng.randrange(1, 0xD800)), ""])

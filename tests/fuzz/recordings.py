@@ -14,7 +14,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_operator.recording.chunks import HEAD, unpack
+from snakesim_operator.recording.chunks import HEAD, unpack_chunk
 from snakesim_operator.recording.message import RECORDING
 from tests.fuzz.forked import Forked, forked
 from tests.harness.endpoint import free_endpoint
@@ -101,7 +101,7 @@ def foreign(chance: random.Random, content: bytes) -> bytes:
 def forged(chance: random.Random, content: bytes) -> bytes:
     """A chunk that is whole, with messages that are not: other bytes, times, numbers and channels."""
     span: Span = chance.choice(chunks(content))
-    data = unpack(content[span.begin + HEAD.size : span.end])
+    data = unpack_chunk(content[span.begin + HEAD.size : span.end])
     places = [one.begin + HEAD.size for one in spans(data, magic=0) if one.opcode == Opcode.MESSAGE]
     for at in chance.sample(places, min(len(places), chance.choice((1, 5, 50)))):
         what = chance.randrange(4)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Answer,
@@ -52,7 +52,7 @@ def taken(hal: Rig, message: Message) -> str:
     answer: Answer
     match message:
         case JointCommand():
-            return authority.offer(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
+            return authority.offer_command(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
         case JointState():
             authority.observe(message)
             return "observed"
@@ -64,7 +64,7 @@ def taken(hal: Rig, message: Message) -> str:
             answer = authority.on_estop(message, hal.tick)
         case _:
             return "not for a HAL"
-    assert ANSWERS.decode(encode(answer), encoding_of(Answer)) == answer
+    assert ANSWERS.decode(encode(answer), format_encoding(Answer)) == answer
     return "yes" if answer.ok else "no"
 
 
@@ -72,7 +72,7 @@ def pass_tick(hal: Rig) -> None:
     """The end of a tick."""
     hal.now_ns += PERIOD_NS // 4
     hal.tick += 1
-    hal.authority.expire(hal.now_ns, hal.tick)
+    hal.authority.check_deadlines(hal.now_ns, hal.tick)
     assert all(abs(target) <= 5.0 for target in hal.authority.decide().setpoints.target)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.wire.codec import Decoder, encoding_of
+from snakesim_hal.wire.codec import Decoder, format_encoding
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Clock,
@@ -39,7 +39,7 @@ class Withholding:
 
     def __init__(self, live: Live) -> None:
         self._live = live
-        self._decoders: dict[str, Decoder[Any]] = {encoding_of(message): Decoder(message) for message in VERSIONS}
+        self._decoders: dict[str, Decoder[Any]] = {format_encoding(message): Decoder(message) for message in VERSIONS}
 
     def effect(self, payload: bytes, encoding: str) -> str | None:
         """What a sample would do by right, in a few words; None when it may be sent."""
@@ -76,7 +76,7 @@ class Withholding:
 
 def _is_known(request: FaultRequest) -> bool:
     try:
-        injection.checked(Injection(request.kind, request.target))
+        injection.check_injection(Injection(request.kind, request.target))
     except ConfigError:
         return False
     return True

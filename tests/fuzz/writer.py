@@ -155,10 +155,10 @@ class Stranger:
         else:
             key = rng.choice([row.key for row in keys.SPACE if row.message is message] or STREAMS)
         if key == keys.FAULT_ALL:
-            return keys.fault(rng.choice((injection.RUN, injection.HAL, *SERVICES)))
-        if key in (keys.DEPTH_ALL, keys.COLOUR_ALL, keys.RANGE_ALL):
+            return keys.fault_key(rng.choice((injection.RUN, injection.HAL, *SERVICES)))
+        if key in (keys.DEPTH_ALL, keys.COLOR_ALL, keys.RANGE_ALL):
             return key.replace("*", "head")
-        return keys.done(rng.choice(SERVICES)) if key == keys.DONE_ALL else key
+        return keys.done_key(rng.choice(SERVICES)) if key == keys.DONE_ALL else key
 
 
 def overhear(link: Link) -> tuple[list[Seed], Live]:
@@ -176,7 +176,7 @@ def overhear(link: Link) -> tuple[list[Seed], Live]:
     found: list[Seed] = []
     live: Live | None = None
     for key, arrival in newest.items():
-        message = keys.message_at(key)
+        message = keys.find_message(key)
         assert message is not None
         real: Any = Decoder(message).decode(arrival.payload, arrival.encoding)
         plain: dict[str, Any] = msgspec.to_builtins(real)

@@ -14,7 +14,7 @@ from tests.harness.wait import wait_until
 from tests.lab.small_lab import OWN, SmallLab
 from tests.unit.hal.strategies import plain_example
 
-KEY = keys.depth("head")
+KEY = keys.depth_key("head")
 # The largest that a robot may have: it is sent in many pieces, each of which waits for the one before it.
 SIZE = {"width": 1280, "height": 960, "depth": bytes(2 * 1280 * 960)}
 IMAGE = msgspec.convert({**plain_example(DepthImage), **SIZE, "tick": 1}, DepthImage)
@@ -25,7 +25,7 @@ def link(lab: SmallLab, role: Role) -> Link:
     identity = lab.who(role, OWN)
     path = lab.folder / f"{identity.common_name}.json5"
     path.write_text(json.dumps(lab.settings(identity, namespace=OWN)))
-    return Link.of_file(read_session(path), OWN)
+    return Link.from_session_file(read_session(path), OWN)
 
 
 def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: SmallLab) -> None:
@@ -33,7 +33,7 @@ def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: SmallLab) -> 
     with open_session(viewer_link) as viewer, open_session(robot_link) as robot:
         reader, found = viewer.reader(KEY, DepthImage), list[DepthImage]()
         robots, viewers = robot.publisher(KEY, DepthImage), viewer.publisher(KEY, DepthImage)
-        wait_until(robots.heard, "the viewer subscribes")
+        wait_until(robots.has_subscriber, "the viewer subscribes")
         viewers.put(msgspec.structs.replace(IMAGE, tick=2))
 
         def arrived() -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
+from snakesim_hal.model.scenario import RunConfig, load, parse_set, write_config
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.wire.messages import LifecycleRequest, Status
 from tests.e2e.command import SNAKESIM
@@ -28,7 +28,7 @@ class Lab:
         self.folder = folder
         self.config: RunConfig = load(SCENARIO, [parse_set(text) for text in (*CHANGES, *changes)]).config
         self._saved = folder / "config.json"
-        write(self.config, self._saved)
+        write_config(self.config, self._saved)
         self.router_machine, self.robot, self.workstation = (Machine(stack) for _ in range(3))
         wire(self.router_machine, self.robot, "robot", "10.77.1")
         self.link: Radio = stack.enter_context(radio(self.router_machine, self.workstation, "workstation", "10.77.2"))
@@ -79,7 +79,7 @@ class Lab:
     @property
     def status(self) -> Status | None:
         """The host's newest."""
-        self.host.take_in()
+        self.host.receive()
         return self.host.status
 
     def until(self, condition: Callable[[Status], bool], what: str, limit_s: float = START_LIMIT_S) -> float:
@@ -115,7 +115,7 @@ class Lab:
         robot = self.host.description
         assert robot is not None
         named = {"robot": robot.robot, "backend": robot.backend, "config_hash": robot.config_hash, "host": robot.host}
-        self.host.ask(LifecycleRequest(action=action, who="links", **named))  # pyright: ignore[reportArgumentType]
+        self.host.send_request(LifecycleRequest(action=action, who="links", **named))  # pyright: ignore[reportArgumentType]
 
 
 @contextmanager

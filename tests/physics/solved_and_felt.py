@@ -14,7 +14,7 @@ import numpy as np
 
 import snakesim
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.measured_force import FELT_OVER_S
+from snakesim_hal.model.measured_force import FORCE_WINDOW_S
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.results.metrics.force_tracking import ASKED_N, EMPTY_N
 from snakesim_sim_backend.sensors.contacts import ContactReader
@@ -129,7 +129,7 @@ def causes(scenario: str, controller: str, **options: Any) -> str:
 def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
     """Asked and felt forces, (n_states, n_obstacles) each; felt: mean over 50 ms, centered so long after asking."""
     names = sorted({*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)})
-    window = round(FELT_OVER_S / STEP_S)
+    window = round(FORCE_WINDOW_S / STEP_S)
     asked, felt = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
     for j, name in enumerate(names):
         sums = np.concatenate(([0.0], np.cumsum(forces.get(name, np.zeros(1)))))

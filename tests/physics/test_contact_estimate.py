@@ -13,7 +13,7 @@ import pytest
 from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.plugins import BACKENDS, offered
+from snakesim_hal.model.plugins import BACKENDS, offer_plugin
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -79,7 +79,7 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
                 seen.append((samples, true_pushes(self.describe(), self.true_state())))
             return samples
 
-    with offered(BACKENDS, "sim", Watched), InProcessRun(config) as run:
+    with offer_plugin(BACKENDS, "sim", Watched), InProcessRun(config) as run:
         for _ in run.iterate_ticks():
             pass
         return run.host.description, seen

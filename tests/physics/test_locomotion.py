@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scene import Cylinder, route_of
-from snakesim_hal.safety.limiter import bumpless_target
+from snakesim_hal.model.scene import Cylinder, make_route
+from snakesim_hal.safety.limiter import find_bumpless_target
 from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import known
 from tests.whole_run import Run, configure, run
@@ -106,7 +106,7 @@ def test_no_command_jumps_at_a_hand_over():
     for i, j in zip(*np.nonzero(np.diff(record.mode, axis=0)), strict=True):
         tick, mode = i + 1, Mode(int(record.mode[i + 1, j]))
         angle, speed, torque = (float(x[tick, j]) for x in (record.angle_rad, record.velocity_rad_s, record.torque_nm))
-        steady = bumpless_target(record.description.joints[j], mode, angle, speed, torque)
+        steady = find_bumpless_target(record.description.joints[j], mode, angle, speed, torque)
         report = whole.reports[tick]
         if mode == Mode.POSITION:
             way = abs(steady - report.reference_rad[j])
@@ -124,13 +124,13 @@ def test_no_command_jumps_at_a_hand_over():
 @pytest.mark.parametrize("clearance_m", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushing(clearance_m: float):
     config = configure("triplet")
-    route = known(route_of(config.scene))
+    route = known(make_route(config.scene))
     way_m = 0.04 + clearance_m + 0.05
     behind, middle, ahead = route.inflections_s_m()[1:4]
     places = (0.3 * behind + 0.7 * middle, 0.7 * middle + 0.3 * ahead, 0.4 * middle + 0.6 * ahead)
     pegs: list[Cylinder] = []
     for s, side in zip(places, (1, 1, -1), strict=True):
-        (x, y), (along_x, along_y) = route.at(s), route.tangent_w(s).tolist()
+        (x, y), (along_x, along_y) = route.point_at(s), route.tangent_w(s).tolist()
         pegs.append(Cylinder(position_m=(x - side * along_y * way_m, y + side * along_x * way_m), radius_m=0.05))
     scene = msgspec.structs.replace(config.scene, cylinder=pegs)
     whole = run(msgspec.structs.replace(config, scene=scene), duration_s=8.0)

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_triplet import TripletSolution, bending_torque_nm, solve_triplet
+from snakesim_gnc.control.obstacle_triplet import TripletSolution, compute_bending_torque_nm, solve_triplet
 from snakesim_gnc.control.obstacle_triplet.statics import add_tether
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
@@ -92,7 +92,7 @@ def make_bench(seed: int) -> Bench | None:
         ),
         joint=joint,
         solved=solved,
-        loads_nm=bending_torque_nm(nodes[1:-1], starts[1:-1], touched, places, pushes),
+        loads_nm=compute_bending_torque_nm(nodes[1:-1], starts[1:-1], touched, places, pushes),
     )
 
 

@@ -75,7 +75,7 @@ class Operator:
             if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MAX_VIOLATIONS:
                 return
             self._spend(event.pause_s)
-            answer = self._ask(keys.fault(event.part), event.request)
+            answer = self._ask(keys.fault_key(event.part), event.request)
             if not answer.ok:
                 if answer.refusal in ("cannot", "unknown_fault", "not_permitted"):
                     dice.rule_out(event)
@@ -109,7 +109,7 @@ class Operator:
         tick = watch.status.tick if watch.status is not None else 0
         self._spend(event.lasts_s)
         if event.end_request is not None:
-            answer = self._ask(keys.fault(event.part), event.end_request)
+            answer = self._ask(keys.fault_key(event.part), event.end_request)
             if not answer.ok and answer.refusal not in ("wrong_state", "not_on", "unknown_fault"):
                 line.violations.append(f"its end was refused: {answer.reason}")
         self._spend(SETTLE_S)
@@ -175,7 +175,7 @@ class Operator:
         give_up = time.monotonic() + RECOVERY_S
         while True:
             try:
-                return self._watch.session.ask(key, request, timeout_s=5.0)
+                return self._watch.session.request(key, request, timeout_s=5.0)
             except NotConnectedError as error:
                 if time.monotonic() > give_up:
                     return Answer(ok=False, reason=str(error), refusal="no_answer")

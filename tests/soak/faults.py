@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.model.fault_kinds import KINDS, Injection, TargetType, checked
+from snakesim_hal.model.fault_kinds import KINDS, Injection, TargetType, check_injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 
@@ -94,7 +94,7 @@ class Dice:
             lasts_s, pause_s, by_itself = dice.choice(LASTS_S), dice.uniform(0.5, 3.0), dice.random() < 0.5
             if (sort, kind) in self._impossible or (kind == "corrupt" and target not in SPOILT_KEYS):
                 continue
-            injection = checked(Injection(kind, target, 0.0, lasts_s, amount))
+            injection = check_injection(Injection(kind, target, 0.0, lasts_s, amount))
             once = injection.about.once
             by_itself |= (kind, target) == ("freeze", "host")  # nobody can ask for its end
             request = FaultRequest(

@@ -15,7 +15,7 @@ import msgspec
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.stop_port import ask_to_stop
+from snakesim_hal.network.stop_port import request_stop
 from snakesim_hal.run_log.host_record import HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
@@ -240,16 +240,16 @@ class KilledRun:
         with contextlib.suppress(NotConnectedError):
             if self._trial.by_datagram:
                 host, _, port = self._endpoint.removeprefix("tcp/").rpartition(":")
-                self._outcome.stop_answered = ask_to_stop(host, int(port), "kills", 3.0) is not None
+                self._outcome.stop_answered = request_stop(host, int(port), "kills", 3.0) is not None
             elif self._session is not None:
-                answer = self._session.ask(keys.ESTOP, EstopRequest(who="kills"), 3.0)
+                answer = self._session.request(keys.ESTOP, EstopRequest(who="kills"), 3.0)
                 self._outcome.stop_answered = answer.ok
 
     def _ask_to_clear(self) -> None:
         if self._session is not None:
             with contextlib.suppress(NotConnectedError):
                 request = LifecycleRequest(action="clear", who="kills")
-                self._outcome.clear_answered = self._session.ask(keys.LIFECYCLE, request, 3.0).ok
+                self._outcome.clear_answered = self._session.request(keys.LIFECYCLE, request, 3.0).ok
 
     # --- after it ---------------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_node,
     parse_opcode,
 )
-from snakesim_hal.model.scenario import Override, RunConfig, load, write
+from snakesim_hal.model.scenario import Override, RunConfig, load, write_config
 from tests.e2e.command import Ended, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
@@ -203,7 +203,7 @@ class Bench:
 def bench(folder: Path, channel: str) -> Iterator[Bench]:
     scenario = write_files(folder, scenario=SCENARIO.replace("CHANNEL", channel))
     config = load(scenario, [Override("robot.chain.modules", JOINTS, "test")]).config
-    write(config, folder / "config.json")
+    write_config(config, folder / "config.json")
     with ExitStack() as running, closing(Listener(channel)) as listener:
         yield Bench(folder, config, free_endpoint(), listener, running)
 

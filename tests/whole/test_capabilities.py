@@ -6,7 +6,7 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import ControllerError
-from snakesim_hal.model.robot import describe
+from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.run.in_process import simulate
@@ -31,7 +31,7 @@ def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_comm
             return action
 
     config = load("triplet", [parse_set(text) for text in SERVOS]).config
-    robot = describe(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
+    robot = describe_robot(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
     view = View(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
     with pytest.raises(
         ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"

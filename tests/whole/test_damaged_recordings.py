@@ -43,7 +43,7 @@ def whole(run: Path) -> bytes:
 
 def lost(whole_path: Path, path: Path) -> Counter[str]:
     """By key, by comparison with the file as it was."""
-    before, after = (Counter(one.key for one in RecordingReader(of).messages()) for of in (whole_path, path))
+    before, after = (Counter(one.key for one in RecordingReader(of).read_messages()) for of in (whole_path, path))
     return before - after
 
 
@@ -53,10 +53,10 @@ def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key
     damaged, following = chunks(whole)[2:4]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     reader = RecordingReader(path)
-    kept = list(reader.messages())
+    kept = list(reader.read_messages())
     truth = lost(run / RECORDING, path)
     assert truth[keys.JOINTS] >= 2 and len(kept) > 500
-    assert {key: count for key, count in reader.losses.lost.items() if not key.startswith("/")} == truth
+    assert {key: count for key, count in reader.losses.lost_by_key.items() if not key.startswith("/")} == truth
     (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
     clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
     hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
@@ -69,9 +69,9 @@ def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Pa
         for at in (chunk.begin, chunk.begin + 2, chunk.begin + 45, chunk.end - 5):  # kind, length, name, data
             path = written(tmp_path / "a.mcap", flipped(whole, at))
             reader = RecordingReader(path)
-            kept = list(reader.messages())
-            ours = {key: n for key, n in reader.losses.lost.items() if not key.startswith("/")}
-            assert kept and reader.finished and ours == lost(run / RECORDING, path), (chunk, at, reader.lacks)
+            kept = list(reader.read_messages())
+            ours = {key: n for key, n in reader.losses.lost_by_key.items() if not key.startswith("/")}
+            assert kept and reader.finished and ours == lost(run / RECORDING, path), (chunk, at, reader.missing)
 
 
 COMMANDS = [
@@ -128,10 +128,10 @@ def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: by
     first = chunks(whole)[0]
     written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
     ended = snakesim("export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
-    count = len(list(RecordingReader(tmp_path / "a.mcap").messages()))
+    count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
     assert ended.code == INCOMPLETE and int(ended.out.split()[0]) > count > 500  # and those for Foxglove
     reader = RecordingReader(tmp_path / "copy.mcap")
-    assert len(list(reader.messages())) == count and reader.finished
+    assert len(list(reader.read_messages())) == count and reader.finished
     told = snakesim("info", "copy.mcap", cwd=tmp_path)
     assert told.code == INCOMPLETE and "before it was copied: damaged in 1 place" in told.err
     assert "sensor/joints" in told.err
@@ -241,18 +241,18 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
     end = next(span for span in spans(whole) if span.opcode == Opcode.METADATA)
     path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
     reader = RecordingReader(path)
-    assert list(reader.messages()) and reader.finished and not reader.lacks
+    assert list(reader.read_messages()) and reader.finished and not reader.missing
 
 
 def test_a_bad_lz4_chunk_and_an_impossible_time_are_damage_as_any_other(whole: bytes, tmp_path: Path) -> None:
     first, second = chunks(whole)[:2]
     bad = packed(b"abc", "lz4", data=b"no lz4 at all")
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :]))
-    assert len(list(reader.messages())) > 500 and "a chunk that cannot be unpacked" in reader.lacks[0]
+    assert len(list(reader.read_messages())) > 500 and "a chunk that cannot be unpacked" in reader.missing[0]
     (channel,) = struct.unpack("<H", b"\x01\x00")
     late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
-    assert max(one.time_ns for one in reader.messages()) < 2**62 and reader.lacks
+    assert max(one.time_ns for one in reader.read_messages()) < 2**62 and reader.missing
     assert snakesim("info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
 
 
@@ -261,8 +261,8 @@ def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> No
     for opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT):
         absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
         reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :]))
-        list(reader.messages())
-        assert reader.finished and not reader.losses.lost and reader.losses.places == 1
+        list(reader.read_messages())
+        assert reader.finished and not reader.losses.lost_by_key and reader.losses.damage_count == 1
 
 
 def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:

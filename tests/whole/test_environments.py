@@ -21,7 +21,7 @@ import snakesim.environments
 from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
 from snakesim.environments.rewards import TERMS
 from snakesim_hal.model.drawn import Draw
-from snakesim_hal.model.scenario import write
+from snakesim_hal.model.scenario import write_config
 from snakesim_operator.base.extras import BRINGS
 from tests.e2e.documents import REPOSITORY, sections
 
@@ -107,7 +107,7 @@ def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
 def test_a_residual_of_nothing_is_the_shipped_controller(tmp_path) -> None:
     env = made("peg_row", action="residual:obstacle_triplet", duration=0.5)
     nothing = episode(env, seed=3, action=lambda _: np.zeros(13))
-    write(env.config, tmp_path / "config.json")
+    write_config(env.config, tmp_path / "config.json")
     assert nothing["digest"] == snakesim.run(tmp_path / "config.json").digest
     something = episode(env, seed=3, action=lambda _: np.full(13, 0.1))
     assert something["digest"] != nothing["digest"]
@@ -130,7 +130,7 @@ def test_what_a_lab_does_not_choose_is_drawn_for_each_seed_as_in_an_evaluation()
     found = [env.reset(seed=seed) and env.config.scene.ground.friction for seed in (7, 8, 7)]
     assert found[0] == found[2] != found[1] and all(0.1 <= one <= 0.4 for one in found)
     of_suite = Draw(set=["scene.ground.friction"], low=0.1, high=0.4)
-    assert found[0] == of_suite.on_field(7)[0].value
+    assert found[0] == of_suite.overrides_for_scene(7)[0].value
     for wrong, why in (
         ({"scene.ground.frictoin": (0.1, 0.4)}, "did you mean `friction`"),
         ({"scene.ground.friction": (0.4, 0.1)}, "lowest and the highest"),

@@ -12,7 +12,7 @@ import pytest
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY
 from snakesim_operator.run.conclusion import conclude
-from snakesim_operator.run.in_process import WORDS, run_in_process, simulate
+from snakesim_operator.run.in_process import LOG_FILE, run_in_process, simulate
 from tests.harness.command import SNAKESIM, environment
 from tests.harness.wait import wait_until
 from tests.whole.command import snakesim
@@ -24,7 +24,7 @@ def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
     out = tmp_path / "run"
     ended = snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
-    assert {path.name for path in out.iterdir()} == LEFT | {WORDS}
+    assert {path.name for path in out.iterdir()} == LEFT | {LOG_FILE}
     assert "in one process" in ended.out and str(out / REPORT) in ended.out and not ended.err
 
 

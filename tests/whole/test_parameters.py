@@ -5,14 +5,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, installed
+from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, list_installed
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, SettingsRequest
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.robot_commands.parameters import Parameter, parameters_of
+from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
 from tests.whole.command import snakesim
 
 CHANGED_AT = 30  # turns
@@ -26,13 +26,13 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with InProcessRun(config) as run:
         session, recording = run.network.session(), Recording(path)
         for row in keys.SPACE:
-            session.on_latched_arrival(row.key, recording.take)
+            session.on_latched_arrival(row.key, recording.write_arrival)
         request = SettingsRequest(
             who="ada", controller=config.controller, settings='{"propulsion_n": 20, "damping_nm_s_per_rad": 0.9}'
         )
         for turn, _ in enumerate(run.iterate_ticks()):
             if turn == CHANGED_AT:
-                session.put_question(keys.SETTINGS, request)
+                session.send_query(keys.SETTINGS, request)
         recording.close({})
     return path
 
@@ -59,7 +59,7 @@ def test_what_is_set_for_the_replay_stays(tuned: Path, tmp_path: Path) -> None:
 MUST_BE_SET = {"policy": {"model": "a.onnx"}}
 
 
-@pytest.mark.parametrize("name", installed(CONTROLLERS))
+@pytest.mark.parametrize("name", list_installed(CONTROLLERS))
 def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
     settings = find_plugin(CONTROLLERS, name).Settings
     in_force = ControlSettings(
@@ -69,14 +69,14 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
         settings=msgspec.json.encode(settings(**MUST_BE_SET.get(name, {}))).decode(),
         schema=msgspec.json.encode(msgspec.json.schema(settings)).decode(),
     )
-    found = parameters_of(in_force)
+    found = read_parameters(in_force)
     assert len(found) == len(msgspec.structs.fields(settings))
     for one in found:
-        assert one.about and one.range and (one.unit or one.name in ("push_scale", "model", "slides")), one
+        assert one.description and one.range and (one.unit or one.name in ("push_scale", "model", "slides")), one
 
 
 def test_ranges_are_told_in_words() -> None:
-    assert Parameter("a", 1.0, "s", least=0.0, most=5.0).range == ">= 0, <= 5"
-    assert Parameter("a", 1.0, "s", least=0.0, above_least=True).range == "> 0"
+    assert Parameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range == ">= 0, <= 5"
+    assert Parameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range == "> 0"
     assert Parameter("a", "x", choices=("x", "y")).range == "x or y"
-    assert (Parameter("a", 0.3, "N").shown, Parameter("a", 0.3, "1").shown) == ("0.3 N", "0.3")
+    assert (Parameter("a", 0.3, "N").value_with_unit, Parameter("a", 0.3, "1").value_with_unit) == ("0.3 N", "0.3")

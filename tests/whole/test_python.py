@@ -69,7 +69,7 @@ def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
     assert result["angle_rad"].shape == (100, 13) and result.time_s.shape == (100,)
     assert np.array_equal(result["angle_rad.joint_3"], result["angle_rad"][:, result.joints.index("joint_3")])
     assert result.units["torque_nm.joint_1"] == "N·m" and result.units["position_w_m.x"] == "m"
-    assert set(result.arrays) <= set(UNITS) and set(result.units) == set(result.names)
+    assert set(result.arrays) <= set(UNITS) and set(result.units) == set(result.signal_names)
     with pytest.raises(snakesim.ConfigError, match="no signal 'angle_rd'; did you mean `angle_rad`"):
         result["angle_rd"]
 

@@ -54,9 +54,9 @@ def test_a_run_tells_of_ticks_that_never_came_to_its_recorder(run: Path, tmp_pat
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / RECORDING).unlink()
     recording = Recording(tmp_path / RECORDING)
-    for message in RecordingReader(run / RECORDING).messages():
+    for message in RecordingReader(run / RECORDING).read_messages():
         if not 0.5e9 < message.time_ns < 1.5e9:
-            recording.take(Arrival(message.key, message.payload, message.encoding, message.wall_ns))
+            recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_ns))
     recording.close({})
     assert RunRecord.load(tmp_path / RECORDING).lacks == []  # nothing in the file itself tells
     ended = snakesim("report", ".", cwd=tmp_path)

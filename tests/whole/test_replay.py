@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import shipped
+from snakesim_hal.model.files import list_shipped
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.playback.control import Replay
 from snakesim_operator.recording.message import RECORDING
@@ -25,7 +25,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "scenario", [pytest.param(name, marks=pytest.mark.slow if name in PLANNED else ()) for name in shipped("scenarios")]
+    "scenario",
+    [pytest.param(name, marks=pytest.mark.slow if name in PLANNED else ()) for name in list_shipped("scenarios")],
 )
 def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str) -> None:
     ended, _ = run_to_summary(tmp_path / "run", scenario, "--duration", str(DURATION_S), "--clock-mode", "lockstep")

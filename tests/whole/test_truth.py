@@ -6,7 +6,7 @@ import msgspec
 
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import encode, encoding_of
+from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
@@ -45,13 +45,13 @@ def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Pat
     assert summary.last_state not in (None, "PowerOff")
     last = RunRecord.load(tmp_path / "run").control[-1]
     gone = msgspec.structs.replace(last, state="PowerOff", reason="no clock from the HAL")
-    before = list(RecordingReader(tmp_path / "run" / RECORDING).messages())
+    before = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages())
     (tmp_path / "run" / RECORDING).unlink()
     recording = Recording(tmp_path / "run" / RECORDING)
     for reported in before:
-        recording.take(Arrival(reported.key, reported.payload, reported.encoding, reported.wall_ns))
-    reported = Arrival(keys.CONTROL_STATE, encode(gone), encoding_of(ControlState), 0)
-    recording.take(reported)  # as control reports it while a host writes a long record
+        recording.write_arrival(Arrival(reported.key, reported.payload, reported.encoding, reported.wall_ns))
+    reported = Arrival(keys.CONTROL_STATE, encode(gone), format_encoding(ControlState), 0)
+    recording.write_arrival(reported)  # as control reports it while a host writes a long record
     recording.close({})
     again = summarise(RunRecord.load(tmp_path / "run"), "complete")
     assert (again.last_state, again.last_reason) == (summary.last_state, summary.last_reason)

@@ -64,7 +64,7 @@ def plan_contact(
     else:
         center_w = np.array(obstacle.position_w[:2])
         s = route.project(center_w, near_s_m, window_m)
-        x, y = route.at(s)
+        x, y = route.point_at(s)
         push = (x - float(center_w[0]), y - float(center_w[1]))
         distance_m = math.hypot(*push) - obstacle.radius_m
     heading_rad = route.heading_rad(s)
@@ -74,7 +74,7 @@ def plan_contact(
     return PlannedContact(
         obstacle=obstacle.name,
         path_s_m=s,
-        point_w=route.at(s),
+        point_w=route.point_at(s),
         normal_w=(-side * tangent[1], side * tangent[0]),
         tangent_w=tangent,
         side=side,
@@ -84,7 +84,7 @@ def plan_contact(
 
 def _find_place_at_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
     """Return the arc length nearest to a box, the direction from the box to there, and the distance in m."""
-    outline = Outlines.of([box])
+    outline = Outlines.from_obstacles([box])
     low = near_s_m - window_m
     high = near_s_m + window_m
     s = near_s_m
@@ -93,7 +93,7 @@ def _find_place_at_box(route: Route, box: Obstacle, near_s_m: float, window_m: f
     for step in (COARSE_STEP_M, FINE_STEP_M):
         places_m = np.arange(low, high, step)
         box_indices = np.zeros(len(places_m), dtype=np.intp)
-        distances_m, normals_w = outline.towards(route.position_w(places_m), box_indices)
+        distances_m, normals_w = outline.distance_and_normal(route.position_w(places_m), box_indices)
         best = int(np.argmin(distances_m))
         s = float(places_m[best])
         away_w = normals_w[best]

@@ -32,7 +32,7 @@ from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Tripl
 from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
 from snakesim_gnc.control.obstacle_triplet.telemetry import compute_bending_nm, make_contact_messages
-from snakesim_gnc.control.progress import Located, Progress
+from snakesim_gnc.control.progress import Located, PathProgress
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
@@ -72,7 +72,7 @@ class ObstacleTriplet:
         # Models and estimators.
         self._body = PlanarBody(robot)
         self._climb = Climb(robot)
-        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._progress = PathProgress(self._body, speed_filter_s=settings.speed_filter_s)
         self._contacts = MeasuredContacts()
         # Joints in position mode.
         self._hand_over = HandOver(robot)

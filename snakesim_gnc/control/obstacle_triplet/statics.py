@@ -185,7 +185,7 @@ def explain_missing_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Pl
     return "no authority: the line from the joint to o_3 is parallel to the normal there"
 
 
-def bending_torque_nm(
+def compute_bending_torque_nm(
     joints_w: ArrayLike, joints_s_m: ArrayLike, points_w: ArrayLike, points_s_m: ArrayLike, forces_w: ArrayLike
 ) -> Floats:
     """Compute the internal torque at every joint that balances the forces ahead of it; equation (12).

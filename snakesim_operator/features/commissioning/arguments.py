@@ -5,8 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.programs.arguments import add_network, number
-from snakesim_operator.base.robot_selection import selection_of
+from snakesim_hal.programs.arguments import add_network, number_type
+from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
 TASK = "scenarios, robots, labs"  # the heading of `snakesim --help` that lists it
@@ -31,7 +31,7 @@ def add_commands(commands: Any) -> None:
     _add_joint_names(gear)
     gear.add_argument(
         "--degrees",
-        type=number(10.0, 180.0, "degrees"),
+        type=number_type(10.0, 180.0, "degrees"),
         default=45.0,
         help="by which you turn each joint, along a template or a set square (default: 45)",
     )
@@ -71,7 +71,7 @@ def _add_check(verbs: Any) -> None:
     check.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
     check.add_argument(
         "--allow-backlash",
-        type=number(0.0, 0.5, "rad"),
+        type=number_type(0.0, 0.5, "rad"),
         default=ALLOWED_BACKLASH_RAD,
         metavar="RAD",
         help=f"as much may be lost in a gear when its load reverses (default: {ALLOWED_BACKLASH_RAD:g} rad)",
@@ -104,7 +104,7 @@ def _add_by_hand(
 def _zero(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import zero
 
-    return zero(arguments.file, selection_of(arguments), wait_for_enter=not arguments.now)
+    return zero(arguments.file, select_robots(arguments), wait_for_enter=not arguments.now)
 
 
 def _jog(arguments: argparse.Namespace) -> int:
@@ -113,25 +113,25 @@ def _jog(arguments: argparse.Namespace) -> int:
     request = JogRequest(
         joint=arguments.joint, speed_rad_s=arguments.speed, travel_rad=arguments.travel, torque=arguments.torque
     )
-    return jog(arguments.file, selection_of(arguments), request)
+    return jog(arguments.file, select_robots(arguments), request)
 
 
 def _direction(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import direction
 
-    return direction(arguments.file, selection_of(arguments), arguments.joints)
+    return direction(arguments.file, select_robots(arguments), arguments.joints)
 
 
 def _limits(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import limits
 
-    return limits(arguments.file, selection_of(arguments), arguments.joints)
+    return limits(arguments.file, select_robots(arguments), arguments.joints)
 
 
 def _gear(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import gear
 
-    return gear(arguments.file, selection_of(arguments), arguments.joints, arguments.degrees)
+    return gear(arguments.file, select_robots(arguments), arguments.joints, arguments.degrees)
 
 
 def _check(arguments: argparse.Namespace) -> int:

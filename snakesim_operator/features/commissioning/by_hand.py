@@ -18,7 +18,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, RefusedError
-from snakesim_hal.base.terminal import overwrite_lines, say
+from snakesim_hal.base.terminal import overwrite_lines, print_line
 from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session, open_session
@@ -95,7 +95,7 @@ class HandMovedRobot:
         while not over:
             over = is_over()  # samples that arrived before that still count
             self._refuse_if_armed()
-            states = [state for state in self._joint_states.drain() if state.is_of(len(self.joints))]
+            states = [state for state in self._joint_states.drain() if state.has_joint_count(len(self.joints))]
             if states:
                 last_arrival_s = time.monotonic()
             elif time.monotonic() - last_arrival_s > MAX_SILENCE_S:
@@ -132,7 +132,7 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
     """Write the present pose as the straight pose into a robot file. Return 0. Raises SnakesimError."""
     with _connect(path, selection, "joints zero") as robot:
         if wait_for_enter:
-            say("Lay the robot straight on a flat floor, let go of it, then press Enter.")
+            print_line("Lay the robot straight on a flat floor, let go of it, then press Enter.")
             list(robot.read_angles_rad(_line_was_typed))
         start_s = time.monotonic()
         samples = list(robot.read_angles_rad(lambda: time.monotonic() - start_s > ZERO_SAMPLING_S))
@@ -142,11 +142,11 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
             raise RefusedError(f"{error} within {ZERO_SAMPLING_S:g} s; let go of the robot, and try again") from None
     values: dict[str, dict[str, Any]] = {}
     for joint, zero_rad in zip(robot.joints, zeros_rad, strict=True):
-        say(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
+        print_line(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
         values[joint.name] = {"zero_rad": zero_rad}
         if joint.limits.cable_turns is not None:
             values[joint.name]["cable_unwound"] = datetime.now(UTC).isoformat(timespec="seconds")
-            say(f"{joint.name:<10} its cable counts as unwound here: restart the host within an hour")
+            print_line(f"{joint.name:<10} its cable counts as unwound here: restart the host within an hour")
     _write_values(path, values, "straight pose")
     return 0
 
@@ -171,9 +171,9 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
             if turn is None:
                 unknown.append(joint.name)
             elif turn.by_rad > 0:
-                say(f"  {turn.by_rad:+.2f} rad: as the file says")
+                print_line(f"  {turn.by_rad:+.2f} rad: as the file says")
             else:
-                say(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
+                print_line(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
                 values[joint.name] = {"sign": -joint.drive.sign}
     _write_values(path, values, "turned by hand")
     return _report_unknown(unknown, f"snakesim joints direction {path}")
@@ -203,13 +203,13 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
             ratio = abs(turn.by_rad) / math.radians(degrees)
             measured = f"  {math.degrees(abs(turn.by_rad)):.0f} of {degrees:g} degrees"
             if abs(ratio - 1) < MAX_RATIO_ERROR:
-                say(f"{measured}: as the file says")
+                print_line(f"{measured}: as the file says")
             else:
                 gear_ratio = joint.drive.gear * ratio
-                say(f"{measured}: gear = {gear_ratio:.3g} or so; write what its data sheet says into the file")
+                print_line(f"{measured}: gear = {gear_ratio:.3g} or so; write what its data sheet says into the file")
                 wrong.append(joint.name)
     if wrong:
-        say(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")
+        print_line(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")
     exit_code_of_unknown = _report_unknown(unknown, f"snakesim joints gear {path}")
     return 1 if wrong else exit_code_of_unknown
 
@@ -227,20 +227,20 @@ def _wait_for_turn(robot: HandMovedRobot, joint: Joint, instruction: str) -> Han
         if turn is not None:
             break
         if detector.ready and not instruction_printed:
-            say(f"{joint.name}: {instruction}; Enter skips it")
+            print_line(f"{joint.name}: {instruction}; Enter skips it")
             instruction_printed = True
     if turn is None:
-        say("  skipped")
+        print_line("  skipped")
         return None
     turned_joint = robot.joints[turn.joint]
     if turned_joint is not joint:
-        say(
+        print_line(
             f"  {turned_joint.name} reports the turn: look at the ids and the wiring of {joint.name} and "
             f"{turned_joint.name}"
         )
         return None
     if not turn.alone:
-        say("  other joints turned, too: hold them, and repeat this one")
+        print_line("  other joints turned, too: hold them, and repeat this one")
         return None
     return turn
 
@@ -249,7 +249,7 @@ def _report_unknown(names: Sequence[str], command: str) -> int:
     """Print which joints are still unknown, and the command that repeats them. Return the exit code."""
     if not names:
         return 0
-    say(f"still unknown: {', '.join(names)}; type `{command} {' '.join(names)}`")
+    print_line(f"still unknown: {', '.join(names)}; type `{command} {' '.join(names)}`")
     return 1
 
 
@@ -266,7 +266,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
     """
     with _connect(path, selection, "joints limits") as robot:
         watched = choose_joints(robot.joints, names, path)
-        say("Move each joint by hand from end to end, slowly; then press Enter.")
+        print_line("Move each joint by hand from end to end, slowly; then press Enter.")
         travel = _watch_travel(robot)
     values: dict[str, dict[str, Any]] = {}
     unknown: list[str] = []
@@ -277,12 +277,12 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
         if travel is not None:
             limits_rad = travel.limits_rad(i)
         if limits_rad is None:
-            say(f"{joint.name:<10} was not moved from end to end: left as it is")
+            print_line(f"{joint.name:<10} was not moved from end to end: left as it is")
             unknown.append(joint.name)
         else:
             lower, upper = limits_rad
             values[joint.name] = {"angle_min_rad": lower, "angle_max_rad": upper}
-            say(f"{joint.name:<10} {lower:+.3f} to {upper:+.3f} rad")
+            print_line(f"{joint.name:<10} {lower:+.3f} to {upper:+.3f} rad")
     _write_values(path, values, "end to end by hand")
     return _report_unknown(unknown, f"snakesim joints limits {path}")
 
@@ -330,7 +330,7 @@ def _line_was_typed() -> bool:
 def _write_values(path: Path, values: dict[str, dict[str, Any]], origin: str) -> None:
     """Write fields of joints into the robot file. origin: how they were found, for a comment beside each."""
     if not values:
-        say(f"{path}: nothing to change")
+        print_line(f"{path}: nothing to change")
         return
     change_joints(path, values, origin)
-    say(f"{path}: {len(values)} joints changed; restart the host with it")
+    print_line(f"{path}: {len(values)} joints changed; restart the host with it")

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import user_name
-from snakesim_hal.base.terminal import say
-from snakesim_hal.model.checked import CHECK, PROPERTIES, Checked, JointProperty, mounting_digest
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.checked import CHECK, PROPERTIES, JointProperty, StartCheckRecord, mounting_digest
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import COLUMNS, collect_measurements, read_imus, tick_numbers
@@ -65,7 +65,7 @@ def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
     rows = judge_joints(measurements, straight=request.straight, allowed_backlash_rad=request.allowed_backlash_rad)
     rows = [row.confirmed_by_hand(request.by_hand) for row in rows]
     for line in report_lines(rows):
-        say(line)
+        print_line(line)
     if robot_file is not None:
         _write_result(robot_file, record, rows, request)
     return 0 if all(row.all_confirmed for row in rows) else 1
@@ -142,10 +142,10 @@ def _write_result(path: Path, record: RunRecord, rows: Sequence[JointVerdict], r
         raise ConfigError(f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again")
     unconfirmed = [row.joint for row in rows if not row.all_confirmed]
     if unconfirmed:
-        say(f"{path}: nothing was written: {', '.join(unconfirmed)} are wrong or unknown")
+        print_line(f"{path}: nothing was written: {', '.join(unconfirmed)} are wrong or unknown")
         return
-    checked = Checked(
-        by=user_name(),
+    checked = StartCheckRecord(
+        by=get_user_name(),
         on=date.today().isoformat(),
         joints=mounting_digest(joints),
         backend=robot.backend,
@@ -157,7 +157,9 @@ def _write_result(path: Path, record: RunRecord, rows: Sequence[JointVerdict], r
         allowed_backlash_rad=request.allowed_backlash_rad,
     )
     write_checked(path, checked)
-    say(f"{path}: checked by {checked.by} on {checked.on}; restart the host with it, and it is armed as any other")
+    print_line(
+        f"{path}: checked by {checked.by} on {checked.on}; restart the host with it, and it is armed as any other"
+    )
 
 
 def _serial_numbers(robot: Description) -> list[str]:

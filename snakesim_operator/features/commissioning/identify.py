@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import say
-from snakesim_hal.model.files import find
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.files import find_file
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.features.commissioning.identification import (
@@ -49,7 +49,7 @@ def identify(run: Path, robot_file: Path | None, out: Path | None) -> int:
     Raises:
         ConfigError: the run is of another controller, or a file cannot be read or written.
     """
-    if robot_file is not None and find(str(robot_file), "robots") != robot_file:
+    if robot_file is not None and find_file(str(robot_file), "robots") != robot_file:
         raise ConfigError(
             f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay"
         )
@@ -61,11 +61,11 @@ def identify(run: Path, robot_file: Path | None, out: Path | None) -> int:
     for row in rows:
         _print_joint(row)
     if np.isnan(link_rates).all():
-        say("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
+        print_line("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
     run_folder = run if run.is_dir() else run.parent
     page_path = out or run_folder / PAGE
     write_text(page_path, render_page(record, rows))
-    say(f"page: {page_path}")
+    print_line(f"page: {page_path}")
     if robot_file is not None:
         _write_robot_file(robot_file, record, rows)
     everything_identified = all(row.complete and not row.fails for row in rows)
@@ -95,20 +95,20 @@ def _find_judged_ticks(record: RunRecord) -> slice:
 
 def _print_joint(row: JointIdentification) -> None:
     if row.explained is None:
-        say(row.joint)
+        print_line(row.joint)
     else:
-        say(f"{row.joint}   {100 * row.explained:.1f} % of its torque explained")
+        print_line(f"{row.joint}   {100 * row.explained:.1f} % of its torque explained")
     for field, estimate in row.fields.items():
         name, unit = LABELS[field]
-        say(f"  {name:<17} {_format_interval(estimate)} {unit}")
+        print_line(f"  {name:<17} {_format_interval(estimate)} {unit}")
     if row.latency_s is not None:
-        say(f"  {'latency':<17} {_format_interval(row.latency_s)} s")
+        print_line(f"  {'latency':<17} {_format_interval(row.latency_s)} s")
     if row.bandwidth_hz is not None:
-        say(f"  {'servo bandwidth':<17} {row.bandwidth_hz:.3g} Hz, of this joint with what it carries")
+        print_line(f"  {'servo bandwidth':<17} {row.bandwidth_hz:.3g} Hz, of this joint with what it carries")
     for reason in row.unknown:
-        say(f"  unknown: {reason}")
+        print_line(f"  unknown: {reason}")
     if row.explained is not None and row.explained < MIN_EXPLAINED:
-        say("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
+        print_line("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
 
 
 def _format_interval(estimate: Estimate) -> str:
@@ -128,9 +128,9 @@ def _write_robot_file(path: Path, record: RunRecord, rows: Sequence[JointIdentif
             values[row.joint] = {field: max(estimate.value, 0.0) for field, estimate in row.fields.items()}
     unchanged = [row.joint for row in rows if row.joint not in values]
     if not values:
-        say(f"{path}: nothing was written: the values of no joint are sure")
+        print_line(f"{path}: nothing was written: the values of no joint are sure")
         return
     change_joints(path, values, f"identified from {record.folder.name}")
-    say(f"{path}: {len(values)} joints changed; restart the host with it")
+    print_line(f"{path}: {len(values)} joints changed; restart the host with it")
     if unchanged:
-        say(f"{path}: left as they were: {', '.join(unchanged)}")
+        print_line(f"{path}: left as they were: {', '.join(unchanged)}")

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError, RefusedError
-from snakesim_hal.base.process import SERVICE_PRIORITY, on_stop_signal, set_realtime_priority, user_name
-from snakesim_hal.base.terminal import say
-from snakesim_hal.network.commanding import Commanding
+from snakesim_hal.base.process import SERVICE_PRIORITY, get_user_name, on_stop_signal, set_realtime_priority
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.network.commanding import CommandingClient
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -28,12 +28,12 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     Mode,
     Status,
-    request_to_arm,
+    make_arm_request,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.features.commissioning.by_hand import choose_joints, running_joints
-from snakesim_operator.robot_commands.command import ask_meanwhile
+from snakesim_operator.robot_commands.command import request_while_driving
 from snakesim_operator.robot_commands.teleop.keyboard import Keyboard
 
 KEY_HOLD_S = 0.15  # a key repeats 20 to 30 times a second
@@ -138,7 +138,7 @@ class _JogSession:
         self._link = link
         self._robot = robot
         self._statuses = session.latched_reader(keys.STATUS, Status)
-        self._commanding = Commanding(session, robot, status.clock_mode)
+        self._commanding = CommandingClient(session, robot, status.clock_mode)
         # Request.
         self._request = request
         self._joint = joint
@@ -153,9 +153,9 @@ class _JogSession:
         signal.signal(signal.SIGHUP, lambda *_: self._request_stop())
         self._cycle_until(self._is_ready_to_arm)
         arm_session_before = self._cycle().arm_session
-        requester = f"{user_name()[:40]}, joints jog"
+        requester = f"{get_user_name()[:40]}, joints jog"
         # Unchecked is allowed, because jogging is how a user finds out how the joints are mounted.
-        self._send_request(request_to_arm(self._robot, requester, unchecked=True), "armed")
+        self._send_request(make_arm_request(self._robot, requester, unchecked=True), "armed")
         try:
             self._cycle_until(lambda: self._cycle().arm_session > arm_session_before)
             self._follow_keys(keyboard)
@@ -169,7 +169,7 @@ class _JogSession:
         joint = self._robot.joints[self._joint]
         target = JogTarget(self._request, joint, self._read_angle_rad())
         self._jog_target = target
-        say(
+        print_line(
             f"{joint.name}: from {target.lower_rad:+.3f} to {target.upper_rad:+.3f} rad, at {target.target_rad:+.3f}. "
             f"{HELP}"
         )
@@ -184,7 +184,7 @@ class _JogSession:
                 self._read_status()
                 raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.why}")
             if moved and not target.moves:
-                say(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
+                print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
             moved = target.moves
 
     def _cycle(self) -> Clock:
@@ -234,7 +234,7 @@ class _JogSession:
 
     def _send_request(self, request: LifecycleRequest, outcome: str) -> None:
         """Send a lifecycle request, and run cycles until it is answered. outcome: such as `armed`."""
-        ask_meanwhile(self._session, request, outcome, self._link, self._cycle)
+        request_while_driving(self._session, request, outcome, self._link, self._cycle)
 
     def _request_stop(self) -> None:
         self._stop_requested = True

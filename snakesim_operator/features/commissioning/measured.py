@@ -71,7 +71,7 @@ def read_imus(record: RunRecord) -> Iterable[Imu]:
     """Yield every IMU message of a run. Raises ConfigError."""
     path = record.folder if record.alone else record.folder / RECORDING
     decoder = Decoder(Imu)
-    for message in RecordingReader(path).messages([keys.IMU]):
+    for message in RecordingReader(path).read_messages([keys.IMU]):
         yield decoder.decode(message.payload, message.encoding)
 
 

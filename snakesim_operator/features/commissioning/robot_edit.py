@@ -10,11 +10,11 @@ import msgspec
 import tomlkit
 from tomlkit.items import Table
 
-from snakesim_hal.base.atomic_write import write_through, write_whole
+from snakesim_hal.base.atomic_write import write_atomically, write_through
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import user_name
-from snakesim_hal.model.checked import Checked
-from snakesim_hal.model.files import decode, find, read_part
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.model.checked import StartCheckRecord
+from snakesim_hal.model.files import decode, find_file, read_part
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_text
@@ -22,7 +22,7 @@ from snakesim_hal.model.textfiles import read_text
 
 def must_be_own(path: Path) -> None:
     """Raise ConfigError for a robot file that is shipped."""
-    if find(str(path), "robots") != path:
+    if find_file(str(path), "robots") != path:
         raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
 
 
@@ -51,7 +51,7 @@ def change_joints(path: Path, values: dict[str, dict[str, Any]], origin: str) ->
     """
     document = tomlkit.parse(read_text(path))
     joints = _get_section(document, "joints", super_table=True)
-    comment = f"{origin}, {user_name()}, {date.today().isoformat()}"
+    comment = f"{origin}, {get_user_name()}, {date.today().isoformat()}"
     for name, fields in values.items():
         section = _get_section(joints, name, super_table=False)
         for field, value in fields.items():
@@ -62,7 +62,7 @@ def change_joints(path: Path, values: dict[str, dict[str, Any]], origin: str) ->
     _replace_file(path, document)
 
 
-def write_checked(path: Path, checked: Checked) -> None:
+def write_checked(path: Path, checked: StartCheckRecord) -> None:
     """Write the section `[checked]` of a robot file. Raises ConfigError; then nothing changed."""
     document = tomlkit.parse(read_text(path))
     section = tomlkit.table()
@@ -80,7 +80,7 @@ def _replace_file(path: Path, document: tomlkit.TOMLDocument) -> None:
     # The candidate is in the same folder, because `extends` may name a file relative to it.
     candidate = path.with_name(f".{path.name}")
     try:
-        write_whole(candidate, content)
+        write_atomically(candidate, content)
         decode(read_part(str(candidate), "robots"), RobotFile)
         write_through(path, content, durable=True)
     except OSError as error:

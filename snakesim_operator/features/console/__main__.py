@@ -2,8 +2,8 @@
 
 import sys
 
-from snakesim_hal.base.terminal import exit_code
+from snakesim_hal.base.terminal import run_tool
 from snakesim_operator.features.console.command import main
 
 if __name__ == "__main__":
-    sys.exit(exit_code("snakesim console", main))
+    sys.exit(run_tool("snakesim console", main))

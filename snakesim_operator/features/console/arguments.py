@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.programs.arguments import add_network, number
+from snakesim_hal.programs.arguments import add_network, number_type
 
 TASK = "watch"  # heading under which `snakesim --help` lists the command
 
@@ -18,10 +18,10 @@ def add_commands(commands: Any) -> None:
     )
     console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
     console.add_argument(
-        "--at", type=number(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds into the recording"
+        "--at", type=number_type(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds into the recording"
     )
     console.add_argument(
-        "--port", type=number(0, 65535), help="port on the loopback interface (default: 8080, or any free one)"
+        "--port", type=number_type(0, 65535), help="port on the loopback interface (default: 8080, or any free one)"
     )
     console.add_argument(
         "--commission",
@@ -35,11 +35,11 @@ def add_commands(commands: Any) -> None:
 
 def _run_console(arguments: argparse.Namespace) -> int:
     """Show a running robot, or the recorded run that the arguments name."""
-    from snakesim_operator.base.robot_selection import selection_of
+    from snakesim_operator.base.robot_selection import select_robots
     from snakesim_operator.features.console.command import console, show_record
 
     if arguments.run is not None:
         if arguments.commission is not None:
             raise ConfigError("--commission is for a running robot; leave RUN out")
         return show_record(arguments.run, arguments.at, arguments.port)
-    return console(selection_of(arguments), arguments.port, arguments.commission)
+    return console(select_robots(arguments), arguments.port, arguments.commission)

@@ -10,7 +10,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import on_stop_signal, raise_open_files
 from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import read
+from snakesim_hal.model.scenario import read_config
 from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import Link
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
@@ -39,7 +39,7 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
     """
     _prepare_process()
     if commission is not None:
-        extras.check("commission", "commissioning")
+        extras.require("commission", "commissioning")
         robot_text = read_part(str(commission), "robots")
         decode(robot_text, RobotFile)  # an invalid file is an error now, rather than when a page writes it
     from snakesim_operator.features.console.display_loop import show_live
@@ -81,11 +81,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = process_options(parser.parse_args(argv))
     _prepare_process()
     from snakesim_operator.features.console.display_loop import show_live
-    from snakesim_operator.features.console.robot_data.snapshot import expected_snapshot
+    from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
     from snakesim_operator.features.console.scene.drawing import Surroundings
 
     listening = socket.socket(fileno=options.arguments.listening)
-    expected = expected_snapshot(options.config)
+    expected = make_expected_snapshot(options.config)
     show_live(options.link, Surroundings(options.config), listening, _stop_on_signal(), expected)
     return 0
 
@@ -95,7 +95,7 @@ def _prepare_process() -> None:
 
     Modules that need the extra can be imported only after this.
     """
-    extras.check("console", "the console")
+    extras.require("console", "the console")
     raise_open_files(MAX_OPEN_FILES)
 
 
@@ -107,7 +107,7 @@ def _find_surroundings(link: Link):
         is_same_robot = (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace)
         if is_same_robot and robot.config is not None:
             try:
-                return Surroundings(read(Path(robot.config)))
+                return Surroundings(read_config(Path(robot.config)))
             except (ConfigError, OSError):
                 return None
     return None

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page.page import Page
@@ -20,7 +20,7 @@ from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.features.console.robot_data.signals import LiveSignals
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import Surroundings
-from snakesim_operator.features.console.web.server import SECOND_STOP, page_server
+from snakesim_operator.features.console.web.server import SECOND_STOP, serve_pages
 
 FRAMES_PER_S = 30.0
 
@@ -51,29 +51,29 @@ def show_live(
 
     def report(line: str) -> None:
         log.write(line)
-        say(line)
+        print_line(line)
 
     signals = LiveSignals()
     signals_page = SignalsPage(signals, SECOND_STOP)
     signals_page.now_s = signals.now_s
 
-    with page_server(listening, report, operations.stop, signals_page.answer) as (server, address):
+    with serve_pages(listening, report, operations.stop, signals_page.answer) as (server, address):
         page = Page(server, surroundings, operations, log, commission=commission)
-        say(f"console: {address}")
-        page.show(expected)
+        print_line(f"console: {address}")
+        page.show_snapshot(expected)
         link_with_images = replace(link, max_bytes=MAX_IMAGE_BYTES)
-        with open_session(link_with_images, START_LIMIT_S) as session:
+        with open_session(link_with_images, SERVICE_START_LIMIT_S) as session:
             operations.connect(session)
             robot = LiveRobot(session)
             changes = StateChangeLog(log.write)
             for _ in wait_for_frames(stop):
-                snapshot = robot.snapshot() or expected
+                snapshot = robot.take_snapshot() or expected
                 if snapshot is not None:
                     changes.note(snapshot.status)
                     changes.note(snapshot.control)
                     changes.note(snapshot.settings)
                     signals.add_snapshot(snapshot)
-                page.show(snapshot)
+                page.show_snapshot(snapshot)
 
 
 def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: threading.Event) -> int:
@@ -104,19 +104,19 @@ def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: 
         log.write(f"of {run.history.image_decimation} camera images one is kept")
     code = exit_code(folder, run.record.lacks)
     signals_page = SignalsPage(RecordedSignals(run))
-    with page_server(listening, say, answer_first=signals_page.answer) as (server, address):
+    with serve_pages(listening, print_line, answer_first=signals_page.answer) as (server, address):
         page = Page(server, Surroundings(run.record.config), None, log, recorded=folder.name)
         player = Player(server, run.span_s, start_s)
         signals_page.now_s = lambda: player.since_begin_s
         signals_page.jump_to = player.jump_to
-        say(f"console: {address}")
+        print_line(f"console: {address}")
         shown_s = None
         for _ in wait_for_frames(stop):
             time_s, has_jumped = player.advance()
             if has_jumped or shown_s is None:
-                page.start_over(run.before(time_s))
+                page.start_over(run.iterate_snapshots_before(time_s))
             if time_s != shown_s:
-                page.show(run.at(time_s))
+                page.show_snapshot(run.snapshot_at(time_s))
                 shown_s = time_s
     return code
 

@@ -138,7 +138,7 @@ class Operations:
         """
         if self._session is None:
             raise NotConnectedError("not connected to the robot yet")
-        answer = self._session.ask(key, request, ANSWER_S)
+        answer = self._session.request(key, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)
         print_(answer.reason)

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.programs.arguments import number
+from snakesim_hal.programs.arguments import number_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,7 +34,9 @@ def _add_evaluate(commands: Any) -> None:
     command.add_argument(
         "--controllers", "--controller", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
     )
-    command.add_argument("--fields", type=number(1, 100_000), metavar="N", help="fields for each row and controller")
+    command.add_argument(
+        "--fields", type=number_type(1, 100_000), metavar="N", help="fields for each row and controller"
+    )
     command.add_argument("--rows", metavar="1,2,...", help="only these rows of the table, by number")
     command.add_argument(
         "--against",
@@ -55,7 +57,9 @@ def _add_sweep(commands: Any) -> None:
     command.add_argument(
         "--vary", action="append", required=True, metavar="KEY=LOW:HIGH:COUNT", help="or KEY=[A, B]; may be repeated"
     )
-    command.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each value (1)")
+    command.add_argument(
+        "--seeds", type=number_type(1, 100_000), default=1, metavar="N", help="runs for each value (1)"
+    )
     _add_set(command)
     _add_shared(command)
     command.set_defaults(act=_sweep)
@@ -69,11 +73,11 @@ def _add_optimize(commands: Any) -> None:
     command.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
     command.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
     command.add_argument(
-        "--trials", type=number(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
+        "--trials", type=number_type(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
     )
     command.add_argument(
         "--seeds",
-        type=number(1, 100_000),
+        type=number_type(1, 100_000),
         default=1,
         metavar="N",
         help="runs for each trial, or fields for each row (1)",
@@ -105,7 +109,7 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
         "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
     )
     parser.add_argument(
-        "--workers", type=number(1, 100_000), metavar="N", help="processes on this computer (one a core)"
+        "--workers", type=number_type(1, 100_000), metavar="N", help="processes on this computer (one a core)"
     )
 
 
@@ -122,9 +126,9 @@ def _guarded_if_one_run(arguments: argparse.Namespace, act: "Callable[[argparse.
     _check_extra()
     if arguments.only is None:
         return act(arguments, None)
-    from snakesim_operator.run.guarded_process import guarded
+    from snakesim_operator.run.guarded_process import run_guarded
 
-    return guarded(lambda pulse: act(arguments, pulse), owns_process=arguments.owns_process)
+    return run_guarded(lambda pulse: act(arguments, pulse), owns_process=arguments.owns_process)
 
 
 def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
@@ -186,13 +190,13 @@ def _shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[st
 def _optimize(arguments: argparse.Namespace) -> int:
     _check_extra()
     from snakesim_hal.base.process import stop_signals_raise
-    from snakesim_hal.base.terminal import say
+    from snakesim_hal.base.terminal import print_line
     from snakesim_operator.features.evaluate.optimize import SearchRequest, optimize
     from snakesim_operator.run.conclusion import INTERRUPTED
-    from snakesim_operator.run.folder import named_after
+    from snakesim_operator.run.folder import default_folder
 
     values = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)}
-    storage = arguments.storage or named_after("optimize").with_suffix(".db")
+    storage = arguments.storage or default_folder("optimize").with_suffix(".db")
     values["storage"] = storage
     values["rows"] = _parse_numbers(arguments.rows or "", "--rows")
     values["seed"] = 1 if arguments.seed is None else arguments.seed
@@ -201,8 +205,8 @@ def _optimize(arguments: argparse.Namespace) -> int:
             return optimize(SearchRequest(**values))
         except KeyboardInterrupt:  # no trial that is done is lost
             if storage.is_file():
-                say(f"stopped: {storage} keeps the trials that are done; the same command goes on with")
-                say(f"  --storage {shlex.quote(str(storage))}")
+                print_line(f"stopped: {storage} keeps the trials that are done; the same command goes on with")
+                print_line(f"  --storage {shlex.quote(str(storage))}")
             return INTERRUPTED
 
 
@@ -236,4 +240,4 @@ def _check_extra() -> None:
     """Raise an error that names the extra `evaluate` if it is not installed."""
     from snakesim_operator.base import extras
 
-    extras.check("evaluate", "this command")
+    extras.require("evaluate", "this command")

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.base.process import stop_signals_raise
 from snakesim_hal.base.step_limit import Pulse
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.base.dask_cluster import check_address
@@ -25,7 +25,7 @@ from snakesim_operator.features.evaluate.progress import Progress
 from snakesim_operator.features.evaluate.suite import Suite, make_cases, select_rows
 from snakesim_operator.features.evaluate.table import best_controller, group_results, table_lines, worst_failures
 from snakesim_operator.run.conclusion import INTERRUPTED
-from snakesim_operator.run.folder import named_after
+from snakesim_operator.run.folder import default_folder
 from snakesim_operator.run.in_process import run_in_process
 
 FIRST_DRAWN_FIELD = 1_000_000  # fields that a suite draws are beyond any that parameters were tuned on
@@ -72,7 +72,7 @@ def evaluate(request: EvaluationRequest, pulse: Pulse | None = None) -> int:
         try:
             return _run_all_cases(request)
         except KeyboardInterrupt:
-            say("stopped before any case was begun")
+            print_line("stopped before any case was begun")
             return INTERRUPTED
 
 
@@ -85,21 +85,21 @@ def _run_all_cases(request: EvaluationRequest) -> int:
     seed = choose_first_field(request)
     cases = make_cases(request.suite, request.source, request.controllers, request.fields, seed)
     cases = select_rows(cases, request.rows, request.source)
-    out = request.out or named_after(request.name)
+    out = request.out or default_folder(request.name)
     with store.open_store(out, resume=request.resume) as results:
         todo = list({case.id: case for case in cases if case.id not in results.done}.values())
         todo.sort(key=lambda case: case.field)  # if it is stopped, every row has results of the same fields
         if request.resume:
-            say(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
+            print_line(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
         try:
             if todo:
                 _run_on_workers(request, todo, results, out)
             _report(request, cases, results.done, out, other_cards)
         except KeyboardInterrupt:
             done = sum(case.id in results.done for case in cases)
-            say(f"stopped: {done} of {len(cases)} cases are done; the same command goes on with")
+            print_line(f"stopped: {done} of {len(cases)} cases are done; the same command goes on with")
             seed_option = f" --seed {seed}" if request.suite.fresh else ""
-            say(f"  --resume --out {shlex.quote(str(out))}{seed_option}")
+            print_line(f"  --resume --out {shlex.quote(str(out))}{seed_option}")
             return INTERRUPTED
         has_errors = any(results.done[case.id].error is not None for case in cases)
         return 1 if has_errors else 0
@@ -118,14 +118,14 @@ def choose_first_field(request: EvaluationRequest) -> int:
     if request.resume:
         raise ConfigError("--resume: this suite draws its fields; name with --seed those that were printed as drawn")
     seed = secrets.randbelow(LAST_DRAWN_FIELD - FIRST_DRAWN_FIELD) + FIRST_DRAWN_FIELD
-    say(f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again")
+    print_line(f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again")
     return seed
 
 
 def _run_one_case(request: EvaluationRequest, only: str, pulse: Pulse | None) -> int:
     """Run one case in this process, with the whole folder of a run. Return the exit code of `snakesim run`."""
     case = find_case(request.suite, request.source, only)
-    say(f"{case.setting}, {case.controller}, field {case.field}")
+    print_line(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
     return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, pulse=pulse)
 
@@ -134,7 +134,7 @@ def find_case(suite: Suite, source: str, only: str) -> Case:
     """Return the case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
     parts = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
     if parts is None:
-        raise ConfigError(f"--only {short(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1")
+        raise ConfigError(f"--only {shorten(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1")
     cases = make_cases(suite, source, [parts["controller"]], 1, int(parts["field"]))
     matching = [case for case in cases if parts["row"] is None or case.row == int(parts["row"])]
     if len(matching) == 1:
@@ -152,8 +152,8 @@ def _run_on_workers(request: EvaluationRequest, todo: Sequence[Case], results: s
     """Run cases on workers, and store each as it is done."""
     with workers(request.cluster, request.workers) as pool, Progress(len(todo)) as progress:
         where = request.cluster or "on this computer"
-        say(f"{len(todo)} cases on {pool.size()} workers, {where}")
-        say(f"results: {out}; if this ends early, --resume --out {out} goes on")
+        print_line(f"{len(todo)} cases on {pool.size()} workers, {where}")
+        print_line(f"results: {out}; if this ends early, --resume --out {out} goes on")
         for case, outcome in pool.solve(todo):
             results.append(case, outcome)
             progress.count(outcome)
@@ -165,9 +165,9 @@ def _report(
     """Print the table and the worst failures, and write tables, score card and page."""
     rows = group_results(cases, done)
     for line in table_lines(rows):
-        say(line)
+        print_line(line)
     if any(row.runs == 1 and row.crossed is None for row in rows):
-        say("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
+        print_line("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
     _print_errors(cases, done)
     best = best_controller(rows)
     failures = _find_failures(request, [case for case in cases if case.controller == best], done)
@@ -176,11 +176,11 @@ def _report(
     card = make_card(request.name, cases, done)
     if request.suite.fresh or other_cards:
         for line in card_lines(card, compare(card, other_cards)):
-            say(line)
+            print_line(line)
     write_text(out / CARD, msgspec.json.format(msgspec.json.encode(card), indent=1).decode())
     write_text(out / PAGE, render_page(request.suite.title or request.name, request.source, rows, failures))
     for path in (*paths, out / CARD, out / PAGE):
-        say(f"written: {path}")
+        print_line(f"written: {path}")
 
 
 def _print_errors(cases: Sequence[Case], done: store.Results) -> None:
@@ -188,7 +188,7 @@ def _print_errors(cases: Sequence[Case], done: store.Results) -> None:
     broken = [case for case in cases if done[case.id].error is not None]
     if broken:
         first = broken[0]
-        say(f"{len(broken)} could not run, the first: {name_case(first)}: {done[first.id].error}")
+        print_line(f"{len(broken)} could not run, the first: {name_case(first)}: {done[first.id].error}")
 
 
 def _find_failures(
@@ -204,9 +204,9 @@ def _find_failures(
 
 def _print_failures(controller: str, failures: Sequence[tuple[str, str, str]]) -> None:
     if len(failures) > 1:
-        say(f"the worst {len(failures)} of {controller}:")
+        print_line(f"the worst {len(failures)} of {controller}:")
     elif failures:
-        say(f"the worst of {controller}:")
+        print_line(f"the worst of {controller}:")
     for name, reason, command in failures:
-        say(f"  {name}: {reason}")
-        say(f"    {command}")
+        print_line(f"  {name}: {reason}")
+        print_line(f"    {command}")

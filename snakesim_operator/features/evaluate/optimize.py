@@ -14,9 +14,9 @@ from optuna.distributions import BaseDistribution, FloatDistribution, IntDistrib
 from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
-from snakesim_hal.base.errors import ConfigError, short
-from snakesim_hal.base.terminal import say
-from snakesim_hal.model.scenario import compose, parse_set
+from snakesim_hal.base.errors import ConfigError, shorten
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.scenario import compose_table, parse_set
 from snakesim_operator.base.dask_cluster import check_address
 from snakesim_operator.features.evaluate.case import GAVE_UP, Case, CaseOutcome, code_digest
 from snakesim_operator.features.evaluate.cluster import Workers, workers
@@ -38,7 +38,7 @@ from snakesim_operator.features.evaluate.suite import (
     select_rows,
 )
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.progress import in_minutes
+from snakesim_operator.run.progress import format_duration
 
 Span = FloatDistribution | IntDistribution
 
@@ -83,7 +83,7 @@ def optimize(request: SearchRequest) -> int:
     study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
     completed = len(study.get_trials(states=(TrialState.COMPLETE,)))
     already = f"holds {completed} trials already" if completed else "keeps all trials"
-    say(f"{request.storage} {already}; --storage {shlex.quote(str(request.storage))} goes on with them")
+    print_line(f"{request.storage} {already}; --storage {shlex.quote(str(request.storage))} goes on with them")
     if request.trials > completed:
         _search(request, study, space, request.trials - completed)
     return _report_best(request, study)
@@ -106,7 +106,9 @@ def _search(request: SearchRequest, study: Study, space: Mapping[str, Span], tri
             done = trials - left
             passed_s = time.monotonic() - start_s
             left_s = passed_s / done * left
-            say(f"{done} of {trials} trials, {in_minutes(passed_s)} passed, about {in_minutes(left_s)} left")
+            print_line(
+                f"{done} of {trials} trials, {format_duration(passed_s)} passed, about {format_duration(left_s)} left"
+            )
 
 
 def _search_command(request: SearchRequest, space: Mapping[str, Span], cases_at_ends: Sequence[Case]) -> SearchCommand:
@@ -146,37 +148,39 @@ def _store_result(request: SearchRequest, study: Study, trial: Trial, outcomes: 
     if len(known) < len(numbers):
         reason = next((outcome.error for outcome in outcomes if outcome.error), "unknown")
         study.tell(trial, state=TrialState.FAIL)
-        say(f"{label}: no {request.goal}: {reason}")
+        print_line(f"{label}: no {request.goal}: {reason}")
         return
     trial.set_user_attr(RESULTS, known)
     trial.set_user_attr(STUCK, bool(outcomes[0].numbers.get(GAVE_UP)))
     study.tell(trial, float(np.mean(known)))
-    say(f"{label}: {np.mean(known):.4g}")
+    print_line(f"{label}: {np.mean(known):.4g}")
 
 
 def _report_best(request: SearchRequest, study: Study) -> int:
     """Print the best trial, and the command that repeats it. Return the exit code."""
     if not study.get_trials(states=(TrialState.COMPLETE,)):
-        say(f"no trial had a {request.goal}")
+        print_line(f"no trial had a {request.goal}")
         return 1
     best = study.best_trial
-    say(f"best {request.goal}: {best.value:.4g}, trial {best.user_attrs[NUMBER]}")
+    print_line(f"best {request.goal}: {best.value:.4g}, trial {best.user_attrs[NUMBER]}")
     if request.rows:
         rows = ",".join(map(str, request.rows))
         words = ["snakesim", "evaluate", request.scenario, "--rows", rows]
-        say(f"  {_command_line(words, request.set, best.params)}")
+        print_line(f"  {_command_line(words, request.set, best.params)}")
         return 0
     results = best.user_attrs[RESULTS]
     if len(results) > 1:
-        say(f"  the mean of {len(results)} runs; the first of them, {results[0]:.4g}, again:")
+        print_line(f"  the mean of {len(results)} runs; the first of them, {results[0]:.4g}, again:")
     if best.user_attrs[STUCK]:
-        say("  the search ended this run when it was stuck; this command runs it to its end, so its number may differ:")
-    table = compose(request.scenario, list(map(parse_set, request.set)))
+        print_line(
+            "  the search ended this run when it was stuck; this command runs it to its end, so its number may differ:"
+        )
+    table = compose_table(request.scenario, list(map(parse_set, request.set)))
     values = {**best.params, **dict.fromkeys(seed_keys(table), request.seed)}
     words = ["snakesim", "run", request.scenario, "--clock-mode", "lockstep"]
     if table.values.get("mission", {}).get("goal"):
         words.append("--until-goal")  # without a goal it would be refused
-    say(f"  {_command_line(words, request.set, values)}")
+    print_line(f"  {_command_line(words, request.set, values)}")
     return 0
 
 
@@ -214,4 +218,4 @@ def _parse_span(text: str) -> tuple[str, Span]:
             return key, IntDistribution(int(low), int(high))
         return key, FloatDistribution(float(low), float(high))
     except ValueError:
-        raise ConfigError(f"--vary {short(text)}: give key=low:high, such as control.propulsion_n=5:40") from None
+        raise ConfigError(f"--vary {shorten(text)}: give key=low:high, such as control.propulsion_n=5:40") from None

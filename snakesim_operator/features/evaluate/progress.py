@@ -3,7 +3,7 @@
 import time
 
 from snakesim_operator.features.evaluate.case import CaseOutcome
-from snakesim_operator.run.progress import OneLine, in_minutes
+from snakesim_operator.run.progress import OneLine, format_duration
 
 PLAIN_PERIOD_S = 10.0  # between two lines where the output is no terminal
 
@@ -33,7 +33,7 @@ class Progress(OneLine):
         now_s = time.monotonic()
         if self.terminal or now_s >= self._next_line_s or self._done == self._total:
             self._next_line_s = now_s + PLAIN_PERIOD_S
-            self.put(self._text(now_s))
+            self.show_text(self._text(now_s))
 
     def _text(self, now_s: float) -> str:
         passed_s = now_s - self._start_s
@@ -43,5 +43,5 @@ class Progress(OneLine):
             parts.append(f"{self._crossed} crossed")
         if self._errors:
             parts.append(f"{self._errors} could not run")
-        parts.append(f"{in_minutes(passed_s)} passed, about {in_minutes(left_s)} left")
+        parts.append(f"{format_duration(passed_s)} passed, about {format_duration(left_s)} left")
         return "  ".join(parts)

@@ -37,10 +37,10 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.drawn import Draw
-from snakesim_hal.model.files import FileStruct, Table, decode, find, read_table
-from snakesim_hal.model.scenario import Override, RunConfig, check, compose, written
+from snakesim_hal.model.files import FileStruct, Table, decode, find_file, read_table
+from snakesim_hal.model.scenario import Override, RunConfig, check, compose_table, encode_config
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.programs.preflight import check_plugins
 from snakesim_operator.features.evaluate.case import Case, case_id
@@ -87,7 +87,7 @@ class SuiteSetting:
 
 def read_suite(name: str) -> tuple[Suite, str]:
     """Return a shipped suite or a suite file, and its path. Raises ConfigError."""
-    path = find(name, "suites")
+    path = find_file(name, "suites")
     return decode(read_table(path), Suite), str(path)
 
 
@@ -180,7 +180,7 @@ def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: in
                         setting=setting.name,
                         controller=config.commander,
                         field=field,
-                        config=written(config),
+                        config=encode_config(config),
                         give_up_s=suite.give_up_s,
                         limit_s=suite.limit_s,
                         value=setting.value,
@@ -194,20 +194,20 @@ def _compose_setting(suite: Suite, setting: SuiteSetting, controller: str | None
     overrides = [Override("clock_mode", "lockstep", "--clock-mode lockstep")]
     if controller:
         overrides.append(Override("controller", controller, f"--controllers {controller}"))
-    return compose(suite.scenario, [*overrides, *setting.overrides])
+    return compose_table(suite.scenario, [*overrides, *setting.overrides])
 
 
 def parse_vary(text: str) -> tuple[str, list[Any] | str]:
     """Return key and values of `--vary key=low:high:count` or `key=[a, b, c]`. Raises ConfigError."""
     key, equals, given = (part.strip() for part in text.partition("="))
     if not (key and equals and given):
-        raise ConfigError(f"--vary {short(text)}: give key=low:high:count, such as control.look_ahead_m=0.05:0.2:4")
+        raise ConfigError(f"--vary {shorten(text)}: give key=low:high:count, such as control.look_ahead_m=0.05:0.2:4")
     if not given.startswith("["):
         return key, given
     try:
         return key, parse_toml(f"value = {given}", "--vary")["value"]
     except ConfigError:
-        raise ConfigError(f"--vary {short(text)}: {short(given)} is no list; write it as in TOML, [1, 2]") from None
+        raise ConfigError(f"--vary {shorten(text)}: {shorten(given)} is no list; write it as in TOML, [1, 2]") from None
 
 
 def _check_config(config: RunConfig, table: Table, where: str) -> None:
@@ -232,7 +232,7 @@ def _configure_field(table: Table, field: int, draws: Sequence[Draw]) -> RunConf
     for key in seed_keys(table):
         table.put(key, field, "--seed")
     for draw in draws:
-        for override in draw.on_field(field):
+        for override in draw.overrides_for_scene(field):
             table.put(override.key, override.value, override.flag)
     return decode(table, RunConfig)
 
@@ -279,7 +279,8 @@ def space_evenly(given: str, where: str) -> list[float]:
             raise ValueError
     except ValueError:
         raise ConfigError(
-            f"{where} = {short(given)!r}: give low:high:count with a count of 2 to 1000, such as 0.05:0.2:4, or a list"
+            f"{where} = {shorten(given)!r}: give low:high:count with a count of 2 to 1000, such as "
+            "0.05:0.2:4, or a list"
         ) from None
     return [round(low + (high - low) * i / (count - 1), 12) for i in range(int(count))]
 
@@ -297,7 +298,7 @@ def _short_names(keys: list[str]) -> dict[str, str]:
 def _short_text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:g}"
-    return short(str(value), 40)
+    return shorten(str(value), 40)
 
 
 def _is_number(value: object) -> bool:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.programs.arguments import number
+from snakesim_hal.programs.arguments import number_type
 from snakesim_operator.playback.arguments import add_span
 
 TASK = "results"  # under which `snakesim --help` lists it
@@ -26,7 +26,7 @@ def add_commands(commands: Any) -> None:
     plot.add_argument(
         "--out", type=Path, metavar="PATH", help="FILE.pdf, .svg or .png; with --paper a folder (default: in RUN)"
     )
-    plot.add_argument("--width", type=number(1.0, 40.0, "inches"), default=3.5, help="in inches (3.5: one column)")
+    plot.add_argument("--width", type=number_type(1.0, 40.0, "inches"), default=3.5, help="in inches (3.5: one column)")
     plot.add_argument("--dark", action="store_true", help="on black, for slides")
     add_span(plot)
     plot.set_defaults(act=_plot)
@@ -35,7 +35,7 @@ def add_commands(commands: Any) -> None:
 def _plot(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
-    extras.check("plot", "`snakesim plot`")
+    extras.require("plot", "`snakesim plot`")
     from snakesim_operator.features.figures.inherited import import_matplotlib
 
     import_matplotlib()

@@ -11,12 +11,12 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean, short
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.textfiles import exported
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.features.figures.lines import STYLE, Floats, over_time
-from snakesim_operator.features.figures.paper import figures
+from snakesim_operator.features.figures.lines import STYLE, Floats, plot_over_time
+from snakesim_operator.features.figures.paper import draw_paper_figures
 from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
 from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.record import RunRecord
@@ -75,7 +75,7 @@ def plot(
 def _write_paper_figures(record: RunRecord, folder: Path, width_in: float, span_s: tuple[float, float]) -> None:
     if folder.suffix in FORMATS:
         raise ConfigError(f"--out {folder}: the paper's figures are several files; give a folder")
-    for name, figure in figures(record, width_in, span_s).items():
+    for name, figure in draw_paper_figures(record, width_in, span_s).items():
         write_figure(figure, folder / f"{name}.pdf")
 
 
@@ -106,7 +106,7 @@ def write_figure(figure: Figure, path: Path) -> None:
     figure.savefig(content, format=path.suffix[1:])
     with exported(path) as partial:
         partial.write_bytes(content.getvalue())
-    say(f"written: {path}")
+    print_line(f"written: {path}")
 
 
 def _plot_signals(axes: Axes, record: RunRecord, names: Sequence[str]) -> None:
@@ -128,7 +128,7 @@ def _plot_signals(axes: Axes, record: RunRecord, names: Sequence[str]) -> None:
             if column.startswith("target"):
                 values = _keep_targets_of_unit(record, column, values, unit)
             label = column if name == column else column.partition(".")[2]
-            over_time(axes, record, values, label)
+            plot_over_time(axes, record, values, label)
     title = names[0] if len(names) == 1 else ""
     axes.set_ylabel(title if unit == "1" else f"{title} [{unit}]".strip())
     _add_legend(axes)
@@ -140,7 +140,7 @@ def _check_known(name: str, known: Mapping[str, Any], record: RunRecord) -> None
         return
     wide = ", ".join(array for array in arrays(record) if array != "time_s")
     raise ConfigError(
-        f"no signal {short(name)!r}; {did_you_mean(name, list(known))}there are {wide}, and columns of them "
+        f"no signal {shorten(name)!r}; {suggest_word(name, list(known))}there are {wide}, and columns of them "
         f"such as angle_rad.{record.description.joints[0].name}"
     )
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.figures.lines import Floats, over_time
+from snakesim_operator.features.figures.lines import Floats, plot_over_time
 from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_intervals
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
@@ -44,7 +44,7 @@ DrawSignal = Callable[[Axes, RunRecord, int], None]
 """Draws a signal of the joint with this index into the axes."""
 
 
-def figures(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> dict[str, Figure]:
+def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> dict[str, Figure]:
     """Draw the figures of a run.
 
     Args:
@@ -136,7 +136,7 @@ def _draw_all_torques(record: RunRecord, width_in: float, span_s: tuple[float, f
     axes = figure.subplots()
     max_torque_nm = float(np.nanmax(np.abs(record.torque_nm))) or 1.0
     for joint, torque_nm in enumerate(record.torque_nm.T):
-        over_time(axes, record, joint + 0.45 * torque_nm / max_torque_nm, color=MEASURED)
+        plot_over_time(axes, record, joint + 0.45 * torque_nm / max_torque_nm, color=MEASURED)
         axes.axhline(joint, color=OBSTACLE, linewidth=0.5, zorder=0)
     axes.set_yticks(range(len(names)), names)
     axes.set_xlim(*span_s)
@@ -177,14 +177,14 @@ def _draw_joints(
 
 
 def _plot_angle(axes: Axes, record: RunRecord, joint: int) -> None:
-    over_time(axes, record, record.angle_rad[:, joint], "measured", color=MEASURED)
-    over_time(axes, record, reference_rad(record, joint), "reference", color=REFERENCE, linestyle="--")
+    plot_over_time(axes, record, record.angle_rad[:, joint], "measured", color=MEASURED)
+    plot_over_time(axes, record, reference_rad(record, joint), "reference", color=REFERENCE, linestyle="--")
     axes.set_ylabel("angle [rad]")
 
 
 def _plot_torque(axes: Axes, record: RunRecord, joint: int) -> None:
-    over_time(axes, record, record.torque_nm[:, joint], "measured", color=MEASURED)
-    over_time(axes, record, commanded_torque_nm(record, joint), "commanded", color=REFERENCE, linestyle="--")
+    plot_over_time(axes, record, record.torque_nm[:, joint], "measured", color=MEASURED)
+    plot_over_time(axes, record, commanded_torque_nm(record, joint), "commanded", color=REFERENCE, linestyle="--")
     axes.set_ylabel("torque [N·m]")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_IMAGE_BYTES, MAX_PAYLOAD_BYTES
-from snakesim_hal.wire.roles import Permission, Role, permissions
+from snakesim_hal.wire.roles import Permission, Role, list_permissions
 from snakesim_operator.features.lab.identities import Identity, identities
 from snakesim_operator.features.lab.lab_file import ALL, Lab
 
@@ -80,7 +80,7 @@ def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
     for robot in identity.robots(lab):
         faults = lab.file.robots[robot].faults
         within = ANY if identity.of == ALL else f"{robot}/{ANY}"
-        for flow, message, key in permissions(identity.role, identity.services, faults=faults):
+        for flow, message, key in list_permissions(identity.role, identity.services, faults=faults):
             yield Permission(flow, message, f"{robot}/{key}")
             if key != ANY and message in SEARCHED:  # what is asked with a wildcard reaches who is asked
                 yield Permission(flow, message, f"{within if flow == 'ingress' else ANY}/{key}")

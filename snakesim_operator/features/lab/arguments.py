@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.base.process import stop_signals_raise
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 
 if TYPE_CHECKING:
     from snakesim_operator.features.lab.lab_file import Lab
@@ -51,7 +51,7 @@ def _example(_arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.lab.lab_file import EXAMPLE
 
     for line in read_text(EXAMPLE).splitlines():
-        say(line)
+        print_line(line)
     return 0
 
 
@@ -60,7 +60,7 @@ def _render(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.lab.render import render
 
     for path in render(lab, arguments.out):
-        say(str(path))
+        print_line(str(path))
     return 0
 
 
@@ -73,8 +73,8 @@ def _certs(arguments: argparse.Namespace) -> int:
     done = write_certificates(lab, arguments.out, authority, rotate=arguments.rotate)
     width = max(len(identity.common_name) for identity in identities(lab))
     for identity, state, until in done:
-        say(f"{identity.common_name:<{width}}  {state:<7}  ends {until:%Y-%m-%d %H:%M} UTC")
-    say(f"{authority}: keep this folder where nobody else reads it; it goes to no machine")
+        print_line(f"{identity.common_name:<{width}}  {state:<7}  ends {until:%Y-%m-%d %H:%M} UTC")
+    print_line(f"{authority}: keep this folder where nobody else reads it; it goes to no machine")
     return 0
 
 
@@ -93,5 +93,5 @@ def _lab(arguments: argparse.Namespace) -> "Lab":
     from snakesim_operator.base import extras
     from snakesim_operator.features.lab.lab_file import load_lab
 
-    extras.check("lab", "`snakesim deploy`")
+    extras.require("lab", "`snakesim deploy`")
     return load_lab(arguments.lab)

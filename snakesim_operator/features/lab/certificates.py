@@ -21,7 +21,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_bytes
-from snakesim_hal.network.private_keys import readable_by_all
+from snakesim_hal.network.private_keys import check_permissions
 from snakesim_operator.features.lab.identities import Identity, identities
 from snakesim_operator.features.lab.lab_file import Lab
 
@@ -92,7 +92,7 @@ def _make_private(folder: Path) -> None:
 
 def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
     """Read the authority and check that certificate and key belong together. Raises ConfigError."""
-    warning = readable_by_all(at_key)
+    warning = check_permissions(at_key)
     if warning:
         raise ConfigError(f"{warning}; as this is the lab's authority, anybody may have joined: better make a new one")
     try:

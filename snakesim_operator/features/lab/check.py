@@ -18,11 +18,11 @@ from typing import Any
 from cryptography import x509
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.terminal import Say, say
+from snakesim_hal.base.terminal import PrintLine, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
-from snakesim_hal.network.private_keys import readable_by_all
+from snakesim_hal.network.private_keys import check_permissions
 from snakesim_hal.network.probe import open_probe
-from snakesim_hal.network.process_entries import HOST, differences
+from snakesim_hal.network.process_entries import HOST, find_differences
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
@@ -32,7 +32,7 @@ from snakesim_operator.features.lab.certificates import RENEW_AT, read_certifica
 from snakesim_operator.features.lab.drive_buses import SIMULATOR, is_to_be_real
 from snakesim_operator.features.lab.identities import Identity, identities
 from snakesim_operator.features.lab.lab_file import Lab
-from snakesim_operator.features.lab.lab_robot import Robot
+from snakesim_operator.features.lab.lab_robot import LabRobot
 from snakesim_operator.features.lab.zenoh_files import session_settings, tls_files
 
 CONNECT_MS = 2000
@@ -51,7 +51,7 @@ WRITERS = {  # the process that publishes at a key all the time
 class Findings:
     """Prints the results of the checks, and counts the wrong ones."""
 
-    say: Say
+    say: PrintLine
     wrong: int = 0
 
     def passed(self, text: str) -> None:
@@ -64,7 +64,7 @@ class Findings:
         self.say(f"! {text}")
 
 
-def check(lab: Lab, folder: Path, say: Say = say) -> int:
+def check(lab: Lab, folder: Path, say: PrintLine = print_line) -> int:
     """Check certificates, routers, robots and roles of a lab.
 
     Args:
@@ -107,7 +107,7 @@ def _check_certificate(identity: Identity, folder: Path, found: Findings) -> Non
         found.failed(f"{identity.common_name}: {error}")
         return
     _check_expiry(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
-    warning = readable_by_all(path.with_suffix(".key"))
+    warning = check_permissions(path.with_suffix(".key"))
     if warning:
         found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim deploy certs --rotate`")
 
@@ -223,7 +223,7 @@ def _observe_robot(watcher: Identity, robot: str, lab: Lab, folder: Path) -> _Ro
         with open_probe(json.dumps(settings)) as probe:
             clock_offsets_s = probe.clock_offsets_s(list(WRITERS), LISTEN_S)
         processes = reader.drain()
-    live_services = frozenset(keys.service_of(key).rpartition("-")[0] for key in live_keys)
+    live_services = frozenset(keys.parse_service(key).rpartition("-")[0] for key in live_keys)
     return _RobotState(status, description, live_services, processes, clock_offsets_s)
 
 
@@ -238,7 +238,7 @@ def _expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[
     return expected
 
 
-def check_what_moves(robot: Robot, description: Description | None, found: Findings) -> None:
+def check_what_moves(robot: LabRobot, description: Description | None, found: Findings) -> None:
     """Check that a robot is emulated if, and only if, the lab file names no bus for it.
 
     Args:
@@ -263,7 +263,7 @@ def _check_process(process: Process, host: Process | None, clock_offsets_s: dict
     if host is not None:
         if process.version != host.version:
             found.failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
-        for difference in differences(process, host):
+        for difference in find_differences(process, host):
             found.failed(f"{process.name}: {difference}")
     for key, writer in WRITERS.items():
         if writer != process.name or key not in clock_offsets_s:
@@ -304,7 +304,7 @@ def _open_session(identity: Identity, robot: str, lab: Lab, folder: Path) -> Ite
     with TemporaryDirectory() as scratch:
         path = Path(scratch) / "session.json5"
         path.write_text(json.dumps(_probe_settings(identity, lab, folder)), encoding="utf-8")
-        link = Link.of_file(read_session(path), robot)
+        link = Link.from_session_file(read_session(path), robot)
         with open_session(link, CONNECT_MS / 1000) as session:
             yield session
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.base.errors import ConfigError, did_you_mean
-from snakesim_operator.features.lab.lab_robot import Robot
+from snakesim_hal.base.errors import ConfigError, suggest_word
+from snakesim_operator.features.lab.lab_robot import LabRobot
 
 KERNEL_INTERFACE = re.compile(r"v?can[0-9]{1,3}")  # any other bus on CAN is INTERFACE:CHANNEL of python-can
 EMULATED_BUSES = ("vcan", "udp_multicast:", "virtual:", "/dev/pts/")  # no real drive can be there
@@ -49,7 +49,7 @@ class CanInterface:
         return self.name.startswith("v")
 
 
-def buses_by_drive_type(robot: Robot) -> Mapping[str, Sequence[str]]:
+def buses_by_drive_type(robot: LabRobot) -> Mapping[str, Sequence[str]]:
     """Returns the buses of each drive type; of a simulator, of emulated drives and of a backend not ours none."""
     if robot.backend == SIMULATOR or robot.emulated:
         return {}
@@ -61,7 +61,7 @@ def buses_by_drive_type(robot: Robot) -> Mapping[str, Sequence[str]]:
     return {robot.backend: robot.can if drive_type.kind == "can" else robot.serial}
 
 
-def host_settings(robot: Robot) -> list[str]:
+def host_settings(robot: LabRobot) -> list[str]:
     """Returns the `--set` values that give the host its buses and their bit rates."""
     settings: list[str] = []
     for name, buses in buses_by_drive_type(robot).items():
@@ -75,18 +75,18 @@ def host_settings(robot: Robot) -> list[str]:
     return settings
 
 
-def uses_bus(robot: Robot) -> bool:
+def uses_bus(robot: LabRobot) -> bool:
     """Whether its drives are on a bus, so that time passes by itself."""
     return robot.backend != SIMULATOR and not robot.emulated
 
 
-def is_to_be_real(robot: Robot) -> bool:
+def is_to_be_real(robot: LabRobot) -> bool:
     """Whether its lab file asks for a robot that really moves; unknown of a backend that is not ours, so no."""
     buses = [bus for own in buses_by_drive_type(robot).values() for bus in own]
     return any(not bus.startswith(EMULATED_BUSES) for bus in buses)
 
 
-def can_interfaces(robot: Robot) -> list[CanInterface]:
+def can_interfaces(robot: LabRobot) -> list[CanInterface]:
     """Returns the interfaces that the robot's machine brings up."""
     if not uses_bus(robot):
         return []
@@ -100,7 +100,7 @@ def can_interfaces(robot: Robot) -> list[CanInterface]:
     ]
 
 
-def devices(robot: Robot) -> list[str]:
+def devices(robot: LabRobot) -> list[str]:
     """Returns the device files that the robot's host opens."""
     if not uses_bus(robot):
         return []
@@ -108,7 +108,7 @@ def devices(robot: Robot) -> list[str]:
     return list(dict.fromkeys([*robot.serial, *behind_adapters, *robot.devices]))
 
 
-def check_buses(robots: Mapping[str, Robot], source: str) -> None:
+def check_buses(robots: Mapping[str, LabRobot], source: str) -> None:
     """Raises ConfigError for a robot that would be driven without its buses, and for a bus that two robots have."""
     used_by: dict[tuple[str, str], str] = {}
     for name, robot in robots.items():
@@ -134,7 +134,7 @@ def check_buses(robots: Mapping[str, Robot], source: str) -> None:
                 )
 
 
-def _check_one_type(robot: Robot, where: str) -> None:
+def _check_one_type(robot: LabRobot, where: str) -> None:
     match DRIVE_TYPES[robot.backend].kind:
         case "can":
             kind, buses, example = "can", robot.can, 'can = ["can0"]'
@@ -154,7 +154,7 @@ def _check_one_type(robot: Robot, where: str) -> None:
         )
 
 
-def _check_mixed(robot: Robot, where: str) -> None:
+def _check_mixed(robot: LabRobot, where: str) -> None:
     """Every bus has one drive type, and every drive type has a bus of its kind."""
     if not robot.buses:
         raise ConfigError(
@@ -165,7 +165,7 @@ def _check_mixed(robot: Robot, where: str) -> None:
     for name, buses in robot.buses.items():
         if name not in DRIVE_TYPES:
             raise ConfigError(
-                f"{where}.buses.{name}`: no such drive type; {did_you_mean(name, list(DRIVE_TYPES))}there are "
+                f"{where}.buses.{name}`: no such drive type; {suggest_word(name, list(DRIVE_TYPES))}there are "
                 f"{', '.join(DRIVE_TYPES)}"
             )
         kind = DRIVE_TYPES[name].kind
@@ -182,7 +182,7 @@ def _check_mixed(robot: Robot, where: str) -> None:
         raise ConfigError(f"{where}.buses` does not say which drive type is on {', '.join(unused)}")
 
 
-def _check_other_backend(robot: Robot, where: str) -> None:
+def _check_other_backend(robot: LabRobot, where: str) -> None:
     """How a backend that is not ours is given its buses is not known here."""
     has_section = any(setting.startswith((f"backends.{robot.backend}.", "backend.")) for setting in robot.set)
     own_scenario = "/" in robot.scenario
@@ -194,7 +194,7 @@ def _check_other_backend(robot: Robot, where: str) -> None:
         )
 
 
-def _check_settings(robot: Robot, where: str) -> None:
+def _check_settings(robot: LabRobot, where: str) -> None:
     """Buses and bit rates stand in one place, because the units are made from them, too."""
     for setting in robot.set:
         key = setting.partition("=")[0]

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.files import FileStruct, Table, decode, read_table
 from snakesim_hal.wire.quantities import from_zero
 from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.drive_buses import check_buses
-from snakesim_operator.features.lab.lab_robot import Name, Robot
+from snakesim_operator.features.lab.lab_robot import LabRobot, Name
 
 EXAMPLE = Path(__file__).parent / "example.toml"
 ALL = "all"
@@ -59,7 +59,7 @@ class LabFile(FileStruct, frozen=True, kw_only=True):
     authority_days: Annotated[float, from_zero(7300, "days")] = 1825
     machines: dict[Name, Machine]
     routers: dict[Name, Router]
-    robots: dict[Name, Robot]
+    robots: dict[Name, LabRobot]
     roles: list[Grant] = []
 
 
@@ -129,5 +129,5 @@ def _check_roles(file: LabFile, table: Table) -> None:
 def _known(table: Table, field: str, name: str, among: Sequence[str] | dict[str, Machine]) -> None:
     if name not in among:
         raise ConfigError(
-            f"{table.origin_of(field)}: `{field}` = {short(name)!r} is not in this file; it has {', '.join(among)}"
+            f"{table.origin_of(field)}: `{field}` = {shorten(name)!r} is not in this file; it has {', '.join(among)}"
         )

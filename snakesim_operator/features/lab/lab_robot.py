@@ -18,7 +18,7 @@ BitRate = Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit"
 DataBitRate = Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})]
 
 
-class Robot(FileStruct, frozen=True, kw_only=True):
+class LabRobot(FileStruct, frozen=True, kw_only=True):
     """A robot. Its name in the file is its namespace on the network."""
 
     machine: Name

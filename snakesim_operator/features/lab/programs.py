@@ -7,7 +7,7 @@ from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.drive_buses import can_interfaces, devices, host_settings, uses_bus
 from snakesim_operator.features.lab.identities import Identity, identities
 from snakesim_operator.features.lab.lab_file import Lab
-from snakesim_operator.features.lab.lab_robot import Robot
+from snakesim_operator.features.lab.lab_robot import LabRobot
 
 STATE = "/var/lib/snakesim"
 
@@ -69,7 +69,7 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
                 yield Program(identity, f"recorder of {name}", arguments, of_robot=name)
 
 
-def _scenario(robot: Robot) -> tuple[str, ...]:
+def _scenario(robot: LabRobot) -> tuple[str, ...]:
     """Return the options for the scenario. Host and services get the same, because they compare them."""
     words = [robot.scenario, "--backend", robot.backend]
     if uses_bus(robot):

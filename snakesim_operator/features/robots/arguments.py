@@ -34,9 +34,9 @@ def add_commands(commands: Any) -> None:
 
 def _import(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.robots.command import import_robot
-    from snakesim_operator.features.robots.imported import Order
+    from snakesim_operator.features.robots.imported import ImportOptions
 
-    order = Order(arguments.tail, arguments.up, arguments.scale, arguments.like)
+    order = ImportOptions(arguments.tail, arguments.up, arguments.scale, arguments.like)
     return import_robot(arguments.file, order, arguments.out, as_json=arguments.json)
 
 

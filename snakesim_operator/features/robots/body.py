@@ -12,8 +12,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.links import capsule_inertia
-from snakesim_operator.features.robots.imported import UPS, Imported, Order
-from snakesim_operator.features.robots.urdf_tree import Body, Joint, Row
+from snakesim_operator.features.robots.imported import UPS, Imported, ImportOptions
+from snakesim_operator.features.robots.urdf_tree import Body, Row, UrdfJoint
 from snakesim_operator.features.robots.xml_tree import Element
 
 LENGTH_DIGITS = 9  # lengths are rounded to a nanometer, which removes the noise of adding transforms
@@ -29,7 +29,7 @@ MIN_MASS_KG = 0.001
 MOMENT_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
 
 
-def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Floats]:
+def put_body(found: Imported, row: Row, order: ImportOptions, urdf: Element) -> list[Floats]:
     """Put chain, module and links into the values of a robot file.
 
     Args:
@@ -80,17 +80,17 @@ def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Flo
     return frames
 
 
-def _find_body_axes(row: Row, order: Order, urdf: Element) -> Floats:
+def _find_body_axes(row: Row, order: ImportOptions, urdf: Element) -> Floats:
     """Return body_from_root, (3, 3): x from tail to head, z up. Raises ConfigError."""
     along = row.joints[-1].origin - row.joints[0].origin
     if np.linalg.norm(along) < 1e-9:
-        raise urdf.wrong("has its first and last joint at the same place, so that the chain has no direction")
+        raise urdf.error("has its first and last joint at the same place, so that the chain has no direction")
     x = along / np.linalg.norm(along)
     up = np.array(UPS[order.up], dtype=np.float64)
     z = up - (up @ x) * x
     if np.linalg.norm(z) < 0.1:
         others = [name for name in UPS if abs(np.array(UPS[name]) @ x) < 0.9 and "-" not in name]
-        raise urdf.wrong(f"lies along its {order.up} axis: say which one points up: --up {' or --up '.join(others)}")
+        raise urdf.error(f"lies along its {order.up} axis: say which one points up: --up {' or --up '.join(others)}")
     z /= np.linalg.norm(z)
     return np.vstack([x, np.cross(z, x), z])
 
@@ -100,7 +100,7 @@ def _check_gap(row: Row, joints_x: Floats, gap_m: float, urdf: Element) -> None:
     if gap_m <= MAX_GAP_M:
         return
     widest = row.joints[1 + int(np.argmax(np.diff(joints_x)))]
-    raise urdf.wrong(
+    raise urdf.error(
         f"has joints {gap_m:g} m apart, and a link has {MAX_GAP_M} m at most; in mm? Give --scale 0.001. The "
         f"widest gap is before joint {widest.place()}"
     )
@@ -130,7 +130,7 @@ def _link_from_root(body_from_root: Floats, start_b: Floats) -> Floats:
     return frame
 
 
-def _read_axis(found: Imported, joint: Joint, axis_b: Floats) -> str:
+def _read_axis(found: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
     """Return "yaw" or "pitch". A small tilt is removed and reported. Raises ConfigError for an oblique axis."""
     for name, component, letter in (("yaw", 2, "z"), ("pitch", 1, "y")):
         cosine = abs(float(axis_b[component]))
@@ -142,13 +142,13 @@ def _read_axis(found: Imported, joint: Joint, axis_b: Floats) -> str:
                 f"<axis xyz>, tilted by {math.degrees(tilt_rad):.4f}°, became {letter}", joint.place("axis")
             )
         return name
-    raise joint.element.wrong(
+    raise joint.element.error(
         f"turns about ({axis_b[0]:.2f}, {axis_b[1]:.2f}, {axis_b[2]:.2f}), with x from tail to head and z up; a "
         f"snake's joints turn about z or y, within 1°. Does another axis point up (--up)?"
     )
 
 
-def _check_on_line(found: Imported, joint: Joint, axis: str, offset_m: Floats, gap_m: float) -> None:
+def _check_on_line(found: Imported, joint: UrdfJoint, axis: str, offset_m: Floats, gap_m: float) -> None:
     """Report where a joint is moved onto the line of the others. Raises ConfigError when it is far beside it.
 
     Args:
@@ -167,7 +167,7 @@ def _check_on_line(found: Imported, joint: Joint, axis: str, offset_m: Floats, g
     across_m = abs(float(across))
     along_axis_m = abs(float(along_axis))
     if across_m > MAX_OFFSET_RATIO * gap_m:
-        raise joint.element.wrong(
+        raise joint.element.error(
             f"is {across_m * 1e3:.1f} mm beside the line through the first and the last joint; a robot file has all "
             f"joints on a line, at zero angles"
         )

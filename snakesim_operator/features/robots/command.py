@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import printable, say, say_json
+from snakesim_hal.base.terminal import escape_invisible, print_json, print_line
 from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.features.robots.exporting import urdf_of, values_beside_urdf
-from snakesim_operator.features.robots.imported import Order
-from snakesim_operator.features.robots.importing import robot_of
-from snakesim_operator.features.robots.toml_text import toml_of
+from snakesim_operator.features.robots.exporting import export_urdf, values_beside_urdf
+from snakesim_operator.features.robots.imported import ImportOptions
+from snakesim_operator.features.robots.importing import import_urdf
+from snakesim_operator.features.robots.toml_text import format_toml
 from snakesim_operator.features.robots.unused_parts import LOOKS_HEADING
 
 HEADS = {
@@ -22,7 +22,7 @@ HEADS = {
 }
 
 
-def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = False) -> int:
+def import_robot(file: Path, order: ImportOptions, out: Path | None, *, as_json: bool = False) -> int:
     """Write a robot file from a URDF, and print what differs.
 
     Args:
@@ -37,7 +37,7 @@ def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = 
     Raises:
         ConfigError: The URDF cannot be imported, or the robot file exists already.
     """
-    found = robot_of(file, order)
+    found = import_urdf(file, order)
     path = out or Path(f"{found.robot.name}.toml")
     _check_new(path, ".toml", file)
     notes = [f"From {file.name}, by `snakesim robot import`."]
@@ -45,22 +45,22 @@ def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = 
         if lines:
             notes += ["", f"{HEADS[key]}:"]
             notes += [f"  {line}" for line in lines]
-    write_text(path, toml_of(found.table.values, [printable(note) for note in notes]))
+    write_text(path, format_toml(found.table.values, [escape_invisible(note) for note in notes]))
     if as_json:
-        say_json({"file": str(path), **found.report})
+        print_json({"file": str(path), **found.report})
         return 0
     shown = _count_shown(notes)
     for note in notes[1:shown]:
-        say(note)
+        print_line(note)
     if shown < len(notes):
-        say(f"  (what these say is at the top of {path})")
+        print_line(f"  (what these say is at the top of {path})")
     robot = found.robot
-    say("")
-    say(
+    print_line("")
+    print_line(
         f"{path}: {robot.chain.modules} joints ({', '.join(robot.chain.axes)}), {_whole_length_m(robot):.3f} m, "
         f"{sum(robot.link_masses_kg):.3f} kg"
     )
-    say(f"try it: snakesim run SCENARIO --set robot={path if path.is_absolute() else f'./{path}'}")
+    print_line(f"try it: snakesim run SCENARIO --set robot={path if path.is_absolute() else f'./{path}'}")
     return 0
 
 
@@ -91,10 +91,10 @@ def export_robot(name: str, out: Path | None) -> int:
     robot = decode(read_part(name, "robots"), RobotFile)
     path = out or Path(f"{robot.name}.urdf")
     _check_new(path, ".urdf", None)
-    write_text(path, urdf_of(robot))
-    say(f"{path}: {robot.chain.modules + 1} links, link_0 (tail, the root) to link_{robot.chain.modules} (head)")
+    write_text(path, export_urdf(robot))
+    print_line(f"{path}: {robot.chain.modules + 1} links, link_0 (tail, the root) to link_{robot.chain.modules} (head)")
     sections = dict.fromkeys(key.partition(".")[0] for key in values_beside_urdf(robot))
-    say(f"in <snakesim> elements, which other readers skip: {', '.join(sections)}")
+    print_line(f"in <snakesim> elements, which other readers skip: {', '.join(sections)}")
     return 0
 
 

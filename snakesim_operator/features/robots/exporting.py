@@ -22,7 +22,7 @@ COLOR = "0.87 0.45 0.12 1"
 LOOK = f'<material name="orange"><color rgba="{COLOR}"/></material>'
 
 
-def urdf_of(robot: RobotFile) -> str:
+def export_urdf(robot: RobotFile) -> str:
     """Return the text of the URDF of a robot."""
     lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(robot.name)}>"]
     lines.append(f"  {LOOK}")

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass, field
 
-from snakesim_hal.base.errors import short
+from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.xml_tree import Element
@@ -12,7 +12,7 @@ UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (
 
 
 @dataclass(frozen=True)
-class Order:
+class ImportOptions:
     """How to read a URDF."""
 
     tail: str | None = None  # a link at the tail; none: the root link
@@ -36,11 +36,11 @@ class Notes:
         """Return every sentence with its places, in the order in which they were added."""
         lines: list[str] = []
         for sentence, places in self._places.items():
-            lines.append(f"{sentence}: {joined(places)}" if places else sentence)
+            lines.append(f"{sentence}: {join_places(places)}" if places else sentence)
         return lines
 
 
-def joined(places: list[str]) -> str:
+def join_places(places: list[str]) -> str:
     """Return places as text; if all are lines, they share one word, as in `lines 5, 12`."""
     if len(places) > 1 and all(place.startswith("line ") for place in places):
         return f"lines {', '.join(place.removeprefix('line ') for place in places)}"
@@ -110,7 +110,7 @@ class Imported:
         allowed = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:40] or default
         if allowed != name:
             self.changes.add(
-                f"<{element.tag} name> {short(name)!r} became {allowed!r}: letters, digits, _ and -, 40 at most",
+                f"<{element.tag} name> {shorten(name)!r} became {allowed!r}: letters, digits, _ and -, 40 at most",
                 element.place,
             )
         return allowed

@@ -15,17 +15,17 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, short
-from snakesim_hal.model.files import Table, leaves, read_part, shipped
+from snakesim_hal.base.errors import ConfigError, shorten
+from snakesim_hal.model.files import Table, leaves, list_shipped, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_operator.features.robots.body import put_body
 from snakesim_operator.features.robots.exporting import GEOMETRY, LOOK
-from snakesim_operator.features.robots.imported import Imported, Order
+from snakesim_operator.features.robots.imported import Imported, ImportOptions
 from snakesim_operator.features.robots.joint_limits import put_limits
 from snakesim_operator.features.robots.unused_parts import report_unused
 from snakesim_operator.features.robots.urdf_sensors import gazebo_lines, put_sensors
-from snakesim_operator.features.robots.urdf_tree import row_of
+from snakesim_operator.features.robots.urdf_tree import read_row
 from snakesim_operator.features.robots.xml_tree import Element, parse_xml
 
 SECTIONS = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
@@ -33,7 +33,7 @@ OF_ANOTHER_ROBOT = ("links", "joints", "checked")  # of `--like`: they say nothi
 FROM_URDF = ("name", "about", "chain", "module")
 
 
-def robot_of(file: Path, order: Order) -> Imported:
+def import_urdf(file: Path, order: ImportOptions) -> Imported:
     """Read a URDF as the values of a robot file.
 
     Args:
@@ -50,11 +50,11 @@ def robot_of(file: Path, order: Order) -> Imported:
         raise ConfigError(f"--scale {order.scale:g}: give meters per unit of length of the file, such as 0.001 for mm")
     urdf = parse_xml(read_bytes(file), str(file))
     if urdf.tag != "robot":
-        raise urdf.wrong("is no URDF; its outermost element is <robot>")
+        raise urdf.error("is no URDF; its outermost element is <robot>")
     urdf.read = True
     own = urdf.first("snakesim") is not None
     found = Imported(_exported_values(urdf) if own else _values_of_other(urdf, order))
-    row = row_of(found, urdf, file, tail=order.tail)
+    row = read_row(found, urdf, file, tail=order.tail)
     frames = put_body(found, row, order, urdf)
     _put_name(found, urdf, file)
     put_limits(found, row.joints, str(file), own=own)
@@ -90,14 +90,14 @@ def _put_name(found: Imported, urdf: Element, file: Path) -> None:
 def _report_shipped_name(found: Imported) -> None:
     """Report a name that a shipped robot has too."""
     name = found.table.values["name"]
-    if name in shipped("robots"):
+    if name in list_shipped("robots"):
         found.omissions.add(
             f"a name of its own: it is {name}, as a shipped robot is; change it, because the network and a latched "
             f"stop tell robots apart by it"
         )
 
 
-def _values_of_other(urdf: Element, order: Order) -> Table:
+def _values_of_other(urdf: Element, order: ImportOptions) -> Table:
     """Return the values of the robot file `--like`, without those that describe that robot only."""
     table = read_part(order.like, "robots")
     for section in OF_ANOTHER_ROBOT:
@@ -115,18 +115,18 @@ def _exported_values(urdf: Element) -> Table:
     for element in urdf.all("snakesim"):
         key = element.get("key")
         if key.partition(".")[0] in GEOMETRY:
-            raise element.wrong(f"has `key` = {short(key)!r}, which links and joints say; remove this element")
+            raise element.error(f"has `key` = {shorten(key)!r}, which links and joints say; remove this element")
         if key in seen:
-            raise element.wrong(f"has `key` = {short(key)!r}, as another one has; remove one of them")
+            raise element.error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
         seen.add(key)
         try:
             table.put(key, json.loads(element.get("value")), urdf.source)
         except ValueError as error:
-            raise element.wrong(f"has a `value` that is not JSON: {short(str(error))}") from None
+            raise element.error(f"has a `value` that is not JSON: {shorten(str(error))}") from None
     return table
 
 
-def _report_values_of_other(found: Imported, order: Order) -> None:
+def _report_values_of_other(found: Imported, order: ImportOptions) -> None:
     """Report every value that was taken from the robot given by `--like`."""
     for section, values in found.table.values.items():
         if section in FROM_URDF:
@@ -148,7 +148,7 @@ def _mark_exported(urdf: Element, robot: RobotFile) -> None:
     text = "".join(["<robot>", LOOK, *gazebo_lines(robot), "</robot>"])
     exported = parse_xml(text.encode(), urdf.source)
     for child in urdf.children:
-        if any(child.says_the_same_as(other) for other in exported.children):
+        if any(child.equals(other) for other in exported.children):
             child.read_all()
     exported_material = exported.children[0]
     for link in urdf.children:

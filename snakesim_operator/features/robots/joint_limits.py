@@ -13,7 +13,7 @@ from snakesim_hal.model.joints import MAX_TURN_RAD
 from snakesim_hal.model.joints import Joint as BuiltJoint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.imported import Imported
-from snakesim_operator.features.robots.urdf_tree import Joint
+from snakesim_operator.features.robots.urdf_tree import UrdfJoint
 from snakesim_operator.features.robots.xml_tree import Element
 
 MAX_LIMIT_RAD = 6.2832  # one revolution; a larger number must be in degrees
@@ -54,7 +54,7 @@ class AngleRange:
     upper_rad: float
 
 
-def put_limits(found: Imported, joints: list[Joint], source: str, *, own: bool) -> None:
+def put_limits(found: Imported, joints: list[UrdfJoint], source: str, *, own: bool) -> None:
     """Put limits and friction into the values of a robot file.
 
     Args:
@@ -78,7 +78,7 @@ def put_limits(found: Imported, joints: list[Joint], source: str, *, own: bool) 
     _put_exceptions(found, joints, ranges, columns, source)
 
 
-def _read_range(found: Imported, joint: Joint, negated: bool) -> AngleRange:
+def _read_range(found: Imported, joint: UrdfJoint, negated: bool) -> AngleRange:
     """Return the range of a joint, at most half a revolution to either side. Raises ConfigError.
 
     negated: whether the robot file's angle is minus the URDF's.
@@ -93,11 +93,11 @@ def _read_range(found: Imported, joint: Joint, negated: bool) -> AngleRange:
         return AngleRange(-MAX_TURN_RAD, MAX_TURN_RAD)
     limit = element.first("limit")
     if limit is None:
-        raise element.wrong("is revolute and has no <limit>; add lower and upper, in rad")
+        raise element.error("is revolute and has no <limit>; add lower and upper, in rad")
     lower = _read_limit_rad(found, joint, limit, "lower")
     upper = _read_limit_rad(found, joint, limit, "upper")
     if not lower < 0 < upper:
-        raise limit.wrong(
+        raise limit.error(
             f"of joint {joint.name!r} is {lower:g} to {upper:g} rad; a joint must be able to turn to either side of "
             f"zero: `lower` below 0, `upper` above 0"
         )
@@ -106,12 +106,12 @@ def _read_range(found: Imported, joint: Joint, negated: bool) -> AngleRange:
     return AngleRange(lower, upper)
 
 
-def _read_limit_rad(found: Imported, joint: Joint, limit: Element, attribute: str) -> float:
+def _read_limit_rad(found: Imported, joint: UrdfJoint, limit: Element, attribute: str) -> float:
     """Return one side of the range, cut to half a revolution. The cut is reported. Raises ConfigError."""
     given = limit.number(attribute, "0")
     if abs(given) > MAX_LIMIT_RAD:
         radians = math.radians(given)
-        raise limit.wrong(
+        raise limit.error(
             f"of joint {joint.name!r} has `{attribute}` = {given:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at most. "
             f"URDF has radians: if this is in degrees, write {radians:.5g}. A joint without end stops has "
             f'type="continuous"'
@@ -128,7 +128,7 @@ def _read_limit_rad(found: Imported, joint: Joint, limit: Element, attribute: st
 
 
 def _complete_column(
-    found: Imported, number: JointNumber, joints: Sequence[Joint], built: Sequence[BuiltJoint], *, own: bool
+    found: Imported, number: JointNumber, joints: Sequence[UrdfJoint], built: Sequence[BuiltJoint], *, own: bool
 ) -> list[float]:
     """Return a number of every joint, tail to head. Where the file gives none, a value is assumed and reported.
 
@@ -174,16 +174,16 @@ def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, o
     return kept, "as of the robot given by --like, because no joint says one"
 
 
-def _motorless_error(number: JointNumber, joint: Joint, other: float) -> Exception:
+def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exception:
     limit = joint.element.first("limit") or joint.element
-    return limit.wrong(
+    return limit.error(
         f"of joint {joint.name!r} has `{number.attribute}` = 0 {number.unit}, and other joints have up to {other:g}: a "
         f"joint without a motor. A robot file has a motor in every joint; give a value above 0 and at most "
         f'{number.maximum:g} {number.unit}, or make the joint type="fixed"'
     )
 
 
-def _read_number(found: Imported, number: JointNumber, joint: Joint) -> float | None:
+def _read_number(found: Imported, number: JointNumber, joint: UrdfJoint) -> float | None:
     """Return a number of a joint, or None if the file gives none. Raises ConfigError for one out of its range."""
     element = joint.element.first(number.tag)
     if element is None or number.attribute not in element.attributes:
@@ -191,7 +191,7 @@ def _read_number(found: Imported, number: JointNumber, joint: Joint) -> float | 
     value = element.number(number.attribute)
     if not 0 <= value <= number.maximum:
         bound = "above 0" if number.is_limit else "0 or more"
-        raise element.wrong(
+        raise element.error(
             f"of joint {joint.name!r} has `{number.attribute}` = {value:g} {number.unit}; expected {bound} and at most "
             f"{number.maximum:g} {number.unit}. Is it in {number.other_unit}, or does it stand for no limit?"
         )
@@ -218,7 +218,7 @@ def _put_common_range(found: Imported, ranges: list[AngleRange], source: str) ->
 
 
 def _put_exceptions(
-    found: Imported, joints: list[Joint], ranges: list[AngleRange], columns: dict[str, list[float]], source: str
+    found: Imported, joints: list[UrdfJoint], ranges: list[AngleRange], columns: dict[str, list[float]], source: str
 ) -> None:
     """Put what differs in one joint from the sections for all joints.
 

@@ -33,7 +33,7 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
         return None
 
 
-def vertices(path: Path) -> Floats:
+def read_vertices(path: Path) -> Floats:
     """Return the corners of all faces, (n, 3), in the file's unit of length.
 
     Raises:

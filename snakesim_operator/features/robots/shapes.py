@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_operator.features.robots.imported import Notes
-from snakesim_operator.features.robots.meshes import find_mesh, vertices
+from snakesim_operator.features.robots.meshes import find_mesh, read_vertices
 from snakesim_operator.features.robots.xml_tree import Element
 
 RIM_POINTS = 32  # of a cylinder
@@ -42,13 +42,13 @@ def read_shape(element: Element) -> Shape:
         case "mesh":
             scale = element.numbers("scale", 3, "1 1 1")
             if not all(1e-12 < abs(factor) < 1e12 for factor in scale):
-                raise element.wrong(f"has `scale` = {element.get('scale')!r}; expected factors that are not 0")
+                raise element.error(f"has `scale` = {element.get('scale')!r}; expected factors that are not 0")
             return Shape("mesh", scale, element.get("filename"))
         case _:
-            raise element.wrong("is no shape of URDF: box, cylinder, sphere or mesh")
+            raise element.error("is no shape of URDF: box, cylinder, sphere or mesh")
 
 
-def outline(shape: Shape, element: Element, file: Path, omissions: Notes) -> Floats | None:
+def sample_outline(shape: Shape, element: Element, file: Path, omissions: Notes) -> Floats | None:
     """Return points whose convex hull encloses a shape.
 
     Args:
@@ -76,7 +76,7 @@ def outline(shape: Shape, element: Element, file: Path, omissions: Notes) -> Flo
 def _positive(element: Element, attribute: str, sizes: list[float]) -> list[float]:
     """Return the sizes. Raises ConfigError unless all of them are above 0."""
     if not all(0 < size < 1e9 for size in sizes):
-        raise element.wrong(f"has `{attribute}` = {element.get(attribute)!r}; expected sizes above 0")
+        raise element.error(f"has `{attribute}` = {element.get(attribute)!r}; expected sizes above 0")
     return sizes
 
 
@@ -112,7 +112,7 @@ def _mesh(shape: Shape, element: Element, file: Path, omissions: Notes) -> Float
     try:
         if path is None:
             raise ConfigError("not on this computer")
-        return vertices(path) * np.array(shape.sizes)
+        return read_vertices(path) * np.array(shape.sizes)
     except ConfigError as error:
-        omissions.add(f"line {element.line}: mesh {short(shape.mesh)!r} left out: {error}")
+        omissions.add(f"line {element.line}: mesh {shorten(shape.mesh)!r} left out: {error}")
         return None

@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 
-def toml_of(values: dict[str, Any], notes: list[str]) -> str:
+def format_toml(values: dict[str, Any], notes: list[str]) -> str:
     """Return the text of a TOML file.
 
     Args:

@@ -1,7 +1,7 @@
 """Reports what a robot file has not taken from a URDF, by kind, with every value and its lines."""
 
-from snakesim_hal.base.errors import short
-from snakesim_operator.features.robots.imported import Notes, joined
+from snakesim_hal.base.errors import shorten
+from snakesim_operator.features.robots.imported import Notes, join_places
 from snakesim_operator.features.robots.xml_tree import Element, Unused
 
 MAX_VALUE = 200  # characters that are shown of one value
@@ -16,7 +16,7 @@ def report_unused(omissions: Notes, urdf: Element) -> None:
     _report(omissions, [part for part in unused if not _is_look(part)])
     if looks:
         outermost = dict.fromkeys(part.outermost or part.path for part in looks)
-        omissions.add(f"{LOOKS_HEADING}{', '.join(map(short, outermost))}")
+        omissions.add(f"{LOOKS_HEADING}{', '.join(map(shorten, outermost))}")
         _report(omissions, looks)
 
 
@@ -39,11 +39,11 @@ def _report(omissions: Notes, unused: list[Unused]) -> None:
         else:
             values.setdefault(part.path, {}).setdefault(part.value, []).append(part.line)
     for path, lines in elements.items():
-        omissions.add(f"{short(path)} left out: {_join_lines(lines)}")
+        omissions.add(f"{shorten(path)} left out: {_join_lines(lines)}")
     for path, found in values.items():
-        shown = [f"{short(value, MAX_VALUE)!r} ({_join_lines(lines)})" for value, lines in found.items()]
-        omissions.add(f"{short(path)} left out: {', '.join(shown)}")
+        shown = [f"{shorten(value, MAX_VALUE)!r} ({_join_lines(lines)})" for value, lines in found.items()]
+        omissions.add(f"{shorten(path)} left out: {', '.join(shown)}")
 
 
 def _join_lines(lines: list[int]) -> str:
-    return joined([f"line {line}" for line in lines])
+    return join_places([f"line {line}" for line in lines])

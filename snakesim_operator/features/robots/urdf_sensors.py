@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.base.errors import short
+from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import DepthCamera, RangeSensor
 from snakesim_operator.features.robots.imported import Imported
@@ -61,8 +61,8 @@ def put_sensors(found: Imported, urdf: Element, row: Row, frames: list[Floats], 
 def _report_other_sensor(found: Imported, gazebo: Element, sensor: Element, kind: str, reference: str) -> None:
     known = ", ".join((*ON_EVERY_LINK, *DEPTH_TYPES, *RANGE_TYPES))
     found.omissions.add(
-        f"a sensor whose `type` is {short(kind)!r}, in an element whose `reference` is "
-        f"{short(reference)!r}, left out: a robot file has {known}, on a link",
+        f"a sensor whose `type` is {shorten(kind)!r}, in an element whose `reference` is "
+        f"{shorten(reference)!r}, left out: a robot file has {known}, on a link",
         f"line {sensor.line}",
         f"line {gazebo.line}",
     )
@@ -73,7 +73,8 @@ def _put_on_every_link(found: Imported, sensor: Element, section: str, reference
     sensor.optional("type")
     name = sensor.optional("name") or ""
     found.changes.add(
-        f"sensor {short(name)!r} of link {short(reference)!r}: in a robot file [sensors.{section}] is on every link, "
+        f"sensor {shorten(name)!r} of link {shorten(reference)!r}: in a robot file [sensors.{section}] is on "
+        "every link, "
         f"and has no name",
         sensor.place,
     )
@@ -105,7 +106,7 @@ def _read_rate(found: Imported, sensor: Element, section: str) -> dict[str, Any]
     element = sensor.first("update_rate")
     rate_hz = 0.0 if element is None else element.text_numbers(1)[0]
     if rate_hz < 0:
-        raise sensor.wrong(f"has <update_rate> {rate_hz:g} Hz; expected a number above 0")
+        raise sensor.error(f"has <update_rate> {rate_hz:g} Hz; expected a number above 0")
     if rate_hz > 0:
         return {"rate_hz": rate_hz}
     existing = found.table.values.get("sensors", {}).get(section)
@@ -145,7 +146,8 @@ def _convert_pose(found: Imported, link_from_sensor: Floats, sensor: Element) ->
     if abs(roll_rad) > MAX_ROLL_RAD:
         name = sensor.attributes.get("name", "")
         found.omissions.add(
-            f"sensor {short(name)!r} is rolled by {roll_rad:.2f} rad about its viewing direction; a robot file has no "
+            f"sensor {shorten(name)!r} is rolled by {roll_rad:.2f} rad about its viewing direction; a robot "
+            "file has no "
             f"roll",
             f"line {sensor.line}",
         )
@@ -225,7 +227,7 @@ def _read_whole_number(element: Element, tag: str, default: int) -> int:
     """Return the number in a child. Raises ConfigError for a fraction."""
     value = element.text_number(tag, default)
     if value != int(value):
-        raise element.wrong(f"has <{tag}> {value:g}; expected a whole number")
+        raise element.error(f"has <{tag}> {value:g}; expected a whole number")
     return int(value)
 
 
@@ -255,7 +257,7 @@ def _read_noise(found: Imported, element: Element) -> dict[str, Any]:
         kind = (type_attribute or "").strip()
         line = noise.line
     if kind != "gaussian":
-        found.changes.add(f"<noise><type> {short(kind)!r} became gaussian, the one that there is", f"line {line}")
+        found.changes.add(f"<noise><type> {shorten(kind)!r} became gaussian, the one that there is", f"line {line}")
     return {"noise_m": noise.text_number("stddev", 0.0)}
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_operator.features.robots.imported import Imported
-from snakesim_operator.features.robots.shapes import outline, read_shape
+from snakesim_operator.features.robots.shapes import read_shape, sample_outline
 from snakesim_operator.features.robots.xml_tree import Element
 
 ROTARY = ("revolute", "continuous")
@@ -68,7 +68,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Joint:
+class UrdfJoint:
     """A rotary joint between two neighboring bodies of the row."""
 
     element: Element
@@ -83,7 +83,7 @@ class Joint:
             tag: If the joint has a child of this tag, the line is that of the child.
         """
         place = next((child for child in self.element.children if child.tag == tag), self.element)
-        return f"{short(self.name)} (line {place.line})"
+        return f"{shorten(self.name)} (line {place.line})"
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Row:
     """Bodies from tail to head, and the joints between them."""
 
     bodies: list[Body]
-    joints: list[Joint]
+    joints: list[UrdfJoint]
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class _Connection:
 
     parent: str
     child: str
-    joint: Joint
+    joint: UrdfJoint
 
 
 @dataclass
@@ -112,7 +112,7 @@ class _Tree:
     connections: list[_Connection] = field(default_factory=list[_Connection])
 
 
-def row_of(found: Imported, urdf: Element, file: Path, *, tail: str | None) -> Row:
+def read_row(found: Imported, urdf: Element, file: Path, *, tail: str | None) -> Row:
     """Read bodies and joints, and order them from tail to head.
 
     Args:
@@ -145,7 +145,7 @@ def _elements_by_name(urdf: Element, tag: str) -> dict[str, Element]:
     for element in urdf.all(tag):
         name = element.get("name")
         if name in elements:
-            raise element.wrong("is there twice; give each a name of its own")
+            raise element.error("is there twice; give each a name of its own")
         elements[name] = element
     return elements
 
@@ -163,7 +163,7 @@ def transform(owner: Element) -> Floats:
         return frame
     position = origin.numbers("xyz", 3, "0 0 0")
     if not all(abs(coordinate) < MAX_COORDINATE for coordinate in position):
-        raise origin.wrong(f"has `xyz` = {origin.get('xyz')!r}; expected lengths below {MAX_COORDINATE:g}")
+        raise origin.error(f"has `xyz` = {origin.get('xyz')!r}; expected lengths below {MAX_COORDINATE:g}")
     frame[:3, 3] = position
     frame[:3, :3] = rotation(*origin.numbers("rpy", 3, "0 0 0"))
     return frame
@@ -191,7 +191,7 @@ def _walk_tree(found: Imported, urdf: Element, links: dict[str, Element], joints
         parent = _read_end(joint, "parent", links)
         child = _read_end(joint, "child", links)
         if child in parent_of:
-            raise joint.wrong(f"and another joint both have the child {child!r}; a link has one parent")
+            raise joint.error(f"and another joint both have the child {child!r}; a link has one parent")
         parent_of[child] = parent
         joints_below.setdefault(parent, []).append((child, joint))
     root = _find_root(urdf, links, parent_of)
@@ -205,7 +205,7 @@ def _walk_tree(found: Imported, urdf: Element, links: dict[str, Element], joints
             waiting.append(child)
     if len(tree.frames) != len(links):
         circle = sorted(links.keys() - tree.frames.keys())
-        raise urdf.wrong(f"has joints in a circle: {', '.join(circle[:8])}")
+        raise urdf.error(f"has joints in a circle: {', '.join(circle[:8])}")
     return tree
 
 
@@ -214,8 +214,8 @@ def _find_root(urdf: Element, links: dict[str, Element], parent_of: dict[str, st
     roots = [name for name in links if name not in parent_of]
     if len(roots) == 1:
         return roots[0]
-    names = f": {', '.join(map(short, roots[:8]))}" if roots else ""
-    raise urdf.wrong(f"needs one link without a parent, and has {len(roots)}{names}")
+    names = f": {', '.join(map(shorten, roots[:8]))}" if roots else ""
+    raise urdf.error(f"needs one link without a parent, and has {len(roots)}{names}")
 
 
 def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
@@ -223,7 +223,7 @@ def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
     end = joint.first(tag)
     name = "" if end is None else end.get("link")
     if name not in links:
-        raise joint.wrong(f"has the {tag} {short(name)!r}, which is no link of the file")
+        raise joint.error(f"has the {tag} {shorten(name)!r}, which is no link of the file")
     return name
 
 
@@ -232,7 +232,7 @@ def _add_joint(found: Imported, tree: _Tree, element: Element, parent: str, chil
     kind = element.get("type")
     if kind in ("floating", "planar") and alone_at_root:
         found.omissions.add(
-            f"joint {short(element.get('name'))!r} ({kind}) left out: the base is always free to move", element.place
+            f"joint {shorten(element.get('name'))!r} ({kind}) left out: the base is always free to move", element.place
         )
         tree.frames[child] = np.eye(4)
         tree.body_of[child] = tree.body_of[parent]
@@ -246,18 +246,18 @@ def _add_joint(found: Imported, tree: _Tree, element: Element, parent: str, chil
         tree.body_of[child] = tree.body_of[parent]
         found.changes.add("fixed joints: the links on both sides became one", element.place)
     else:
-        raise element.wrong(f"has the type {short(kind)!r}; a snake's joints are revolute, continuous or fixed")
+        raise element.error(f"has the type {shorten(kind)!r}; a snake's joints are revolute, continuous or fixed")
 
 
-def _read_joint(found: Imported, element: Element, frame: Floats) -> Joint:
+def _read_joint(found: Imported, element: Element, frame: Floats) -> UrdfJoint:
     """Read a rotary joint. Raises ConfigError for one that mimics another, and for an axis without direction.
 
     frame: root_from_joint, (4, 4).
     """
     if element.first("mimic") is not None:
-        raise element.wrong("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
+        raise element.error("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
     axis = _read_axis(found, element)
-    return Joint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis)
+    return UrdfJoint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis)
 
 
 def _read_axis(found: Imported, joint: Element) -> Floats:
@@ -269,14 +269,14 @@ def _read_axis(found: Imported, joint: Element) -> Floats:
     axis = np.array(axis_element.numbers("xyz", 3, "1 0 0"))
     length = float(np.linalg.norm(axis))
     if not 1e-9 < length < 1e9:
-        raise axis_element.wrong(
+        raise axis_element.error(
             f"of joint {joint.get('name')!r} has `xyz` = {axis_element.get('xyz')!r} of length {length:g}; give "
             f"a vector of length 1"
         )
     if abs(length - 1.0) > 1e-3:
         found.changes.add(
             f"<axis xyz> {axis_element.get('xyz')!r} has the length {length:.4g}; only its direction counts",
-            f"{short(joint.get('name'))} (line {axis_element.line})",
+            f"{shorten(joint.get('name'))} (line {axis_element.line})",
         )
     return axis / length
 
@@ -290,12 +290,12 @@ def _add_mass(found: Imported, body: Body, link: Element, frame: Floats) -> None
     mass = inertial.first("mass")
     moments = inertial.first("inertia")
     if mass is None or moments is None:
-        raise inertial.wrong("needs <mass> and <inertia>")
+        raise inertial.error("needs <mass> and <inertia>")
     body.masses.append(mass)
     body.inertias.append(moments)
     mass_kg = mass.number("value")
     if not 0 <= mass_kg <= MAX_MASS_KG:
-        raise mass.wrong(f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?")
+        raise mass.error(f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?")
     xx, xy, xz, yy, yz, zz = (_read_moment(moments, name) for name in MOMENTS)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     root_from_inertial = frame @ transform(inertial)
@@ -308,7 +308,7 @@ def _read_moment(moments: Element, name: str) -> float:
     """Return a moment of inertia in the file's unit of length. Raises ConfigError for one that is too large."""
     value = moments.number(name, "0")
     if abs(value) > 1e15:
-        raise moments.wrong(f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²")
+        raise moments.error(f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²")
     return value
 
 
@@ -324,10 +324,10 @@ def _add_shapes(found: Imported, body: Body, link: Element, frame: Floats, file:
     for element in collisions or visuals:
         geometry = element.first("geometry")
         if geometry is None or not geometry.children:
-            raise element.wrong("has no shape in <geometry>")
+            raise element.error("has no shape in <geometry>")
         shape = geometry.children[0]
         shape.read = True
-        points = outline(read_shape(shape), shape, file, found.omissions)
+        points = sample_outline(read_shape(shape), shape, file, found.omissions)
         root_from_shape = frame @ transform(element)
         if points is not None:
             body.points.append(points @ root_from_shape[:3, :3].T + root_from_shape[:3, 3])
@@ -351,7 +351,7 @@ def _have_same_shape(visual: Element, collision: Element) -> bool:
         of_collision = [child for child in collision.children if child.tag == tag]
         if len(of_visual) != len(of_collision):
             return False
-        if not all(a.says_the_same_as(b) for a, b in zip(of_visual, of_collision, strict=True)):
+        if not all(a.equals(b) for a, b in zip(of_visual, of_collision, strict=True)):
             return False
     return True
 
@@ -359,20 +359,24 @@ def _have_same_shape(visual: Element, collision: Element) -> bool:
 def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> Row:
     """Order the bodies from the tail on. Raises ConfigError for what is no chain."""
     if tail is not None and tail not in tree.body_of:
-        raise ConfigError(f"--tail {short(tail)}: there is no such link; there are {', '.join(list(tree.body_of)[:8])}")
+        raise ConfigError(
+            f"--tail {shorten(tail)}: there is no such link; there are {', '.join(list(tree.body_of)[:8])}"
+        )
     neighbors = _find_neighbors(bodies, tree)
     forks = [name for name, joints in neighbors.items() if len(joints) > 2]
     if forks:
-        raise urdf.wrong(f"is no chain: more than two joints meet at link {short(forks[0])!r}")
+        raise urdf.error(f"is no chain: more than two joints meet at link {shorten(forks[0])!r}")
     if len(tree.connections) < 2:
-        raise urdf.wrong(f"has {len(tree.connections)} joints that turn; a snake has 2 or more")
+        raise urdf.error(f"has {len(tree.connections)} joints that turn; a snake has 2 or more")
     first = tree.body_of[tail] if tail is not None else next(iter(tree.body_of))
     ends = [name for name, joints in neighbors.items() if len(joints) == 1]
     if first not in ends:
-        choices = " or ".join(f"--tail {short(end)}" for end in ends)
-        raise urdf.wrong(f"has the link {short(tail or first)!r} amid the chain; say which end is the tail: {choices}")
+        choices = " or ".join(f"--tail {shorten(end)}" for end in ends)
+        raise urdf.error(
+            f"has the link {shorten(tail or first)!r} amid the chain; say which end is the tail: {choices}"
+        )
     order = [first]
-    joints: list[Joint] = []
+    joints: list[UrdfJoint] = []
     while True:
         passed = order[-2:]
         ahead = [(name, joint) for name, joint in neighbors[order[-1]] if name not in passed]
@@ -383,17 +387,17 @@ def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: 
         joints.append(joint)
 
 
-def _find_neighbors(bodies: dict[str, Body], tree: _Tree) -> dict[str, list[tuple[str, Joint]]]:
+def _find_neighbors(bodies: dict[str, Body], tree: _Tree) -> dict[str, list[tuple[str, UrdfJoint]]]:
     """Return the neighbors of each body, and the joints to them, as if the neighbor were in front of the body.
 
     A joint whose parent is in front turns the other way round, so its axis is negated.
     """
-    neighbors: dict[str, list[tuple[str, Joint]]] = {name: [] for name in bodies}
+    neighbors: dict[str, list[tuple[str, UrdfJoint]]] = {name: [] for name in bodies}
     for connection in tree.connections:
         parent = tree.body_of[connection.parent]
         child = tree.body_of[connection.child]
         joint = connection.joint
-        reversed_joint = Joint(joint.element, joint.name, joint.origin, -joint.axis)
+        reversed_joint = UrdfJoint(joint.element, joint.name, joint.origin, -joint.axis)
         neighbors[parent].append((child, joint))
         neighbors[child].append((parent, reversed_joint))
     return neighbors

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 
 MAX_ELEMENTS = 100_000
 MAX_DEPTH = 32
@@ -53,7 +53,7 @@ class Element:
     def place(self) -> str:
         """The place of the element for a report: its name, if it has one, and its line."""
         name = self.attributes.get("name")
-        return f"{short(name)} (line {self.line})" if name else f"line {self.line}"
+        return f"{shorten(name)} (line {self.line})" if name else f"line {self.line}"
 
     def all(self, tag: str) -> list["Element"]:
         """Return the children of a tag, and mark them as read."""
@@ -88,7 +88,7 @@ class Element:
         if value is not None:
             return value
         if default is None:
-            raise self.wrong(f"has no attribute `{name}`; add it")
+            raise self.error(f"has no attribute `{name}`; add it")
         self.note_absent(f"`{name}`", default)
         return default
 
@@ -123,14 +123,14 @@ class Element:
         except ValueError:
             numbers = []
         if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
-            raise self.wrong(f"{what} = {short(text)!r}; expected {count} finite number{'s' * (count > 1)}")
+            raise self.error(f"{what} = {shorten(text)!r}; expected {count} finite number{'s' * (count > 1)}")
         return numbers
 
-    def wrong(self, why: str) -> ConfigError:
+    def error(self, why: str) -> ConfigError:
         """Return an error about this element. why: the rest of a sentence that begins with its tag."""
         name = ""
         if "name" in self.attributes:
-            name = f" name={short(self.attributes['name'])!r}"
+            name = f" name={shorten(self.attributes['name'])!r}"
         return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}")
 
     def read_all(self) -> None:
@@ -141,13 +141,13 @@ class Element:
         for child in self.children:
             child.read_all()
 
-    def says_the_same_as(self, other: "Element") -> bool:
+    def equals(self, other: "Element") -> bool:
         """Return whether tag, attributes, text and children of both are equal, whatever their lines."""
         if self.tag != other.tag or self.attributes != other.attributes:
             return False
         if self.text.strip() != other.text.strip() or len(self.children) != len(other.children):
             return False
-        return all(mine.says_the_same_as(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
+        return all(mine.equals(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
 
     def unused(self, path: str = "") -> Iterator[Unused]:
         """Yield every value in the element and below it that was not read.
@@ -209,7 +209,7 @@ def parse_xml(data: bytes, source: str) -> Element:
             )
         if tag.startswith("xacro:"):
             raise ConfigError(
-                f"{source}, line {line}: <{short(tag)}> is xacro; convert it first: xacro FILE > robot.urdf"
+                f"{source}, line {line}: <{shorten(tag)}> is xacro; convert it first: xacro FILE > robot.urdf"
             )
         element = Element(tag, attributes, line, source, absences)
         open_elements[-1].children.append(element)

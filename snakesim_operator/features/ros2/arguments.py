@@ -4,9 +4,9 @@ import argparse
 import re
 from typing import Any
 
-from snakesim_hal.base.errors import ConfigError, short
+from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.network.endpoint import check_endpoint
-from snakesim_hal.programs.arguments import add_network, number
+from snakesim_hal.programs.arguments import add_network, number_type
 
 ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
 MAX_DOMAIN = 232  # as with DDS
@@ -26,7 +26,7 @@ def add_commands(commands: Any) -> None:
         epilog="Publishes joint states, transforms, markers, images, IMUs, scans, the robot's URDF, diagnostics and "
         "/clock. ROS may stop the robot, and nothing else without --cmd-vel, --joint-commands or --operate.",
     )
-    parser.add_argument("--domain", type=number(0, MAX_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
+    parser.add_argument("--domain", type=number_type(0, MAX_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
     parser.add_argument(
         "--ros-router", default=ROS_ROUTER, metavar="ENDPOINT", help=f"router of the ROS nodes ({ROS_ROUTER})"
     )
@@ -53,7 +53,7 @@ def _add_rate(parser: argparse.ArgumentParser, option: str, default_hz: float, s
     """Add an option for a maximum rate. subject: what is counted, for the help."""
     parser.add_argument(
         option,
-        type=number(MIN_HZ, MAX_HZ, "Hz"),
+        type=number_type(MIN_HZ, MAX_HZ, "Hz"),
         default=default_hz,
         metavar="HZ",
         help=f"most {subject} ({default_hz:g})",
@@ -63,20 +63,20 @@ def _add_rate(parser: argparse.ArgumentParser, option: str, default_hz: float, s
 def _run(arguments: argparse.Namespace) -> int:
     check(arguments)
     # Imported here, because these modules need the extra `ros2`.
-    from snakesim_operator.base.robot_selection import selection_of
+    from snakesim_operator.base.robot_selection import select_robots
     from snakesim_operator.features.ros2.join import run_bridge
 
-    return run_bridge(arguments, selection_of(arguments))
+    return run_bridge(arguments, select_robots(arguments))
 
 
 def check(arguments: argparse.Namespace) -> None:
     """Check the arguments and that the extra is installed. Raises ConfigError."""
     from snakesim_operator.base import extras
 
-    extras.check("ros2", "`snakesim ros2`")
+    extras.require("ros2", "`snakesim ros2`")
     check_endpoint(arguments.ros_router, "--ros-router")
     namespace = arguments.ros_namespace
     if namespace is not None and not re.fullmatch(ROS_NAMESPACE, namespace, re.ASCII):
         raise ConfigError(
-            f"--ros-namespace {short(namespace)!r}: give a name such as planar13 or lab/planar13: letters, digits, _"
+            f"--ros-namespace {shorten(namespace)!r}: give a name such as planar13 or lab/planar13: letters, digits, _"
         )

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_hal.base.terminal import say
-from snakesim_hal.model.kinematics import nodes_w
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.kinematics import find_nodes_w
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
@@ -136,7 +136,7 @@ class Bridge:
 
     def _make_cmd_vel_input(self) -> CmdVelInput:
         twists = self._node.declare_subscription(Topic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1))
-        return CmdVelInput(twists, self._session, say)
+        return CmdVelInput(twists, self._session, print_line)
 
     def _set_robot(self, robot: m.Description) -> None:
         """Use this description of the robot from now on, and publish it in ROS."""
@@ -170,7 +170,7 @@ class Bridge:
         return max(1, math.ceil(self._options.hz / hz))
 
     def _fits_robot(self, message: m.Message) -> bool:
-        return mismatch(message, self._robot) is None
+        return find_mismatch(message, self._robot) is None
 
     # --- from the robot to ROS
 
@@ -180,19 +180,19 @@ class Bridge:
         if clock is not None:
             self._update_clock(clock, now_s)
         elif self._clock_arrival_s is not None and now_s - self._clock_arrival_s > SILENT_S:
-            say(f"no clock from the robot for {SILENT_S:g} s; waiting for it")
+            print_line(f"no clock from the robot for {SILENT_S:g} s; waiting for it")
             self._clock_arrival_s = None
 
     def _update_clock(self, clock: m.Clock, now_s: float) -> None:
         if self._clock is not None and clock.tick < self._clock.tick:
             self._ros_time.reset()
-            say("the robot's host has restarted: its time starts over")
+            print_line("the robot's host has restarted: its time starts over")
         self._ros_time.add_clock(clock.timestamp_ns)
         self._clock = clock
         if self._ros_clock is not None:
             self._ros_clock.publish(ros.encode_clock(clock.timestamp_ns))
         if self._clock_arrival_s is None:
-            say("the robot is back")
+            print_line("the robot is back")
         self._clock_arrival_s = now_s
 
     def _read_description(self) -> None:
@@ -256,7 +256,7 @@ class Bridge:
         joints = self._joints
         if world is None or joints is None or self._world_is_silent():
             return None
-        nodes = nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, joints.angle_rad)
+        nodes = find_nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, joints.angle_rad)
         tail_to_head = nodes[-2] - nodes[0]
         return float(np.arctan2(tail_to_head[1], tail_to_head[0]))
 

@@ -9,10 +9,10 @@ import threading
 import time
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
-from snakesim_hal.base.terminal import Say
+from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.base.workers import start_worker
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.network.commanding import Commanding
+from snakesim_hal.network.commanding import CommandingClient
 from snakesim_hal.network.foreign_network import RawReader
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
@@ -28,7 +28,7 @@ END_TIMEOUT_S = 5.0  # for the thread
 class JointCommander:
     """Commands every joint in every tick from the messages of one topic; reconnects after a loss of the robot."""
 
-    def __init__(self, session: Session, messages: RawReader, say: Say, *, wall_time: bool) -> None:
+    def __init__(self, session: Session, messages: RawReader, say: PrintLine, *, wall_time: bool) -> None:
         """Start the thread that commands the robot.
 
         Args:
@@ -40,7 +40,7 @@ class JointCommander:
         Raises:
             RefusedError: The robot has a controller.
         """
-        if session.present(keys.alive(CONTROL)):
+        if session.present(keys.alive_key(CONTROL)):
             raise RefusedError(
                 "--joint-commands: the robot has a controller already, which holds the lease; run it without one: "
                 "--set services.control.external=true"
@@ -75,7 +75,7 @@ class JointCommander:
         status = session.latest(keys.STATUS, Status, PRESENT_S)
         if robot is None or status is None:
             raise NotConnectedError("the robot does not describe itself; is its HAL host running?")
-        commanding = Commanding(session, robot, status.clock_mode)
+        commanding = CommandingClient(session, robot, status.clock_mode)
         targets = RosJointTargets(robot)
         self._report(f"joint commands from ROS move {robot.robot} once it is armed")
         while not self._ended.is_set():

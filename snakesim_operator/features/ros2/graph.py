@@ -133,7 +133,7 @@ class RosPublisher:
         self._publisher = publisher
         self._gid = compute_gid(token)
         self._sequence = count(1)
-        self.has_subscribers = publisher.heard
+        self.has_subscribers = publisher.has_subscriber
 
     def publish(self, message: bytes) -> None:
         """Send a message in CDR."""

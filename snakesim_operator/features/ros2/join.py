@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import NoReturn
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.terminal import say
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.foreign_network import ForeignNetwork, open_foreign_network
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
@@ -64,12 +64,12 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
             if arguments.joint_commands:
                 topic = Topic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=JOINT_COMMANDS_KEPT)
                 messages = node.declare_subscription(topic)
-                commander = JointCommander(session, messages, say, wall_time=options.wall_time)
+                commander = JointCommander(session, messages, print_line, wall_time=options.wall_time)
                 cleanup.callback(commander.close)
             time_name = "robot"
             if options.wall_time:
                 time_name = "wall-clock"
-            say(
+            print_line(
                 f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
                 f"{time_name} time; Ctrl-C ends it"
             )
@@ -112,7 +112,7 @@ def _run_cycles(bridge: Bridge, servers: Sequence[ServiceServer], hz: float) -> 
     while True:
         bridge.run_cycle()
         for server in servers:
-            server.poll(say)
+            server.poll(print_line)
         due_s = max(due_s + 1.0 / hz, time.monotonic())
         time.sleep(max(0.0, due_s - time.monotonic()))
 
@@ -128,6 +128,6 @@ def _wait_for_robot(selection: RobotSelection) -> Link:
             if time.monotonic() > give_up_s:
                 raise
             if not is_reported:
-                say(f"{error}. Waiting for it up to {START_TIMEOUT_S:g} s")
+                print_line(f"{error}. Waiting for it up to {START_TIMEOUT_S:g} s")
                 is_reported = True
             time.sleep(RETRY_S)

@@ -140,7 +140,7 @@ class RosJointTargets:
         if not math.isfinite(value):
             raise _RefusedMessageError(f"has {field} {value} for {name}, must be finite")
         joint = self._robot.joints[self._joint_indices[name]]
-        if not joint.has(mode):
+        if not joint.supports_mode(mode):
             supported = ", ".join(supported_mode.name.lower() for supported_mode in joint.modes)
             raise _RefusedMessageError(f"has {field} for {name}, whose drive takes {supported}")
 

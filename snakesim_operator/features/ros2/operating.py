@@ -5,21 +5,21 @@ from collections.abc import Callable
 from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
-from snakesim_hal.base.process import user_name
+from snakesim_hal.base.process import get_user_name
 from snakesim_hal.network.session import Link, Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, request_to_arm
+from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, make_arm_request
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.features.ros2.graph import Node
 from snakesim_operator.features.ros2.message_age import explain_request_age_refusal
 from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.features.ros2.service_types import TRIGGER
-from snakesim_operator.robot_commands.command import ask_host
+from snakesim_operator.robot_commands.command import request_from_host
 from snakesim_operator.robot_commands.stop import estop
 
 DESCRIPTION_TIMEOUT_S = 3.0
 READY_TIMEOUT_S = 5.0  # a controller may be starting
-REQUESTER = f"{user_name()[:40]}, ros2"
+REQUESTER = f"{get_user_name()[:40]}, ros2"
 
 
 def make_operating_servers(
@@ -98,7 +98,7 @@ class _Operator:
             raise NotConnectedError(f"{self._link.namespace} publishes no description; is its HAL host running?")
         # If it does not become ready, the host's answer to the request gives the reason.
         self._session.latest(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
-        return self._request(request_to_arm(robot, REQUESTER), "armed")
+        return self._request(make_arm_request(robot, REQUESTER), "armed")
 
     def disarm(self) -> str:
         """Disarm the robot."""
@@ -110,5 +110,5 @@ class _Operator:
 
     def _request(self, request: LifecycleRequest, done: str) -> str:
         lines: list[str] = []
-        ask_host(self._session, keys.LIFECYCLE, request, done, self._link, lines.append)
+        request_from_host(self._session, keys.LIFECYCLE, request, done, self._link, lines.append)
         return "; ".join(lines)

@@ -17,7 +17,14 @@ from snakesim_operator.features.ros2.graph import Node
 from snakesim_operator.features.ros2.messages import make_message
 from snakesim_operator.features.ros2.operating import REQUESTER
 from snakesim_operator.features.ros2.server import ServiceServer, run_action
-from snakesim_operator.robot_commands.parameters import PREFIX, Parameter, change, in_force, in_text, parameters_of
+from snakesim_operator.robot_commands.parameters import (
+    PREFIX,
+    Parameter,
+    change_parameters,
+    format_value,
+    read_parameters,
+    read_settings,
+)
 
 # Types of rcl_interfaces/ParameterType.
 NOT_SET = 0
@@ -108,10 +115,10 @@ class ParameterServices:
     def _read_parameters(self) -> dict[str, Parameter]:
         """Return the controller's parameters by name; none if no controller publishes any."""
         try:
-            settings = in_force(self._session)
+            settings = read_settings(self._session)
         except NotConnectedError:
             return {}
-        return {PREFIX + parameter.name: parameter for parameter in parameters_of(settings)}
+        return {PREFIX + parameter.name: parameter for parameter in read_parameters(settings)}
 
     def _read_values(self, names: Sequence[str]) -> list[Any]:
         """Return the value of each name; None for an unknown one."""
@@ -134,7 +141,7 @@ class ParameterServices:
 
     def _change(self, parameters: Sequence[Any]) -> str:
         values = {parameter.name: _decode_value(parameter.value) for parameter in parameters}
-        change(self._session, values, REQUESTER)
+        change_parameters(self._session, values, REQUESTER)
         return ""
 
 
@@ -159,9 +166,9 @@ def _encode_value(value: Any) -> Any:
     kind = _find_type(value)
     fields: dict[int, Any] = {BOOL: False, INTEGER: 0, DOUBLE: 0.0, STRING: "", DOUBLES: [], STRINGS: []}
     if kind == STRING:
-        fields[STRING] = in_text(value)
+        fields[STRING] = format_value(value)
     elif kind == STRINGS:
-        fields[STRINGS] = [in_text(element) for element in value]
+        fields[STRINGS] = [format_value(element) for element in value]
     elif kind != NOT_SET:
         fields[kind] = value
     return make_message(
@@ -195,11 +202,11 @@ def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
     if parameter is None:
         return make_message("rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], [])
     kind = _find_type(parameter.value)
-    description = parameter.about
+    description = parameter.description
     if parameter.unit not in ("", "1"):
-        description = f"{parameter.about} [{parameter.unit}]"
+        description = f"{parameter.description} [{parameter.unit}]"
     floating_point_ranges: list[Any] = []
-    has_limits = parameter.least is not None or parameter.most is not None
+    has_limits = parameter.minimum is not None or parameter.maximum is not None
     if kind == DOUBLE and has_limits:
         floating_point_ranges.append(_make_range(parameter))
     return make_message(
@@ -218,10 +225,10 @@ def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
 def _make_range(parameter: Parameter) -> Any:
     """Return an rcl_interfaces/FloatingPointRange. It needs both limits, so a missing one becomes the largest float."""
     lower = -sys.float_info.max
-    if parameter.least is not None:
-        lower = parameter.least
+    if parameter.minimum is not None:
+        lower = parameter.minimum
     upper = sys.float_info.max
-    if parameter.most is not None:
-        upper = parameter.most
+    if parameter.maximum is not None:
+        upper = parameter.maximum
     any_step = 0.0
     return make_message("rcl_interfaces/msg/FloatingPointRange", lower, upper, any_step)

@@ -17,8 +17,8 @@ from snakesim_hal.wire.messages import (
     World,
     WorldContact,
 )
-from snakesim_hal.wire.own_sample import OwnKind
-from snakesim_operator.base.png import png
+from snakesim_hal.wire.own_sample import CustomMessage
+from snakesim_operator.base.png import encode_png
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2.messages import Marker, Rgba, Triple
 
@@ -136,14 +136,14 @@ def encode_compressed_depth(timestamp_ns: int, frame: str, image: DepthImage) ->
     """
     depth_mm = np.frombuffer(image.depth, dtype="<u2") * (image.scale_m / MILLIMETER_M)
     counts = np.where(depth_mm > MAX_DEPTH_COUNTS, 0, np.rint(depth_mm)).astype(">u2")
-    picture = png(image.width, image.height, counts.tobytes(), bits=16, color=False)
+    picture = encode_png(image.width, image.height, counts.tobytes(), bits=16, color=False)
     data = INVERSE_DEPTH_UNUSED + picture
     return ros.encode_compressed_image(timestamp_ns, frame, "16UC1; compressedDepth png", data)
 
 
 def encode_compressed_color(timestamp_ns: int, frame: str, image: ColorImage) -> bytes:
     """Return a sensor_msgs/CompressedImage with a lossless 8 bit PNG. OpenCV reads it as bgr8, as its format states."""
-    picture = png(image.width, image.height, image.rgb, bits=8, color=True)
+    picture = encode_png(image.width, image.height, image.rgb, bits=8, color=True)
     return ros.encode_compressed_image(timestamp_ns, frame, "rgb8; png compressed bgr8", picture)
 
 
@@ -217,7 +217,7 @@ def encode_laser_scan(timestamp_ns: int, frame: str, scan: Ranges) -> bytes:
     )
 
 
-def encode_numbers(kind: OwnKind, field: str, _timestamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
+def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
     """Return a std_msgs/Float64MultiArray with one field of a custom sensor's sample.
 
     The array has one dimension, labeled with the field's name and unit. This type has neither timestamp nor frame.

@@ -10,7 +10,7 @@ from typing import Any
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
-from snakesim_hal.wire.own_sample import message_of, own_kinds
+from snakesim_hal.wire.own_sample import find_custom_messages, find_message_type
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.frames import Frames, make_ros_name
@@ -96,14 +96,14 @@ class SensorTopics:
             relays.append(Relay(self._session, keys.IMU, m.Imu, 1, self._forward_imu, forwards_all=True))
         for key in sorted(sensor_keys):
             name = _get_sensor_name(key)
-            if key == keys.depth(name):
+            if key == keys.depth_key(name):
                 relays.append(self._relay_depth_camera(key, image_every_cycles))
-            elif key == keys.color(name):
+            elif key == keys.color_key(name):
                 relays.append(self._relay_color_camera(key, image_every_cycles))
-            elif key == keys.ranges(name):
+            elif key == keys.ranges_key(name):
                 encode = robot_in_ros.encode_laser_scan
                 relays.append(self._relay_mounted_sensor(key, "scan", ros.LASER_SCAN, encode))
-        for key, custom_type in own_kinds(self._robot).items():
+        for key, custom_type in find_custom_messages(self._robot).items():
             for field in custom_type.units:
                 encode_field = partial(robot_in_ros.encode_numbers, custom_type, field)
                 relays.append(self._relay_mounted_sensor(key, field, ros.NUMBERS, encode_field))
@@ -179,7 +179,7 @@ class SensorTopics:
         """Return the relay of one topic of a sensor that is mounted on a link."""
         name = _get_sensor_name(key)
         publisher = self._declare_publisher(f"{make_ros_name(name)}/{topic}", ros_type)
-        message_type: Any = message_of(key, self._robot)
+        message_type: Any = find_message_type(key, self._robot)
 
         def forward(sample: m.MountedSample) -> None:
             self._static_frames.place_sensor(key, self._frames.make_mount_transforms(name, sample))

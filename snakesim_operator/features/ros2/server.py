@@ -9,9 +9,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from snakesim_hal.base.errors import SnakesimError
-from snakesim_hal.base.terminal import Say
+from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.base.workers import ErrorReport
-from snakesim_hal.network.foreign_network import RawQueryable, RawQuestion
+from snakesim_hal.network.foreign_network import RawQuery, RawQueryable
 from snakesim_operator.features.ros2.graph import Node, Topic, make_reply_attachment
 from snakesim_operator.features.ros2.service_types import RosService
 
@@ -59,7 +59,7 @@ class ServiceServer:
         self._errors = ErrorReport(name)
         self.rejected = 0  # malformed requests
 
-    def poll(self, say: Say) -> None:
+    def poll(self, say: PrintLine) -> None:
         """Start to answer the next request, if the previous one has been answered. It does not wait."""
         if self._running is not None:
             if not self._running.done():
@@ -68,7 +68,7 @@ class ServiceServer:
             if error is not None:
                 say(f"{self.name} was not answered: {error}")
             self._running = None
-        question = self._requests.next()
+        question = self._requests.take_next()
         if question is None:
             return
         reply_attachment = make_reply_attachment(question.attachment)
@@ -87,7 +87,7 @@ class ServiceServer:
             return None
         return self._service.decode_request(payload)
 
-    def _reply(self, question: RawQuestion, request: Any, reply_attachment: bytes) -> None:
+    def _reply(self, question: RawQuery, request: Any, reply_attachment: bytes) -> None:
         """Send the response to a request; it runs in the thread of this service."""
         response = self._respond(request, question.attachment)
         question.reply(response, reply_attachment)

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable
 
-from snakesim_hal.base.terminal import Say
+from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.network.foreign_network import RawReader
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
@@ -27,7 +27,7 @@ REQUESTER = "ros2 /cmd_vel"
 class CmdVelInput:
     """Reads the newest Twist of a ROS topic in each cycle and publishes the intent that it stands for."""
 
-    def __init__(self, twists: RawReader, session: Session, say: Say) -> None:
+    def __init__(self, twists: RawReader, session: Session, say: PrintLine) -> None:
         """Prepare to read the topic and to publish intents.
 
         Args:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import say, say_json
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.page import page
@@ -50,13 +50,13 @@ def compare(
     except ConfigError as error:
         raise ConfigError(f"{error}; name another file with --out FILE.html") from None
     if as_json:
-        say_json({**for_scripts(difference), "page": str(path), "within": check})
+        print_json({**for_scripts(difference), "page": str(path), "within": check})
     else:
         for line in table(difference):
-            say(line)
-        say(f"page: {path}")
+            print_line(line)
+        print_line(f"page: {path}")
         if check is not None:
-            say(check.words)
+            print_line(check.words)
     code = 0 if check is None or check.holds else 1
     code_a = exit_code(run_a, difference.a.lacks, code)
     code_b = exit_code(run_b, difference.b.lacks, code)

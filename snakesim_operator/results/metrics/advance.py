@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import nodes_w
+from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.run_log.black_box import BlackBox
@@ -185,12 +185,12 @@ class GoalWatch:
 
     def _add_sample(self, black_box: BlackBox, first_row: int) -> bool:
         """Add the first row from a number on in which the pose is known. Returns False if there is none."""
-        rows = black_box.layout.arrays(black_box.rows_from(first_row)[1])
+        rows = black_box.layout.arrays(black_box.read_rows(first_row)[1])
         poses = zip(rows["position_w"], rows["orientation_wxyz"], rows["angle_rad"], strict=True)
         for i, pose in enumerate(poses):
             if all(np.isfinite(part).all() for part in pose):
                 self._time_s.append(float(rows["time_s"][i]))
-                self._nodes.append(nodes_w(self._robot, *pose))
+                self._nodes.append(find_nodes_w(self._robot, *pose))
                 return True
         return False
 

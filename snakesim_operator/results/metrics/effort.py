@@ -148,7 +148,7 @@ def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
 
 def _form_closure_fraction(record: RunRecord, advance: Advance) -> float | None:
     """Return the fraction of the time in which the obstacles, as the scene places them, close the form."""
-    outlines = Outlines.of([placed.obstacle for placed in record.placed if not placed.walkable])
+    outlines = Outlines.from_obstacles([placed.obstacle for placed in record.placed if not placed.walkable])
     if not len(outlines):
         return 0.0
     radius_m = record.description.links[0].radius_m

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import nodes_w
+from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.wire.messages import World
 from snakesim_operator.results.record import RunRecord
 
@@ -78,4 +78,4 @@ def _distance_between_m(record: RunRecord, first: World, last: World) -> float |
 def _estimated_nodes_w(record: RunRecord, world: World) -> Floats:
     """Return tail end, joints and head end on the ground by the estimated pose, (joints + 2, 2)."""
     angles_rad = record.angle_rad[record.row_at(world.timestamp_ns * 1e-9)]
-    return nodes_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles_rad)[:, :2]
+    return find_nodes_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles_rad)[:, :2]

@@ -29,7 +29,7 @@ def contacts_beside(nodes_w: Floats, radius_m: float, outlines: Outlines) -> tup
     _, nearest, distances = nearest_on_chain(nodes_w, outlines)
     which = np.flatnonzero(distances - radius_m < MAX_GAP_M)
     at = nearest[which]
-    _, normals = outlines.towards(at, which)
+    _, normals = outlines.distance_and_normal(at, which)
     return at - radius_m * normals, normals
 
 

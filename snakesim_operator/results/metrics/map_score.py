@@ -64,7 +64,7 @@ def score(
     """
     head = np.asarray(head_w, dtype=np.float64)[:2]
     near_truth = _within(truth, head, NEAR_M + MATCH_M)
-    true_outlines = Outlines.of(near_truth)
+    true_outlines = Outlines.from_obstacles(near_truth)
     result = MapScore()
     matched: set[str] = set()
     for obstacle in _within(reported, head, NEAR_M):
@@ -94,7 +94,7 @@ def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> li
     The center of such an obstacle is in the field of view, and no other obstacle hides half of its facing side.
     """
     near = _within(truth, head_w, NEAR_M)
-    outlines = Outlines.of(near)
+    outlines = Outlines.from_obstacles(near)
     seen: list[Obstacle] = []
     for i, obstacle in enumerate(near):
         x, y = np.array(obstacle.position_w[:2]) - head_w
@@ -164,7 +164,7 @@ def moved(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[
 
 def _within(obstacles: Sequence[Obstacle], head_w: Floats, within_m: float) -> list[Obstacle]:
     """Return the obstacles whose outline is within a distance of the head."""
-    near = Outlines.of(obstacles).distance_m(head_w) <= within_m
+    near = Outlines.from_obstacles(obstacles).distance_m(head_w) <= within_m
     return [one for one, is_near in zip(obstacles, near.tolist(), strict=True) if is_near]
 
 

@@ -10,7 +10,7 @@ import jinja2
 import msgspec
 from markupsafe import Markup
 
-from snakesim_hal.base.terminal import printable
+from snakesim_hal.base.terminal import escape_invisible
 from snakesim_operator.results.page.charts import LIBRARY, Figure
 from snakesim_operator.results.page.palette import themes
 
@@ -52,7 +52,7 @@ def render(
 
 def chart(figure: Figure) -> Markup:
     """Return the markup of a figure, with its data beside it."""
-    label = Markup.escape(printable(figure["label"]))
+    label = Markup.escape(escape_invisible(figure["label"]))
     return Markup(
         f'<figure class="chart" role="group" aria-label="{label}" style="min-height:{figure["layout"]["height"]}px">'
         f'<div class="plot"></div><div class="cursor"></div>{data(figure)}</figure>'
@@ -97,14 +97,14 @@ def _pages(folder: Path) -> jinja2.Environment:
 def _visible(value: Any) -> Any:
     """Return a value whose control characters, which would hide or reverse the text around them, are visible."""
     if isinstance(value, str) and not isinstance(value, Markup):
-        return printable(value, KEPT)
+        return escape_invisible(value, KEPT)
     return value
 
 
 def _harmless(value: Any) -> Any:
     """Escape every text in a value."""
     if isinstance(value, str):
-        return escape(printable(value), quote=False)
+        return escape(escape_invisible(value), quote=False)
     if isinstance(value, dict):
         return {key: _harmless(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -6,7 +6,7 @@ What it looks like stands in figure.css and palette.py; a figure only names clas
 import math
 from html import escape
 
-from snakesim_hal.base.terminal import printable
+from snakesim_hal.base.terminal import escape_invisible
 
 Point = tuple[float, float]
 Attribute = str | float | int | None
@@ -33,7 +33,7 @@ def element(name: str, *children: str, **attributes: Attribute) -> str:
     for key, value in attributes.items():
         if value is None:
             continue
-        shown = escape(printable(value)) if isinstance(value, str) else number(value)
+        shown = escape(escape_invisible(value)) if isinstance(value, str) else number(value)
         parts.append(f'{key.rstrip("_").replace("_", "-")}="{shown}"')
     opening = " ".join(parts)
     return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
@@ -43,7 +43,7 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
     """Return a line of text. anchor: start, middle or end."""
     return element(
         "text",
-        escape(printable(words), quote=False),
+        escape(escape_invisible(words), quote=False),
         x=x,
         y=y,
         class_=class_ or None,
@@ -53,7 +53,7 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
 
 def title(words: str) -> str:
     """Return the tooltip of the element around it."""
-    return element("title", escape(printable(words), quote=False))
+    return element("title", escape(escape_invisible(words), quote=False))
 
 
 def line(a: Point, b: Point, class_: str) -> str:

@@ -10,9 +10,9 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import on_stop_signal, user_name
-from snakesim_hal.base.terminal import overwrite_lines, say
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
+from snakesim_hal.base.process import get_user_name, on_stop_signal
+from snakesim_hal.base.terminal import overwrite_lines, print_line
+from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Intent, Status, World
@@ -71,7 +71,7 @@ class Teleop:
         self._link = link
         self._keyboard = keyboard
         self._stick = stick
-        self._user = f"{user_name()[:40]}, teleop {os.getpid()}"  # with the process id: one user may run two
+        self._user = f"{get_user_name()[:40]}, teleop {os.getpid()}"  # with the process id: one user may run two
         self._steering = Steering(self._user, fastest_m_s)
         self._ignores_keys = False  # the newest keys were late
         self._end_reason = ""  # not empty: the loop ends
@@ -120,7 +120,7 @@ class Teleop:
             time.sleep(max(PERIOD_S - (time.monotonic() - began_s), 0.0))
         self._finish()
         with contextlib.suppress(OSError):  # the terminal may be gone
-            say(f"teleop ended: {self._end_reason}; nothing is asked of {self._link.namespace} any more")
+            print_line(f"teleop ended: {self._end_reason}; nothing is asked of {self._link.namespace} any more")
         return 1 if self._input_is_lost() else 0
 
     def _finish(self) -> None:
@@ -229,7 +229,7 @@ class Teleop:
             self._control = states[-1]
             self._control_s = time.monotonic()
         if worlds := self._worlds.drain():
-            self._body_w_rad = yaw_of(rotation_from_quaternion(worlds[-1].base_orientation_wxyz))
+            self._body_w_rad = yaw_from_rotation(rotation_from_quaternion(worlds[-1].base_orientation_wxyz))
         for intent in self._others.drain():
             if intent.who != self._user:
                 self._other_user = intent.who

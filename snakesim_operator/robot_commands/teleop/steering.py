@@ -39,7 +39,7 @@ class Steering:
         start_w_rad = self.heading_w_rad
         if start_w_rad is None:
             start_w_rad = body_w_rad or 0.0
-        self.heading_w_rad = turned(start_w_rad, by_rad, body_w_rad)
+        self.heading_w_rad = rotate_heading(start_w_rad, by_rad, body_w_rad)
         self.touched_s = now_s
 
     def stop(self, now_s: float) -> None:
@@ -59,7 +59,7 @@ class Steering:
         )
 
 
-def turned(heading_w_rad: float, by_rad: float, body_w_rad: float | None) -> float:
+def rotate_heading(heading_w_rad: float, by_rad: float, body_w_rad: float | None) -> float:
     """Return a direction after a rotation, limited to LEAD_RAD to either side of the body.
 
     Args:

@@ -180,7 +180,7 @@ class TwoWriters:
             self.rig.now_ns += self.rng.randrange(PERIOD_NS // 2)
             got += move()
         decision = self.authority.decide()
-        self.authority.expire(self.rig.now_ns, self.rig.tick)
+        self.authority.check_deadlines(self.rig.now_ns, self.rig.tick)
         stopped = self.authority.state != "armed"
         return got + (decision.sequence is not None and decision.sequence >= FORGED) + stopped
 
@@ -216,4 +216,4 @@ class TwoWriters:
     def _offer(self, given: JointCommand, sequence: int, epoch: int) -> str | None:
         tick, now_ns, arm_session = self.rig.tick, self.rig.now_ns, self.authority.arm_session
         made = msgspec.structs.replace(given, sequence=sequence, tick=tick, lease_epoch=epoch, arm_session=arm_session)
-        return self.authority.offer(made, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS))
+        return self.authority.offer_command(made, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS))

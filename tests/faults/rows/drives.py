@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.model.scenario import RunConfig, write
+from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.programs.preflight import check_plugins
 from snakesim_operator.run import children
 from tests.faults.drives_process import READY
@@ -64,14 +64,14 @@ class DrivesOutside:
             self._words.append(words)
             log.write(words)
 
-        write(config, folder / "drives.json")
+        write_config(config, folder / "drives.json")
         module = ["tests.faults.drives_process", str(folder / "drives.json"), str(self._notes), "--pose", POSE]
-        self._child = children.start("drives", module, keep)
+        self._child = children.start_child("drives", module, keep)
         wait_until(lambda: READY in self.said(), "the drives", START_LIMIT_S)
 
     def said(self) -> str:
         """What the process printed."""
-        if (how := self._child.how_it_ended()) is not None:
+        if (how := self._child.describe_end()) is not None:
             raise TrialError(how)
         return b"".join(self._words).decode(errors="replace")
 

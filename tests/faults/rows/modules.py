@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from snakesim_can_backend.protocol.definitions import CommandAction
-from snakesim_hal.model.fault_kinds import Injection, checked
+from snakesim_hal.model.fault_kinds import Injection, check_injection
 from snakesim_hal.wire.messages import Answer, Status
 from tests.faults import bus_log
 from tests.faults.observer import Observer, TrialError
@@ -48,7 +48,7 @@ def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
 
 def injected(observer: Observer, injection: Injection, what: Sequence[str], period_ms: float) -> Trial:
     """One trial of it. what: names that the driver may give it; period_ms: of the host."""
-    injection, asked_ns = checked(injection), time.monotonic_ns()
+    injection, asked_ns = check_injection(injection), time.monotonic_ns()
     answer = observer.inject("hal", injection.kind, injection.target, for_s=ASKED_FOR_S)
     begun = _begun_tick(answer, period_ms)
     status = observer.first_fault(asked_ns)
@@ -104,7 +104,7 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
         with Robot(folder, config) as made:
             host = made.start("host")
             host.process.wait(START_LIMIT_S)
-            words = "\n".join(host.words.last())
+            words = "\n".join(host.output.last_lines())
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
         yield Trial(

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 
-from snakesim_hal.model.fault_kinds import writer_of
+from snakesim_hal.model.fault_kinds import find_writer
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Mode
 from tests.faults.observer import Observer, TrialError
@@ -60,12 +60,12 @@ def withheld(key: str, request: Request) -> Iterator[Trial]:
 def _cut(observer: Observer, key: str) -> int:
     """Have a stream's writer lose all of it; when that was asked for, by the monotonic clock."""
     asked_ns = time.monotonic_ns()
-    observer.inject(writer_of(key), "drop", key)
+    observer.inject(find_writer(key), "drop", key)
     return asked_ns
 
 
 def _mend(observer: Observer, key: str) -> None:
-    observer.inject(writer_of(key), "drop", key, end=True)
+    observer.inject(find_writer(key), "drop", key, end=True)
 
 
 def _pushing(made: Robot, observer: Observer) -> None:

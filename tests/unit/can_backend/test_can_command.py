@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import aligned
+from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 from tests.unit.can_backend.frames import health, heartbeat
@@ -120,7 +120,7 @@ def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
     assert rows[2]["state"] == "disarmed" and rows[2]["faults"] == "none"
     assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
     assert heard and set(heard) == {make_command(CommandAction.IDENTIFY)}
-    heading, *lines = aligned(COLUMNS, rows)
+    heading, *lines = align_columns(COLUMNS, rows)
     assert heading.split() == list(COLUMNS) and len(lines) == 3
 
 

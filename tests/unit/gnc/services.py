@@ -9,7 +9,7 @@ from typing import Any
 from snakesim_gnc.control.controller import Action, View
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import SnakesimError
-from snakesim_hal.model.plugins import CONTROLLERS, offered
+from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link, Reader, open_session
 from snakesim_hal.programs.preflight import find_service
@@ -93,7 +93,7 @@ def stage(**config: Any) -> Iterator[Stage]:
     made = run_config(**{**common, "allow_fault_injection": True, **POSE, **config})
     Showing.views, Showing.answers = [], []
     with (
-        offered(CONTROLLERS, "showing", Showing),
+        offer_plugin(CONTROLLERS, "showing", Showing),
         running(made) as run,
         open_session(run.link) as session,
         ExitStack() as stack,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.progress import Located, Progress
+from snakesim_gnc.control.progress import Located, PathProgress
 from snakesim_gnc.geometry.body_on_path import BodyOnPath, chain_nodes, compute_heading_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
@@ -65,8 +65,8 @@ def test_pitch_joints_count_as_straight():
     assert [body.link_at(s) for s in (0.0, 0.06, 0.2, 0.43)] == [0, 1, 2, 4]
 
 
-def make_progress() -> Progress:
-    return Progress(PlanarBody(make_robot()), speed_filter_s=0.03)
+def make_progress() -> PathProgress:
+    return PathProgress(PlanarBody(make_robot()), speed_filter_s=0.03)
 
 
 def follow(progress, stage, speed_m_s, ticks):

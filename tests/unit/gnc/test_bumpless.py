@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.bumpless import HandOver
-from snakesim_hal.safety.limiter import bumpless_target
+from snakesim_hal.safety.limiter import find_bumpless_target
 from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import make_robot
 from tests.unit.hal.rig import state
@@ -18,7 +18,7 @@ values = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
 def bumpless(mode: Mode, angle, velocity, torque):
     """What the HAL's own limiter takes for the target that changes nothing."""
     parts = zip(ROBOT.joints, angle, velocity, torque, strict=True)
-    return [bumpless_target(joint, mode, q, speed, push) for joint, q, speed, push in parts]
+    return [find_bumpless_target(joint, mode, q, speed, push) for joint, q, speed, push in parts]
 
 
 @given(values, values, values, values)

@@ -14,7 +14,7 @@ from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, O
 from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
-from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, load, parse_set, place_all, start_of
+from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, find_start_pose, load, parse_set, place_obstacles
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 from tests.unit.gnc.stage import make_world
 
@@ -28,9 +28,9 @@ def field(density: float = 8.0) -> tuple[list[Obstacle], np.ndarray]:
     """Obstacles, and the nodes of the body where it is laid down."""
     flags = ("scene.random_field.0.seed=1", f"scene.random_field.0.density_per_m2={density}")
     config = load("surveyed_clutter", [parse_set(flag) for flag in flags]).config
-    start, segments = start_of(config), yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
+    start, segments = find_start_pose(config), yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
     body = chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
-    return [placed.obstacle for placed in place_all(config)], body
+    return [placed.obstacle for placed in place_obstacles(config)], body
 
 
 def world(at_s: float, obstacles: list[Obstacle]) -> World:

@@ -64,7 +64,7 @@ def test_a_command_names_the_joint_state_that_it_answers() -> None:
         commands = session.reader(keys.JOINT_COMMAND, JointCommand)
         wait_until(commands.drain, "commands")
         lose = FaultRequest(kind="drop", target=keys.JOINTS, amount=0.5)
-        assert made.run.ask(keys.fault("hal"), lose).ok
+        assert made.run.ask(keys.fault_key("hal"), lose).ok
         for reader in (clocks, joints, commands):
             reader.drain()
         named: set[int] = set()
@@ -80,12 +80,12 @@ def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
         for sender, key, what in (("hal", keys.POSE, "world"), ("navigation", keys.TRAJECTORY, "trajectory")):
-            assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key)).ok
+            assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key)).ok
             wait_until(lambda what=what: blind(made, what), f"views without a {what}")
             reported, words = made.tells(f"{key} is "), f"at most {limits[key.partition('/')[2] + '_s']:.3g} s"
             assert reported.state == "NotLocomoting" and words in reported.reason
             since = len(made.views)
-            assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key, end=True)).ok
+            assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key, end=True)).ok
             wait_until(lambda since=since: sighted(made, since), "views with everything again")
             wait_until(lambda key=key: f"{key} is " not in known(made.state()).reason, "another reason")
         for view in made.views:  # nothing too old was ever handed over

@@ -37,7 +37,9 @@ class Bench:
         self.settings.answer_requests(CLOCK)
 
     def ask(self, settings: str, controller: str = "obstacle_triplet") -> Answer:
-        return self.operator.ask(keys.SETTINGS, SettingsRequest(who="ada", controller=controller, settings=settings))
+        return self.operator.request(
+            keys.SETTINGS, SettingsRequest(who="ada", controller=controller, settings=settings)
+        )
 
     def in_force(self) -> ControlSettings:
         found = self.operator.latest(keys.SETTINGS_IN_FORCE, ControlSettings, 1.0)

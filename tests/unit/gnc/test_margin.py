@@ -21,7 +21,7 @@ def touching(tail_s_m: float, pegs: list[Obstacle] | None = None) -> tuple[np.nd
     """Nodes of a body on the usual route, what touches it, and its joints' change of angle per metre of the way."""
     stage = make_stage()
     nodes = nodes_of(stage, tail_s_m)
-    outlines = Outlines.of(stage.pegs if pegs is None else pegs)
+    outlines = Outlines.from_obstacles(stage.pegs if pegs is None else pegs)
     slope = (angles_of(nodes_of(stage, tail_s_m + 0.01)) - angles_of(nodes)) / 0.01
     return nodes, find_touches(nodes, BODY_RADIUS_M, outlines, reach_m=0.03, friction=0.0), slope
 

@@ -26,7 +26,7 @@ def peg(name: str, x: float, side: int) -> Obstacle:
 
 
 def pushing(pegs: Sequence[Obstacle]):
-    touches = find_touches(NODES, 0.04, Outlines.of(pegs), reach_m=0.03, friction=0.0)
+    touches = find_touches(NODES, 0.04, Outlines.from_obstacles(pegs), reach_m=0.03, friction=0.0)
     return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), contact_gap_scale_m=0.005)
 
 

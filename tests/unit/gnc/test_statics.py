@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.obstacle_triplet import bending_torque_nm, solve_triplet
+from snakesim_gnc.control.obstacle_triplet import compute_bending_torque_nm, solve_triplet
 from snakesim_gnc.control.obstacle_triplet.statics import add_tether
 
 PROPULSION_N = 35.0
@@ -150,13 +150,13 @@ def test_bending_torque_is_the_same_from_ahead_and_from_behind_and_at_the_propul
     pushed = add_tether(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
     joints_w = np.array(joints)
     joints_s = joints_w[:, 0]
-    ahead = bending_torque_nm(joints_w, joints_s, case.points, places, pushed)
+    ahead = compute_bending_torque_nm(joints_w, joints_s, case.points, places, pushed)
     for joint_w, joint_s, torque in zip(joints_w, joints_s, ahead, strict=True):
         behind = places <= joint_s
         moments = cross(case.points - joint_w, pushed)
         assert torque == pytest.approx(moments[behind].sum(), abs=1e-7)
         assert torque == pytest.approx(-moments[~behind].sum(), abs=1e-7)
-    (torque,) = bending_torque_nm(case.joint[None], [0.4], case.points, places, pushed)
+    (torque,) = compute_bending_torque_nm(case.joint[None], [0.4], case.points, places, pushed)
     assert torque == pytest.approx(solved.torque_nm, rel=1e-9, abs=1e-9)
 
 

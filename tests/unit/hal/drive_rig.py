@@ -4,7 +4,7 @@ from typing import Any
 
 from snakesim_drivers.kit.drive_backend import DriveBackend
 from snakesim_hal.backend import SafeSetpoints
-from snakesim_hal.model.fault_kinds import parse
+from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
 
@@ -52,4 +52,4 @@ class DriveRig:
 
     def go_wrong(self, text: str, *, begins: bool = True) -> None:
         """Begin or end a fault, such as `mute:joint_2@0-9`."""
-        assert self.backend.inject(parse(text), begins=begins)
+        assert self.backend.inject(parse_injection(text), begins=begins)

@@ -13,10 +13,10 @@ import msgspec
 
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.faults.allowed import faults_of_host
+from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host, HostOptions
-from snakesim_hal.model.scenario import RunConfig, description_of
+from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.wire import keys
@@ -90,7 +90,7 @@ class LagBackend:
 
     def describe(self) -> Description:
         """From the robot file, and the pose."""
-        described = msgspec.structs.replace(description_of(self._config, "lag"), simulated_time=True)
+        described = msgspec.structs.replace(describe_run_robot(self._config, "lag"), simulated_time=True)
         if any(sensor.key == keys.POSE for sensor in described.sensors):
             return described
         pose_sensor = SensorDescription(key=keys.POSE, rate_hz=0.2e9 / self._config.period_ns, delay_s=0.0)
@@ -174,14 +174,14 @@ class Follower:
         self, clock: Clock, client: Client, commander: Commander, joints: JointState | None, robot: Description
     ) -> None:
         self.ticks_seen.append(clock.tick)
-        if joints is not None and commander.holds(clock):
-            points = commander.stay(joints)
+        if joints is not None and commander.ensure_lease(clock):
+            points = commander.hold_position(joints)
             if clock.lifecycle == "armed":
                 self.armed_ticks.append(clock.tick)
                 wave = self.amplitude_rad * math.sin(2 * math.pi * clock.timestamp_ns * 1e-9)
                 points = RequestedSetpoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
             commander.send(clock, joints, points)
-        client.done(clock.tick)
+        client.report_done(clock.tick)
 
 
 @dataclass
@@ -210,7 +210,7 @@ class Running:
 
     def ask(self, key: str, request: Message) -> Answer:
         """Ask the host; a no is an answer too."""
-        return self.session.ask(key, request)
+        return self.session.request(key, request)
 
     def lifecycle(self, action: Any) -> Answer:
         """Arm (naming the robot rightly), disarm, clear or finish."""
@@ -237,7 +237,7 @@ def running(config: RunConfig, **host: Any) -> Iterator[Running]:
     endpoint, backend = free_endpoint(), LagBackend(config)
     link = Link(endpoint, "lab/worm")
     with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
-        faulty, faults = faults_of_host(config, GuardedBackend(backend), own)
+        faulty, faults = create_host_faults(config, GuardedBackend(backend), own)
         made = Host(config, faulty, own, HostOptions(faults=faults, **host))
         thread = threading.Thread(target=made.run, name="host")
         statuses = watcher.latched_reader(keys.STATUS, Status)

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.model.robot import RobotFile, describe
+from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Clock, Contact, Description, JointCommand, JointState, Mode, Pose, Power, Status
 
@@ -108,7 +108,7 @@ def run_config(**dotted: Any) -> RunConfig:
 def description(*, simulated_time: bool = False, **dotted: Any) -> Description:
     """The test robot as a HAL publishes it."""
     reported = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
-    return describe(robot_file(**dotted), simulated_time=simulated_time, **reported)
+    return describe_robot(robot_file(**dotted), simulated_time=simulated_time, **reported)
 
 
 def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any) -> JointState:

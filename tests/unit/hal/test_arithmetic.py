@@ -19,22 +19,22 @@ INTEL = "processor : 0\nflags\t\t: fpu sse2 fma avx2 avx512f\n"
 def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """What the kernel says of another processor."""
     monkeypatch.setattr(arithmetic, "CPUINFO", tmp_path / "cpuinfo")
-    arithmetic.environment.cache_clear()
+    arithmetic.common_environment.cache_clear()
     yield tmp_path / "cpuinfo"
-    arithmetic.environment.cache_clear()
+    arithmetic.common_environment.cache_clear()
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
 def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
     computer.write_text(INTEL)
-    wanted = arithmetic.environment()
+    wanted = arithmetic.common_environment()
     assert wanted["OPENBLAS_CORETYPE"] == "Haswell" and "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
 def test_what_was_set_before_has_no_effect(computer: Path) -> None:
     computer.write_text(INTEL.replace(" avx512f", ""))
-    wanted = arithmetic.environment()
+    wanted = arithmetic.common_environment()
     assert wanted["NPY_DISABLE_CPU_FEATURES"] == wanted["NPY_ENABLE_CPU_FEATURES"] == ""
 
 
@@ -43,12 +43,12 @@ def test_a_processor_that_cannot_or_is_not_known_is_left_alone(computer: Path, f
     """Code for AVX2 would crash there."""
     if flags is not None:
         computer.write_text(flags)
-    assert arithmetic.environment() == {} and arithmetic.is_pinned()
+    assert arithmetic.common_environment() == {} and arithmetic.is_pinned()
 
 
 def measured_with(code: str, **more: str) -> dict[str, str]:
     show = "import json; from snakesim_hal.base import arithmetic; {}; print(json.dumps(arithmetic.measured()))"
-    unset = {name: value for name, value in os.environ.items() if name not in arithmetic.environment()}
+    unset = {name: value for name, value in os.environ.items() if name not in arithmetic.common_environment()}
     done = subprocess.run(
         [sys.executable, "-c", show.format(code)], env={**unset, **more}, capture_output=True, check=True
     )
@@ -56,27 +56,27 @@ def measured_with(code: str, **more: str) -> dict[str, str]:
 
 
 def test_what_a_process_computes_with_is_measured() -> None:
-    if not arithmetic.environment():
+    if not arithmetic.common_environment():
         pytest.skip("this processor has no AVX2 and FMA, so nothing can be chosen")
     old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
-    assert arithmetic.foreign(measured_with("pass", **old)) == ["BLAS", "NumPy"]
-    assert measured_with("arithmetic.pin()", **old) == arithmetic.measured()
+    assert arithmetic.find_differing_parts(measured_with("pass", **old)) == ["BLAS", "NumPy"]
+    assert measured_with("arithmetic.pin()", **old) == arithmetic.measure_arithmetic()
     assert measured_with("import numpy; arithmetic.pin()", **old) == measured_with("pass", **old)
 
 
 def test_a_digest_of_other_arithmetic_is_said_to_be_the_computers_own() -> None:
     other = {**arithmetic.COMMON, "BLAS": "00000000", "C library": "00000000"}
-    assert arithmetic.foreign(other) == ["BLAS", "C library"]
-    said = arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign(other))
+    assert arithmetic.find_differing_parts(other) == ["BLAS", "C library"]
+    said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(other))
     otherwise = "round otherwise than on most computers with NumPy 2.2 to 2.4"
     assert said == f"0123456789abcdef, its own: BLAS and C library {otherwise}"
-    assert arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign({})) == "0123456789abcdef"
+    assert arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts({})) == "0123456789abcdef"
 
 
 def test_a_newer_wheel_is_named_and_no_computer_is_blamed_for_it() -> None:
     of_2_5 = {**arithmetic.COMMON, "BLAS": "3f7c15b6"}
-    assert arithmetic.foreign(of_2_5) == ["BLAS of NumPy 2.5"]
-    said = arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign(of_2_5))
+    assert arithmetic.find_differing_parts(of_2_5) == ["BLAS of NumPy 2.5"]
+    said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(of_2_5))
     assert said.startswith("0123456789abcdef, as on most computers with the BLAS of NumPy 2.5, which rounds otherwise")
 
 
@@ -92,7 +92,7 @@ def test_numpy_is_given_only_names_that_its_version_knows(
         "importlib.util.find_spec", lambda _: ModuleSpec("numpy", None, origin=f"{tmp_path}/__init__.py")
     )
     computer.write_text(INTEL)
-    names = arithmetic.environment()["NPY_DISABLE_CPU_FEATURES"].split()
+    names = arithmetic.common_environment()["NPY_DISABLE_CPU_FEATURES"].split()
     assert (names[0], names[-1]) == (first, last)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_hal.base.errors import raised
+from snakesim_hal.base.errors import describe_exception
 
 PLUGIN = "import numpy as np\n\n\ndef solve():\n    return np.linalg.solve(np.zeros((2, 2)), np.ones(2))\n"
 
@@ -19,7 +19,7 @@ def described(folder: Path, package: str) -> str:
     exec(compile(PLUGIN, str(folder / "plugin.py"), "exec"), names)
     with pytest.raises(np.linalg.LinAlgError) as caught:
         names["solve"]()
-    return raised(caught.value.with_traceback(caught.tb.tb_next), package)  # without this test's own line
+    return describe_exception(caught.value.with_traceback(caught.tb.tb_next), package)  # without this test's own line
 
 
 @pytest.mark.parametrize(

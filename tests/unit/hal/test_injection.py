@@ -10,21 +10,21 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import (
     KINDS,
     Injection,
-    Plan,
+    InjectionPlan,
+    check_injection,
     check_targets,
-    checked,
-    explain,
+    explain_kinds,
     kinds_in_short,
-    parse,
+    parse_injection,
 )
-from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, planned
+from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, parse_planned
 from snakesim_hal.wire import keys
 from tests.kinds_table import PAGE, with_table
 from tests.unit.hal.rig import run_config
 
 TARGETS = {
     "process": ["control", "host"],
-    "key": [keys.JOINT_COMMAND, keys.JOINTS, keys.done("guidance")],
+    "key": [keys.JOINT_COMMAND, keys.JOINTS, keys.done_key("guidance")],
     "joint": ["joint_1", "joint_13"],
     "bus": ["bus_1"],
     "simulator": ["simulator"],
@@ -46,15 +46,18 @@ def injections(draw: st.DrawFn) -> Injection:
 
 @given(injections())
 def test_texts_go_both_ways(injection: Injection) -> None:
-    there = parse(str(injection))
+    there = parse_injection(str(injection))
     assert str(there) == str(injection)
     assert (there.kind, there.target, there.part) == (injection.kind, injection.target, injection.part)
     assert there.about is KINDS[there.target_type][there.kind]
 
 
 def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
-    assert parse("drop:sensor/joints@1").amount == 1.0 and parse("delay:sensor/joints@1").amount == 0.05
-    assert parse("mute:joint_2@1").amount is None
+    assert (
+        parse_injection("drop:sensor/joints@1").amount == 1.0
+        and parse_injection("delay:sensor/joints@1").amount == 0.05
+    )
+    assert parse_injection("mute:joint_2@1").amount is None
 
 
 @pytest.mark.parametrize(
@@ -76,24 +79,26 @@ def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
     ],
 )
 def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None:
-    assert parse(text).part == part
+    assert parse_injection(text).part == part
 
 
 def test_what_is_not_there_cannot_go_wrong() -> None:
-    check_targets([parse("mute:joint_13@1"), parse("kill:host@1")], services=["control"], joints=13, buses=0)
+    check_targets(
+        [parse_injection("mute:joint_13@1"), parse_injection("kill:host@1")], services=["control"], joints=13, buses=0
+    )
     with pytest.raises(ConfigError, match="guidance writes guidance/world, and this run does not start it"):
-        check_targets([parse("drop:guidance/world@1")], services=["control"], joints=13, buses=0)
+        check_targets([parse_injection("drop:guidance/world@1")], services=["control"], joints=13, buses=0)
 
 
 def test_a_request_is_checked_like_a_text() -> None:
-    assert checked(Injection("drop", keys.JOINTS)).amount == 1.0
+    assert check_injection(Injection("drop", keys.JOINTS)).amount == 1.0
     with pytest.raises(ConfigError, match="'mute control': a process"):
-        checked(Injection("mute", "control"), "mute control")
+        check_injection(Injection("mute", "control"), "mute control")
 
 
 @given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
 def test_a_plan_gives_every_change_once_in_the_order_of_time(given_: list[Injection], looks: list[float]) -> None:
-    plan, seen = Plan(given_), []
+    plan, seen = InjectionPlan(given_), []
     for now_s in [*sorted(looks), inf]:
         due = plan.until(now_s)
         assert (all(change.at_s <= now_s for change in due) and plan.next_s() > now_s) or now_s == inf
@@ -108,7 +113,7 @@ def test_a_plan_gives_every_change_once_in_the_order_of_time(given_: list[Inject
 def test_help_explains_every_kind() -> None:
     for kinds in KINDS.values():
         for name, kind in kinds.items():
-            assert name in kinds_in_short() and name in explain() and kind.about in explain()
+            assert name in kinds_in_short() and name in explain_kinds() and kind.about in explain_kinds()
 
 
 def test_the_page_has_every_kind() -> None:
@@ -119,9 +124,9 @@ def test_the_page_has_every_kind() -> None:
 
 
 def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
-    assert [str(i) for i in planned(run_config(faults=["mute:joint_1@1"]))] == ["mute:joint_1@1"]
+    assert [str(i) for i in parse_planned(run_config(faults=["mute:joint_1@1"]))] == ["mute:joint_1@1"]
     with pytest.raises(ConfigError, match=r"scenario 'crawl': `faults\[1\]`: fault 'mute': give KIND:TARGET"):
-        planned(run_config(faults=["mute:joint_1@1", "mute"]))
+        parse_planned(run_config(faults=["mute:joint_1@1", "mute"]))
     with pytest.raises(ConfigError, match=r"`faults\[0\]`: .*no joint_4; this run has joint_1 to joint_3"):
         check_planned(run_config(faults=["mute:joint_4@1"]))
     check_planned(run_config(faults=["cut:bus_8@1", "hang:control@1", "leak:joint_3@1"]))

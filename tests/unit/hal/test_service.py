@@ -30,7 +30,7 @@ def test_nobody_is_there_before_it_hears_the_joints_because_once_armed_they_are_
     hal = network.session()
     hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
     clocks, felt = hal.publisher(keys.CLOCK, Clock), hal.publisher(keys.JOINTS, JointState)
-    done = hal.reader(keys.done("navigation"), Done)
+    done = hal.reader(keys.done_key("navigation"), Done)
     loop = ServiceLoop(Undemanding, run_config(clock_mode=CLOCK.clock_mode), network.session())
     clocks.put(CLOCK)
     loop.join()

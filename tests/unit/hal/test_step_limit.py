@@ -5,7 +5,7 @@ from contextlib import closing
 
 import pytest
 
-from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, place_of
+from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, describe_interrupted_line
 
 
 def endless() -> None:
@@ -21,7 +21,7 @@ def test_an_endless_step_is_interrupted_and_its_place_is_known() -> None:
     with closing(StepLimit(0.1)) as limit:
         with pytest.raises(StepTooLongError) as caught, limit:
             endless()
-        assert place_of(caught.value).startswith("endless() (test_step_limit.py line ")
+        assert describe_interrupted_line(caught.value).startswith("endless() (test_step_limit.py line ")
         with limit:
             pass
         time.sleep(0.4)  # between steps nothing is raised
@@ -48,8 +48,8 @@ def test_an_error_that_was_not_raised_yet_is_taken_back() -> None:
 def test_another_process_can_see_when_a_step_began() -> None:
     pulse = Pulse()
     with closing(StepLimit(60.0, pulse)) as limit:
-        assert pulse.step_s() is None
+        assert pulse.read_step_times() is None
         with limit:
-            step_s = pulse.step_s()
+            step_s = pulse.read_step_times()
             assert step_s is not None and step_s[1] - step_s[0] == pytest.approx(60.0)
-        assert pulse.step_s() is None
+        assert pulse.read_step_times() is None

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import overwrite_line, printable, report_error, say
+from snakesim_hal.base.terminal import escape_invisible, overwrite_line, print_line, report_error
 
 REPOSITORY = Path(__file__).parents[3]
 STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidirectional overrides too), surrogates, separators
@@ -20,22 +20,22 @@ STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidirectional over
 def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
     for code in range(sys.maxunicode + 1):
         if unicodedata.category(chr(code)) in STEERING:
-            assert printable(f"a{chr(code)}b").isascii(), hex(code)
-    assert printable("\x1b[2J\x9b31m\r\n\u202eoff") == "\\u001b[2J\\u009b31m\\u000d\\u000a\\u202eoff"
-    assert printable("\U000e0041") == "\\udb40\\udc41"
-    assert printable("3 N·m, ü, 関節, ⟂") == "3 N·m, ü, 関節, ⟂"
-    assert printable("a\nb\tc", keep="\n") == "a\nb\\u0009c"
+            assert escape_invisible(f"a{chr(code)}b").isascii(), hex(code)
+    assert escape_invisible("\x1b[2J\x9b31m\r\n\u202eoff") == "\\u001b[2J\\u009b31m\\u000d\\u000a\\u202eoff"
+    assert escape_invisible("\U000e0041") == "\\udb40\\udc41"
+    assert escape_invisible("3 N·m, ü, 関節, ⟂") == "3 N·m, ü, 関節, ⟂"
+    assert escape_invisible("a\nb\tc", keep="\n") == "a\nb\\u0009c"
 
 
 @given(st.text())
 def test_a_json_text_that_is_printed_stays_one(text: str) -> None:
     value = {text: [text]}
-    shown = printable(json.dumps(value, ensure_ascii=False))
+    shown = escape_invisible(json.dumps(value, ensure_ascii=False))
     assert json.loads(shown) == value and "\n" not in shown
 
 
 def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
-    say("\x1b]0;title\x07")
+    print_line("\x1b]0;title\x07")
     report_error(ConfigError("a.toml: \x9b2J\n  next: trust me", "second line"), "snakesim")
     assert overwrite_line("tick 10 \x1b[1A and much more", 24, 3) == 24
     out, err = capsys.readouterr()

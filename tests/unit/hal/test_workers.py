@@ -12,7 +12,7 @@ import pytest
 from snakesim_hal.base.workers import Worker, start_worker
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.network.private_channel import HostEnd, socket_pair
-from snakesim_hal.network.stop_port import Reply, ask_to_stop, open_stop_port, serve_stops
+from snakesim_hal.network.stop_port import Reply, open_stop_port, request_stop, serve_stops
 from snakesim_hal.wire.messages import Answer, LifecycleRequest
 from tests.harness.wait import wait_until
 
@@ -71,7 +71,7 @@ def stop_port_serves() -> bool:
 
     with open_stop_port(LOOPBACK, 0) as opened:
         serve_stops(opened, "worm", take)
-        return ask_to_stop(LOOPBACK, opened.getsockname()[1], "anna", 5.0) is not None
+        return request_stop(LOOPBACK, opened.getsockname()[1], "anna", 5.0) is not None
 
 
 def stop_is_latched(folder: Path) -> bool:

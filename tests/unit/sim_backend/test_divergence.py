@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Mode
 from tests.unit.sim_backend.rig import Run, make_config
 
@@ -32,7 +32,7 @@ def test_what_is_no_number_is_found_at_once(where, value):
         run.go()
     samples = run.sample()
     for message in (samples.joints, *samples.others.values()):
-        assert Decoder(type(message)).decode(encode(message), encoding_of(type(message))) == message  # refuses NaN
+        assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message  # refuses NaN
 
 
 def test_a_robot_too_quick_for_the_step_is_found_out():

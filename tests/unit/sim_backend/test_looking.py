@@ -10,14 +10,14 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
 from snakesim_sim_backend.flat_ground import SINK_M
 from tests.unit.sim_backend.rig import Run, make_config
 
 NOSE_M = 13 * 0.11 + 0.04
 CAMERA = {"name": "head", "width": 161, "height": 121, "rate_hz": 100.0, "delay_s": 0.0, "range_min_m": 0.02}
-HEAD = keys.depth("head")
+HEAD = keys.depth_key("head")
 POST = {"cylinder": [{"position_m": [NOSE_M + 1.05, 0.0], "radius_m": 0.05, "height_m": 1.0, "name": "post"}]}
 
 
@@ -33,7 +33,7 @@ def seen(run, key=HEAD) -> Any:
     run.go()
     message = run.sample().others[key]
     run.sim.close()
-    assert Decoder(type(message)).decode(encode(message), encoding_of(type(message))) == message
+    assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
     return message
 
 
@@ -102,7 +102,7 @@ def test_what_is_too_near_or_too_far_is_not_measured():
 
 def test_a_lidar_measures_along_each_beam_from_right_to_left():
     scene = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.4], "radius_m": 0.2, "height_m": 1.0}]}
-    scan = seen(looking(scene, kind="range", beams=181, fov_rad=3.0), keys.ranges("front"))
+    scan = seen(looking(scene, kind="range", beams=181, fov_rad=3.0), keys.ranges_key("front"))
     assert isinstance(scan, Ranges)
     angles = scan.angle_min_rad + scan.angle_step_rad * np.arange(181)
     assert (angles[0], angles[-1]) == pytest.approx((-1.5, 1.5))
@@ -116,9 +116,9 @@ def test_a_lidar_measures_along_each_beam_from_right_to_left():
 
 
 def test_a_range_finder_is_a_lidar_of_one_beam():
-    scan = seen(looking(POST, kind="range"), keys.ranges("front"))
+    scan = seen(looking(POST, kind="range"), keys.ranges_key("front"))
     assert scan.range_m == [pytest.approx(1.0, abs=1e-6)]
-    assert seen(looking(POST, kind="range", range_max_m=0.9), keys.ranges("front")).range_m == [None]
+    assert seen(looking(POST, kind="range", range_max_m=0.9), keys.ranges_key("front")).range_m == [None]
 
 
 def test_noise_and_dropouts_have_the_size_of_the_robot_file():
@@ -129,7 +129,7 @@ def test_noise_and_dropouts_have_the_size_of_the_robot_file():
     assert np.nanmean(depth_m) == pytest.approx(2.0, abs=0.001)
     assert np.nanstd(depth_m) == pytest.approx(0.002 + 0.003 * 2.0**2, rel=0.03)
     noisy = {"beams": 1001, "fov_rad": 0.2, "noise_m": 0.01, "dropout": 0.2}
-    scan = seen(looking(wall, kind="range", **noisy), keys.ranges("front"))
+    scan = seen(looking(wall, kind="range", **noisy), keys.ranges_key("front"))
     angles = scan.angle_min_rad + scan.angle_step_rad * np.arange(1001)
     found = np.array([np.nan if x is None else x for x in scan.range_m])
     assert np.isnan(found).mean() == pytest.approx(0.2, abs=0.04)
@@ -141,10 +141,10 @@ def test_a_sonar_of_ones_own_is_a_file_and_a_line_in_the_robot_file():
     sonar = {"model": f"{Path(__file__).parents[3] / 'examples' / 'sonar.py'}:Sonar", "settings": {"cone_rad": 0.5}}
     aside = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.2], "radius_m": 0.05, "height_m": 1.0}]}
     place = {"position_m": [0.095, 0.0, 0.5], "pitch_rad": 0.0, "range_max_m": 2.0}
-    heard = seen(looking(aside, kind="range", **place, **sonar), keys.ranges("front"))
+    heard = seen(looking(aside, kind="range", **place, **sonar), keys.ranges_key("front"))
     assert heard.range_m == [pytest.approx(np.hypot(1.0, 0.2) - 0.05, abs=0.02)]
     narrow = {**sonar, "settings": {"cone_rad": 0.2}}
-    assert seen(looking(aside, kind="range", **place, **narrow), keys.ranges("front")).range_m == [None]
+    assert seen(looking(aside, kind="range", **place, **narrow), keys.ranges_key("front")).range_m == [None]
 
 
 # --- by OpenGL -------------------------------------------------------------------------------------------------
@@ -168,13 +168,16 @@ def test_rendered_depth_is_that_of_the_rays():
 
 def test_a_colour_image_comes_beside_the_depth_and_shows_the_same():
     run = rendered(color=True)
-    image = seen(run, keys.color("head"))
+    image = seen(run, keys.color_key("head"))
     assert isinstance(image, ColorImage)
     rgb = np.frombuffer(image.rgb, np.uint8).reshape(image.height, image.width, 3).astype(int)
     post, ground = rgb[40, 80], rgb[110, 20]
     assert post[2] > post[0] + 20  # blue
     assert ground[0] > ground[2] + 10  # sand
-    assert [sensor.key for sensor in run.sim.describe().sensors][-2:] == [keys.depth("head"), keys.color("head")]
+    assert [sensor.key for sensor in run.sim.describe().sensors][-2:] == [
+        keys.depth_key("head"),
+        keys.color_key("head"),
+    ]
 
 
 def test_without_opengl_the_error_names_what_to_install(monkeypatch):

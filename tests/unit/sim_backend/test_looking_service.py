@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.plugins import SERVICES, offered
+from snakesim_hal.model.plugins import SERVICES, offer_plugin
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.client import Client
 from snakesim_hal.programs.single_process import InProcessRun
@@ -17,7 +17,7 @@ from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensor_service import SensorService
 from tests.unit.sim_backend.rig import Run
 
-HEAD = keys.depth("head")
+HEAD = keys.depth_key("head")
 QUIET = ("noise_m=0", "noise_m_per_m2=0", "dropout=0")
 
 
@@ -30,7 +30,7 @@ def config_of(*sets: str) -> RunConfig:
 def images_of(config: RunConfig) -> list[DepthImage]:
     """What somebody who acts every tick reads, as the clock names it."""
     found: dict[int, DepthImage] = {}
-    with offered(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
+    with offer_plugin(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
         onlooker = Client(run.network.session(), "onlooker")
         images, ticks = onlooker.subscribe(HEAD, DepthImage), onlooker.ticks(0.0)
         for _ in run.iterate_ticks():
@@ -60,7 +60,7 @@ def test_a_robot_on_can_sees_what_the_simulated_robot_sees_from_the_same_place()
 
 def test_what_the_backend_has_itself_is_left_to_it() -> None:
     config = config_of()
-    with offered(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
+    with offer_plugin(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
         service = run._loops["sensor"].service  # pyright: ignore[reportPrivateUsage]
         assert isinstance(service, SensorService)
         assert service._readers == []  # pyright: ignore[reportPrivateUsage]

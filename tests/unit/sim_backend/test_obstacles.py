@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.outlines import outline_distance_m
-from snakesim_hal.model.scenario import place_all
+from snakesim_hal.model.scenario import place_obstacles
 from tests.unit.sim_backend.rig import Run, make_config
 
 KINDS = {
@@ -22,7 +22,7 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
     config = make_config(scene=scene)
     run = Run(config)
     data = run.sim.data
-    (placed,) = place_all(config)
+    (placed,) = place_obstacles(config)
     center = np.array(placed.obstacle.position_w[:2])
     radius = config.robot.module.radius_m
     for angle in np.arange(0.2, 2 * np.pi, 0.7):

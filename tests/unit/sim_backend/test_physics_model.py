@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.scenario import load, start_of
+from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.physics import Physics
@@ -328,7 +328,7 @@ def test_what_blows_up_is_reported_at_once_and_for_good_and_no_number_is_lost(to
     bad[4] = torque
     with pytest.raises(BackendError, match="diverged at step 11"):
         physics_model.advance(bad)
-    assert physics_model.angle_rad == pytest.approx(start_of(config).angles_rad, abs=1e-3)
+    assert physics_model.angle_rad == pytest.approx(find_start_pose(config).angles_rad, abs=1e-3)
     assert np.isfinite(physics_model.shaft_torque_nm()).all()
     imu = physics_model.imu()
     assert imu is not None

@@ -15,7 +15,7 @@ from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from tests.unit.sim_backend.rig import Run, make_config
 
-HEAD = keys.depth("head")
+HEAD = keys.depth_key("head")
 CAMERA = {"name": "head", "width": 40, "height": 30, "rate_hz": 20.0}
 WALL = {"ground": {"friction": 0.0}, "box": [{"position_m": [4.0, 0.0], "size_m": [0.5, 9.0, 3.0]}]}
 SLOW = """

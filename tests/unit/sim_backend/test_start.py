@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.scenario import load, start_of
+from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.flat_ground import SINK_M
-from snakesim_sim_backend.ground import hills
+from snakesim_sim_backend.ground import make_heights
 from tests.unit.sim_backend.rig import Run, make_config
 
 HILLS = {"ground": {"friction": 0.6, "heightfield": {"height_m": 0.06, "wavelength_m": 0.8, "area_m": 6.0}}}
@@ -28,7 +28,7 @@ def deepest_m(run):
 def stays(run, seconds=1.0, within_m=2e-3):
     """Holding the angles of its start, the snake does not move any more."""
     start = run.sim.true_state()
-    run.command([Mode.POSITION] * run.count, start_of(run.config).angles_rad.tolist())
+    run.command([Mode.POSITION] * run.count, find_start_pose(run.config).angles_rad.tolist())
     run.go(seconds)
     end = run.sim.true_state()
     assert np.linalg.norm(end.base_position_w - start.base_position_w) < within_m
@@ -38,7 +38,7 @@ def stays(run, seconds=1.0, within_m=2e-3):
 def test_on_flat_ground_it_lies_at_its_start_at_rest_at_time_0():
     config = load("triplet").config
     run = Run(config)
-    state, pose = run.sim.true_state(), start_of(config)
+    state, pose = run.sim.true_state(), find_start_pose(config)
     assert state.time_s == 0.0
     assert state.base_position_w == pytest.approx([*pose.position_w, config.robot.module.radius_m], abs=1.1 * SINK_M)
     assert state.angles_rad == pytest.approx(pose.angles_rad, abs=1e-3)
@@ -50,9 +50,9 @@ def test_on_flat_ground_it_lies_at_its_start_at_rest_at_time_0():
 
 def test_hills_have_the_height_asked_for_and_repeat_for_a_seed():
     uneven = uneven_of(make_config(scene=HILLS))
-    heights = hills(uneven)
+    heights = make_heights(uneven)
     assert (heights.min(), heights.max()) == pytest.approx((-0.03, 0.03))
-    assert np.array_equal(heights, hills(uneven))
+    assert np.array_equal(heights, make_heights(uneven))
     spacing = uneven.area_m / (len(heights) - 1)
     assert np.abs(np.diff(heights, axis=0)).max() / spacing < 2 * np.pi * uneven.height_m / uneven.wavelength_m
     up_and_down = np.abs(np.diff(np.sign(heights - heights.mean()), axis=1)).sum(axis=1).mean() / 2
@@ -62,7 +62,7 @@ def test_hills_have_the_height_asked_for_and_repeat_for_a_seed():
 def test_the_height_field_is_where_the_heights_say():
     config = make_config(scene=HILLS)
     run = Run(config, settle_s=0.0)
-    heights = hills(uneven_of(config))
+    heights = make_heights(uneven_of(config))
     grid = np.linspace(-3.0, 3.0, len(heights))
     hit = np.zeros(1, dtype=np.int32)
     for i, j in ((5, 80), (60, 12), (33, 40)):
@@ -75,7 +75,7 @@ def test_the_height_field_is_where_the_heights_say():
 def test_on_uneven_ground_it_rests_where_it_was_put(robot):
     run = Run(make_config(scene={**HILLS, **CURVE}, base_robot=robot, start={"on_route": True}))
     assert deepest_m(run) < 2e-3
-    state, pose = run.sim.true_state(), start_of(run.config)
+    state, pose = run.sim.true_state(), find_start_pose(run.config)
     assert state.base_position_w[:2] == pytest.approx(pose.position_w, abs=0.05)
     assert not state.velocities_rad_s.any()
     stays(run, within_m=0.01)

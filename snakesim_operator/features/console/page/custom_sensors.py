@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from snakesim_hal.wire.own_sample import OwnKind, own_kinds
+from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.features.console.page.joint_charts import (
     HISTORY_S,
     MAX_SAMPLES,
@@ -33,7 +33,7 @@ class Quantity:
 def collect_numbers(snapshot: RobotSnapshot) -> dict[Quantity, dict[str, float]]:
     """Return the numbers of all custom sensors by quantity, then by sensor: `left`, or `left.0` of a list."""
     numbers: dict[Quantity, dict[str, float]] = {}
-    for key, kind in own_kinds(snapshot.robot).items():
+    for key, kind in find_custom_messages(snapshot.robot).items():
         sample = snapshot.own.get(key)
         if sample is None:
             continue
@@ -45,10 +45,10 @@ def collect_numbers(snapshot: RobotSnapshot) -> dict[Quantity, dict[str, float]]
     return numbers
 
 
-def sensor_table(snapshot: RobotSnapshot) -> str:
+def format_sensor_table(snapshot: RobotSnapshot) -> str:
     """Return a table of each sensor's newest message and its age."""
     rows: list[tuple[str, str]] = []
-    for key, kind in own_kinds(snapshot.robot).items():
+    for key, kind in find_custom_messages(snapshot.robot).items():
         sample = snapshot.own.get(key)
         if sample is None:
             rows.append((escape_text(key), "nothing yet"))
@@ -67,7 +67,7 @@ def _format_age(snapshot: RobotSnapshot, key: str) -> str:
     return f", {stream.age_s * 1e3:.0f} ms old"
 
 
-def _format_value(kind: OwnKind, name: str, value: float) -> str:
+def _format_value(kind: CustomMessage, name: str, value: float) -> str:
     if math.isnan(value):
         return "unknown"
     unit = kind.units[name.partition(".")[0]]
@@ -101,7 +101,7 @@ class CustomSensorCharts:
 
     def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw the table and the charts; called a few times a second."""
-        self._table.content = sensor_table(snapshot)
+        self._table.content = format_sensor_table(snapshot)
         for quantity in list(self._history)[:MAX_CHARTS]:
             self._show_chart(quantity)
 

@@ -7,12 +7,12 @@ from typing import Literal
 
 import viser
 
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
+from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_operator.features.console.operations import BUTTON_VALIDITY_NS, KEY_VALIDITY_NS
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import PageAction
-from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, turned
+from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, rotate_heading
 
 HOLD_REPEAT_HZ = 10.0  # how often a page repeats that the button is held
 MAX_SPEED_M_S = 0.5  # end of the speed slider
@@ -132,7 +132,7 @@ class DriveControls:
 
     def _steer(self, step_rad: float) -> None:
         """Change the heading by a step."""
-        heading_w_rad = turned(self._heading_w_rad, step_rad, self._find_body_yaw_w_rad())
+        heading_w_rad = rotate_heading(self._heading_w_rad, step_rad, self._find_body_yaw_w_rad())
         self._heading_deg.value = _round_to_slider_deg(heading_w_rad)
 
     @property
@@ -144,7 +144,7 @@ class DriveControls:
         if snapshot is None or snapshot.base is None:
             return None
         _, orientation_wxyz = snapshot.base
-        return yaw_of(rotation_from_quaternion(orientation_wxyz))
+        return yaw_from_rotation(rotation_from_quaternion(orientation_wxyz))
 
 
 def _round_to_slider_deg(angle_rad: float) -> int:

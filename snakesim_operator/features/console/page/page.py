@@ -271,7 +271,7 @@ class Page:
 
     # --- each frame ------------------------------------------------------------------------------------------
 
-    def show(self, snapshot: RobotSnapshot | None) -> None:
+    def show_snapshot(self, snapshot: RobotSnapshot | None) -> None:
         """Show a snapshot; None while there is no robot."""
         previous = self._snapshot
         self._snapshot = snapshot

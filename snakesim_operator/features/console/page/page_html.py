@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from html import escape
 
-from snakesim_hal.base.terminal import printable
+from snakesim_hal.base.terminal import escape_invisible
 from snakesim_hal.wire.messages import Description, Status
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
@@ -33,7 +33,7 @@ SIGNALS = (
 
 def escape_text(text: object) -> str:
     """Return text from any source such that it is harmless in a page."""
-    return escape(printable(str(text)))
+    return escape(escape_invisible(str(text)))
 
 
 def describe_backend(robot: Description) -> tuple[str, str]:

@@ -12,7 +12,7 @@ import msgspec
 import viser
 
 from snakesim_hal.wire.messages import ControlSettings
-from snakesim_operator.robot_commands.parameters import Parameter, parameters_of
+from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class InputField:
 def list_input_fields(settings: ControlSettings) -> list[InputField]:
     """Return the inputs for the settings that a form can change; empty for a schema that cannot be read."""
     fields: list[InputField] = []
-    for parameter in parameters_of(settings):
+    for parameter in read_parameters(settings):
         field = _make_field(parameter)
         if field is not None:
             fields.append(field)
@@ -43,9 +43,9 @@ def _make_field(parameter: Parameter) -> InputField | None:
     """Return the input for a parameter; None if it is of a kind that has no input."""
     value = parameter.value
     if isinstance(value, bool):
-        return InputField(parameter.name, value, hint=parameter.about)
+        return InputField(parameter.name, value, hint=parameter.description)
     if isinstance(value, str) and value in parameter.choices:
-        return InputField(parameter.name, value, choices=parameter.choices, hint=parameter.about)
+        return InputField(parameter.name, value, choices=parameter.choices, hint=parameter.description)
     if isinstance(value, int | float) and math.isfinite(value):
         return _make_number_field(parameter, value)
     return None
@@ -55,16 +55,16 @@ def _make_number_field(parameter: Parameter, value: float) -> InputField:
     """Return the input for a number: up to four times its value, as far as the parameter's bounds allow."""
     reach = 4.0 * abs(value) or 1.0
     low = -reach
-    if parameter.least is not None:
-        low = max(parameter.least, -reach)
+    if parameter.minimum is not None:
+        low = max(parameter.minimum, -reach)
     high = reach
-    if parameter.most is not None:
-        high = min(parameter.most, reach)
+    if parameter.maximum is not None:
+        high = min(parameter.maximum, reach)
     step = 1.0
     if not isinstance(value, int):
         # The power of ten that divides the range into 100 to 1000 steps.
         step = 10.0 ** math.floor(math.log10(max(high - low, 1e-9) / 100))
-    if parameter.above_least and low == parameter.least:
+    if parameter.excludes_minimum and low == parameter.minimum:
         low += step  # the bound itself is not allowed
     return InputField(
         parameter.name,
@@ -80,8 +80,8 @@ def _make_number_field(parameter: Parameter, value: float) -> InputField:
 def _describe_number(parameter: Parameter) -> str:
     """Return description, bounds and unit of a parameter, as far as it has them."""
     parts: list[str] = []
-    if parameter.about:
-        parts.append(parameter.about)
+    if parameter.description:
+        parts.append(parameter.description)
     if parameter.range:
         parts.append(f"{parameter.range} {parameter.unit}".removesuffix(" 1").strip())
     return "; ".join(parts)

@@ -10,7 +10,7 @@ from collections import Counter, deque
 from typing import Any
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
@@ -25,7 +25,7 @@ from snakesim_hal.wire.messages import (
     Pose,
     World,
 )
-from snakesim_hal.wire.own_sample import own_kinds
+from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, Stream
 
@@ -51,7 +51,7 @@ STREAM_KEYS = (
     keys.TRAJECTORY,
     keys.CONTROL_STATE,
 )
-IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOUR_ALL)
+IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOR_ALL)
 
 
 class KeyBuffer:
@@ -104,10 +104,10 @@ class LiveRobot:
         self._counted_s = now_s
         self._counts: dict[str, int] = {}
         for key in LATCHED_KEYS:
-            buffer = self._add_buffer(key, keys.message_at(key), MAX_ARRIVALS)
+            buffer = self._add_buffer(key, keys.find_message(key), MAX_ARRIVALS)
             session.on_latched_arrival(key, buffer.store)
         for key in STREAM_KEYS:
-            buffer = self._add_buffer(key, keys.message_at(key), MAX_ARRIVALS)
+            buffer = self._add_buffer(key, keys.find_message(key), MAX_ARRIVALS)
             session.on_arrival(key, buffer.store)
         for key in (*IMAGE_ROWS, keys.OWN_ALL):
             session.on_arrival(key, self._store_described)
@@ -125,8 +125,8 @@ class LiveRobot:
         """
         buffer = self._buffers.get(arrival.key)
         has_room = len(self._buffers) < len(LATCHED_KEYS) + len(STREAM_KEYS) + MAX_CAMERAS
-        if buffer is None and has_room and keys.row_key(arrival.key) in IMAGE_ROWS:
-            buffer = self._add_buffer(arrival.key, keys.message_at(arrival.key), MAX_IMAGE_ARRIVALS)
+        if buffer is None and has_room and keys.find_row_key(arrival.key) in IMAGE_ROWS:
+            buffer = self._add_buffer(arrival.key, keys.find_message(arrival.key), MAX_IMAGE_ARRIVALS)
         if buffer is not None:
             buffer.store(arrival)
 
@@ -135,7 +135,7 @@ class LiveRobot:
         """The newest description."""
         return self._newest.get(keys.DESCRIPTION)
 
-    def snapshot(self) -> RobotSnapshot | None:
+    def take_snapshot(self) -> RobotSnapshot | None:
         """Return what is known of the robot now; None before it has described itself."""
         self._decode_arrivals()
         self._measure_rates()
@@ -183,14 +183,14 @@ class LiveRobot:
                 if key == keys.DESCRIPTION:
                     self._update_description(message)
                     continue
-                difference = None if self.robot is None else mismatch(message, self.robot)
+                difference = None if self.robot is None else find_mismatch(message, self.robot)
                 if difference is not None:
                     self.rejected[difference.reason] += 1
                 else:
                     self._keep_message(key, message)
 
     def _keep_message(self, key: str, message: Any) -> None:
-        if keys.row_key(key) == keys.OWN_ALL and key not in self._buffers:
+        if keys.find_row_key(key) == keys.OWN_ALL and key not in self._buffers:
             return  # a custom sensor of a former host, whose description this host has just replaced
         self._newest[key] = message
         if key == keys.STATUS:
@@ -213,11 +213,11 @@ class LiveRobot:
 
     def _replace_sensor_buffers(self, robot: Description) -> None:
         """Add a buffer for each custom sensor that the robot describes, in the place of the former ones."""
-        former_keys = [key for key in self._buffers if keys.row_key(key) == keys.OWN_ALL]
+        former_keys = [key for key in self._buffers if keys.find_row_key(key) == keys.OWN_ALL]
         for key in former_keys:
             del self._buffers[key]
             self._newest.pop(key, None)
-        for key, kind in own_kinds(robot).items():
+        for key, kind in find_custom_messages(robot).items():
             self._add_buffer(key, kind.message, MAX_ARRIVALS)
 
     # --- parts of a snapshot ---------------------------------------------------------------------------------

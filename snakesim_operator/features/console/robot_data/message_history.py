@@ -10,11 +10,11 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.own_sample import message_of
+from snakesim_hal.wire.own_sample import find_message_type
 from snakesim_operator.features.console.robot_data.snapshot import Stream
 from snakesim_operator.recording.message import RecordedMessage
 
-IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOUR_ALL)
+IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOR_ALL)
 
 # Rows of the key space whose messages are kept, because the rows of a run's record do not have them.
 KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.SETTINGS_IN_FORCE, keys.OWN_ALL, *IMAGE_ROWS})
@@ -58,7 +58,7 @@ class MessageHistory:
 
     def add(self, message: RecordedMessage) -> None:
         """Add the next message of the recording, if the console shows its key."""
-        row = keys.row_key(message.key)
+        row = keys.find_row_key(message.key)
         if row not in KEPT_ROWS and row not in TIMED_ROWS:
             return
         messages = self._messages.setdefault(message.key, _KeyMessages())
@@ -74,7 +74,7 @@ class MessageHistory:
     def _drop_every_second_image(self) -> None:
         self.image_decimation *= 2
         for key, messages in self._messages.items():
-            if keys.row_key(key) in IMAGE_ROWS:
+            if keys.find_row_key(key) in IMAGE_ROWS:
                 messages.kept = messages.kept[::2]
                 messages.times_s = messages.times_s[::2]
         self._image_bytes //= 2
@@ -93,7 +93,7 @@ class MessageHistory:
         """Return the newest message at a time of each key in a row of the key space, by key."""
         newest: dict[str, Any] = {}
         for key in sorted(self._messages):
-            if keys.row_key(key) != row:
+            if keys.find_row_key(key) != row:
                 continue
             message = self.find_newest(key, time_s)
             if message is not None:
@@ -115,7 +115,7 @@ class MessageHistory:
         streams: dict[str, Stream] = {}
         for key, messages in sorted(self._messages.items()):
             count = bisect_right(messages.times_s, time_s)
-            if count == 0 or keys.row_key(key) in LATCHED_KEYS:
+            if count == 0 or keys.find_row_key(key) in LATCHED_KEYS:
                 continue
             recent_count = count - bisect_right(messages.times_s, time_s - RATE_PERIOD_S)
             age_s = time_s - messages.times_s[count - 1]
@@ -125,7 +125,7 @@ class MessageHistory:
     def _decode(self, key: str, index: int) -> Any:
         """Return a message of a key; None if its type is not known, or it cannot be decoded."""
         kept = self._messages[key].kept[index]
-        message_type = message_of(key, self.robot)
+        message_type = find_message_type(key, self.robot)
         if message_type is None:
             return None
         try:

@@ -51,7 +51,7 @@ class RecordedRun:
             return 0.0, 0.0
         return float(times_s[0]), float(times_s[-1])
 
-    def at(self, time_s: float) -> RobotSnapshot:
+    def snapshot_at(self, time_s: float) -> RobotSnapshot:
         """Return what was known of the robot at a time."""
         record = self.record
         history = self.history
@@ -81,11 +81,11 @@ class RecordedRun:
             log=self._read_log(time_s),
         )
 
-    def before(self, time_s: float) -> Iterator[RobotSnapshot]:
+    def iterate_snapshots_before(self, time_s: float) -> Iterator[RobotSnapshot]:
         """Yield the snapshots before a time, oldest first, as far back as charts show them."""
         first_s = max(time_s - CHART_HISTORY_S, self.span_s[0])
         times_s = np.linspace(first_s, time_s, CHART_SAMPLES, endpoint=False).tolist()
-        return (self.at(earlier_s) for earlier_s in times_s)
+        return (self.snapshot_at(earlier_s) for earlier_s in times_s)
 
     def _find_newest(
         self, messages: Sequence[MessageT], time_s: float, max_age_s: float | None = None

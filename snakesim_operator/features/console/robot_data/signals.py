@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.run_log.black_box import touching
+from snakesim_hal.run_log.black_box import summarize_contacts
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, ControlState, Description, Imu, JointState, Message, Power
-from snakesim_hal.wire.own_sample import own_kinds
+from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 LIVE_HISTORY_S = 60.0
@@ -201,7 +201,7 @@ def collect_numbers(snapshot: RobotSnapshot) -> Numbers:
         numbers.add_axes("position_w_m", "xyz", position_w)
         numbers.add_axes("orientation_wxyz", "wxyz", orientation_wxyz)
     if snapshot.contacts is not None:
-        peak_n, count = touching(snapshot.contacts)
+        peak_n, count = summarize_contacts(snapshot.contacts)
         numbers.add("contact_peak_n", peak_n, OTHER_UNITS["contact_peak_n"])
         numbers.add("contact_count", float(count), OTHER_UNITS["contact_count"])
     for message in (snapshot.control, snapshot.power, snapshot.imu):
@@ -232,7 +232,7 @@ def _add_joint_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
 
 def _add_sensor_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
     """Add the numbers of custom sensors: field, sensor, and part of a list."""
-    for key, kind in own_kinds(snapshot.robot).items():
+    for key, kind in find_custom_messages(snapshot.robot).items():
         sample = snapshot.own.get(key)
         if sample is None:
             continue

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.robot import describe
-from snakesim_hal.model.scenario import RunConfig, config_hash, start_of
+from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.scenario import RunConfig, config_hash, find_start_pose
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     ColorImage,
@@ -70,16 +70,16 @@ class RobotSnapshot:
     log: Sequence[str] = ()  # of a recording: changes of the robot's state until then, newest first
 
 
-def expected_snapshot(config: RunConfig) -> RobotSnapshot:
+def make_expected_snapshot(config: RunConfig) -> RobotSnapshot:
     """Return the robot of a run that is starting, as its scenario places it on flat ground."""
-    robot = describe(
+    robot = describe_robot(
         config.robot,
         backend=config.backend,
         period_ns=config.period_ns,
         lease_ns=config.lease_ns,
         config_hash=config_hash(config),
     )
-    start = start_of(config)
+    start = find_start_pose(config)
     zeros = [0.0] * len(robot.joints)
     joints = JointState(
         tick=0,

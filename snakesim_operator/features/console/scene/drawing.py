@@ -12,8 +12,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
-from snakesim_hal.model.scenario import RunConfig, place_all
-from snakesim_hal.physics.hills import hills
+from snakesim_hal.model.scenario import RunConfig, place_obstacles
+from snakesim_hal.physics.hills import make_heights
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.results.metrics.force_tracking import is_measured
@@ -48,7 +48,7 @@ class Surroundings:
     @cached_property
     def obstacles(self) -> list[Obstacle]:
         """All obstacles, with steps among them."""
-        return [placed.obstacle for placed in place_all(self.config)]
+        return [placed.obstacle for placed in place_obstacles(self.config)]
 
     @cached_property
     def heights_m(self) -> tuple[Floats, Floats] | None:
@@ -56,7 +56,7 @@ class Surroundings:
         heightfield = self.config.scene.ground.heightfield
         if heightfield is None:
             return None
-        heights = hills(heightfield)
+        heights = make_heights(heightfield)
         along = np.linspace(-heightfield.area_m / 2, heightfield.area_m / 2, len(heights))
         return along, heights
 

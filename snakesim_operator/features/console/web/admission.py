@@ -21,7 +21,7 @@ import msgspec
 import viser
 from msgspec import Meta, Struct
 
-from snakesim_hal.base.terminal import printable
+from snakesim_hal.base.terminal import escape_invisible
 from snakesim_operator.features.console.web.message_age import MessageAge, PageAction
 
 Identifier = Annotated[str, Meta(max_length=64)]
@@ -242,7 +242,7 @@ class Admission:
             is_first = self.dropped[kind] == 1
         if is_first:
             sender = "a page" if viewer is None else f"viewer {viewer + 1}"
-            shown = printable(detail)[:MAX_REPORTED_CHARACTERS]
+            shown = escape_invisible(detail)[:MAX_REPORTED_CHARACTERS]
             self.report(f"dropped a message of {sender}: {kind}: {shown}; more are only counted")
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Protocol
 
 from snakesim_hal.base.workers import start_worker
-from snakesim_operator.base.page_origin import why_head_refused
+from snakesim_operator.base.page_origin import explain_head_refusal
 from snakesim_operator.features.console.web.connection_limits import (
     ConnectionLimits,
     PendingRequests,
@@ -281,7 +281,7 @@ class ConnectionAcceptor:
     def _answer_stop_request(self, connection: socket.socket, request: bytes) -> None:
         """Answer `GET /stop` with the readiness of the stop, and `POST /stop` by stopping the robot."""
         connection.recv(len(request))  # unread bytes would reset the connection, and the answer would be lost
-        refusal = why_head_refused(request.removesuffix(END_OF_HEAD))
+        refusal = explain_head_refusal(request.removesuffix(END_OF_HEAD))
         if refusal is not None:
             self._on_refused("another origin", refusal)
             _respond(connection, 403, refusal)

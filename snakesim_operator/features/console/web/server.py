@@ -24,8 +24,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from snakesim_operator.base.console_port import LOOPBACK, address_of
-from snakesim_operator.base.page_origin import why_refused
+from snakesim_operator.base.console_port import LOOPBACK, page_address
+from snakesim_operator.base.page_origin import explain_refusal
 from snakesim_operator.features.console.web.admission import Admission
 from snakesim_operator.features.console.web.browser_connection import MAX_MESSAGE_BYTES, BrowserConnection
 from snakesim_operator.features.console.web.connection_acceptor import ConnectionAcceptor, StopPath
@@ -128,7 +128,7 @@ class PageServer(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def page_server(
+def serve_pages(
     listening: socket.socket,
     report: Callable[[str], None] = lambda _: None,
     stop: StopPath | None = None,
@@ -153,7 +153,7 @@ def page_server(
     pace_pages(server)
     with ConnectionAcceptor(listening, handoff, stop, lambda kind, reason: admission.drop(None, kind, reason)):
         try:
-            yield server, address_of(listening)
+            yield server, page_address(listening)
         finally:
             with _ignore_output():
                 server.stop()
@@ -225,7 +225,7 @@ def _check_requests(
     """
 
     def process_request(connection: ServerConnection, request: Request) -> Response | None:
-        refusal = why_refused(request.headers.get("Host"), request.headers.get("Origin"))
+        refusal = explain_refusal(request.headers.get("Host"), request.headers.get("Origin"))
         if refusal is not None:
             admission.drop(None, "another origin", refusal)
             return connection.respond(403, f"{refusal}\n")

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import parse
+from snakesim_hal.model.fault_kinds import parse_injection
 from tests.unit.can_backend.loop import cleared_and_armed_again, loop
 
 START_TICK = 60
@@ -45,7 +45,7 @@ def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_res
         assert stopped < run.tick - 5, "everything comes to rest"
         assert all(run.states()[i] == ModuleState.DISARMED for i in healthy), run.states()
         if kind != "reboot":  # it is over by itself
-            run.backend.inject(parse(f"{kind}:joint_3@0"), begins=False)
+            run.backend.inject(parse_injection(f"{kind}:joint_3@0"), begins=False)
             run.run(10)
         if kind != "overheat":  # it would cool for minutes
             cleared_and_armed_again(run)

@@ -82,7 +82,7 @@ def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
     with hot_robot(backend, curve, celsius) as rig:
         until_told(rig, celsius)
         rig.arm()
-        assert rig.authority.derated.get("joint_1", 1.0) == pytest.approx(share, abs=1e-4), "in the status"
+        assert rig.authority.derated_joints.get("joint_1", 1.0) == pytest.approx(share, abs=1e-4), "in the status"
         from_gate_nm = rig.authority.decide().setpoints.torque_limit_nm[0]
         assert from_gate_nm == pytest.approx(share * RATED_NM, abs=1e-3)
         assert pushes_nm(rig, from_gate_nm) == pytest.approx(share * RATED_NM, abs=STEP_NM), "at the joint"

@@ -16,12 +16,12 @@ from snakesim_can_backend.protocol.definitions import Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.model.fault_kinds import parse
+from snakesim_hal.model.fault_kinds import parse_injection
 from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
 
 
 def inject(run: Loop, text: str, *, begins: bool = True) -> None:
-    FaultyBackend(run.backend).inject(parse(f"{text}@0"), begins)
+    FaultyBackend(run.backend).inject(parse_injection(f"{text}@0"), begins)
 
 
 # --- modules -------------------------------------------------------------------------------------------------
@@ -31,13 +31,13 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
     with loop() as run:
         run.run(3)
         faulty = FaultyBackend(run.backend)
-        faulty.inject(parse("wrong:joint_2@0=0.4"), True)
+        faulty.inject(parse_injection("wrong:joint_2@0=0.4"), True)
         reported = faulty.sample(3, 3 * run.config.period_ns).joints.angle_rad
         assert reported == pytest.approx([0.0, 0.4, 0.0, 0.0], abs=0.02)
         with pytest.raises(ConfigError, match="no joint_9"):
-            faulty.inject(parse("leak:joint_9@0"), True)
+            faulty.inject(parse_injection("leak:joint_9@0"), True)
         with pytest.raises(ConfigError, match="there is no bus_2; this robot has bus_1 to bus_1"):
-            faulty.inject(parse("cut:bus_2@0"), True)
+            faulty.inject(parse_injection("cut:bus_2@0"), True)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from snakesim_can_backend.emulator.firmware import PASSIVE
 from snakesim_can_backend.protocol.commands import make_command, make_emergency
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.model.fault_kinds import parse
+from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from snakesim_testing.contract.rig import Rig
 from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
@@ -39,7 +39,7 @@ class Lame(Rig):
         return [module.state for module in self.can.modules.reading.modules]
 
     def inject(self, text: str, *, begins: bool = True) -> None:
-        assert self.can.inject(parse(f"{text}@0"), begins=begins)
+        assert self.can.inject(parse_injection(f"{text}@0"), begins=begins)
 
     def ask(self, action: Literal["disarm", "clear"]) -> None:
         answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
@@ -76,9 +76,9 @@ def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within:
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(within + 1)
         if what in CONCERNS_ALL:
-            assert robot.authority.state == "fault" and robot.authority.isolated == []
+            assert robot.authority.state == "fault" and robot.authority.isolated_joints == []
             return
-        assert robot.authority.isolated == [f"joint_{FAILS + 1}"], robot.authority.why
+        assert robot.authority.isolated_joints == [f"joint_{FAILS + 1}"], robot.authority.reason
         robot.wave(30)
         robot.must_be_armed()
         assert all(robot.turning()) and {fault.joint for fault in robot.faults} == {f"joint_{FAILS + 1}"}
@@ -90,7 +90,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
     with lame_robot() as robot:
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(30)
-        assert robot.authority.isolated == [f"joint_{FAILS + 1}"], robot.authority.why
+        assert robot.authority.isolated_joints == [f"joint_{FAILS + 1}"], robot.authority.reason
         robot.inject(f"{kind}:joint_{FAILS + 1}", begins=False)
         robot.wave(40)
         robot.must_be_armed()
@@ -103,7 +103,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.arm()
         robot.wave(30)
         robot.must_be_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated == []
+        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
         assert len(robot.faults) == reported, robot.faults[reported:]
 
 
@@ -138,7 +138,7 @@ def swallowed(robot: Lame, *joints: int) -> None:
     for joint in joints:
         chain.slots[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
     for _ in range(20):
-        if robot.authority.isolated or robot.authority.state == "fault":
+        if robot.authority.isolated_joints or robot.authority.state == "fault":
             break
         (robot.wave if robot.authority.state == "armed" else robot.idle)(1)
     if robot.authority.state == "armed":
@@ -163,7 +163,7 @@ def test_who_clears_before_a_period_has_passed_clears_all_the_same(
         robot.arm()
         robot.wave(30)
         robot.must_be_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated == []
+        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
 
 
 @pytest.mark.parametrize("then", ["clear", "estop", "fault"])

@@ -12,7 +12,7 @@ from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParamete
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.files import decode, read_part, shipped
+from snakesim_hal.model.files import decode, list_shipped, read_part
 from snakesim_hal.model.joints import JointExceptions
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import load
@@ -30,7 +30,7 @@ def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[ModuleParamete
     return {4: {ModuleParameter.RATED_TORQUE: torque_nm, ModuleParameter.RATED_SPEED: speed_rad_s}}
 
 
-@pytest.mark.parametrize("name", shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped("robots"))
 def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(name: str) -> None:
     robot = decode(read_part(name, "robots"), RobotFile)
     wanted = plan_parameters(robot, CanSettings(), ReportSchedule(100.0))

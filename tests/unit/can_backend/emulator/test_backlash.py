@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
-from snakesim_hal.physics.backlash import BacklashPlant, without_rotors
+from snakesim_hal.physics.backlash import BacklashModel, without_rotors
 from tests.unit.can_backend.loop import config
 
 BACKLASH_RAD = 0.03
@@ -15,7 +15,7 @@ def test_a_drive_turns_through_its_backlash_before_its_link_moves_and_others_mov
     joints = run.robot.joint_table
     backlash_rad = {"joint_2": BACKLASH_RAD}
     links = InertiaModel(without_rotors(run, joints, backlash_rad), InertiaSettings(drag_nm=0.02))
-    physics_model = BacklashPlant(links, joints, backlash_rad, seed=1)
+    physics_model = BacklashModel(links, joints, backlash_rad, seed=1)
     sound = InertiaModel(run, InertiaSettings(drag_nm=0.02))
     apart: list[float] = []
     for step in range(600):

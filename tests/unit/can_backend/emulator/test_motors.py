@@ -86,7 +86,7 @@ def test_position_mode_of_the_shipped_robot_is_stable_at_1_ms_and_arrives():
     physics_model = InertiaModel(run, InertiaSettings())
     motors, m = Motors(run.robot, physics_model.step_s), run.robot.motor
     for i in range(13):
-        motors.drive(i, Mode.POSITION, 0.4, 7.0, m.stiffness_nm_per_rad, m.damping_nm_s_per_rad, 7.5)
+        motors.set_demand(i, Mode.POSITION, 0.4, 7.0, m.stiffness_nm_per_rad, m.damping_nm_s_per_rad, 7.5)
     for _ in range(1000):
         physics_model.advance(motors.step(physics_model.angle_rad, physics_model.velocity_rad_s))
     assert physics_model.angle_rad == pytest.approx([0.4] * 13, abs=0.1 / 60 + 1e-4)
@@ -127,7 +127,7 @@ def test_the_simulator_s_motors_do_the_same():
         damping = motor.damping_nm_s_per_rad if mode == Mode.POSITION else motor.velocity_gain_nm_s_per_rad
         for i in range(count):
             gains = (motor.stiffness_nm_per_rad, damping, limits.speed_rad_s)
-            motors.drive(i, mode, float(target[i]), limits.torque_nm, *gains)
+            motors.set_demand(i, mode, float(target[i]), limits.torque_nm, *gains)
         for _ in range(4):
             sim.enact(SafeSetpoints([mode] * count, target.tolist(), [limits.torque_nm] * count), "armed")
             sim.advance()

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, corrupted
-from snakesim_hal.model.fault_kinds import Injection, checked
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.model.fault_kinds import Injection, check_injection
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
 from tests.unit.hal.rig import command, description
 
@@ -20,7 +20,7 @@ STEP_S = 0.01
 
 
 def on(kind: str, amount: float | None = None) -> Injection:
-    return checked(Injection(kind, KEY, amount=amount))
+    return check_injection(Injection(kind, KEY, amount=amount))
 
 
 def disturbed(*faults: Injection, seed: str = "1") -> Disturbance:
@@ -144,7 +144,7 @@ def test_decoders_get_noise_cuts_and_numbers_that_are_none_and_refuse_them_in_or
         wrong = corrupted(payload, rng)
         lengths.add(len(wrong))
         try:
-            decoder.decode(wrong, encoding_of(JointCommand))
+            decoder.decode(wrong, format_encoding(JointCommand))
             taken += 1
         except WireError:
             refused += 1

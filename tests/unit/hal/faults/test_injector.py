@@ -11,7 +11,7 @@ from snakesim_hal.faults.injector import Injector
 from snakesim_hal.faults.message_faults import MessageFaults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
-from snakesim_hal.model.fault_kinds import parse
+from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
 from tests.harness.wait import wait_until
@@ -22,7 +22,7 @@ ALLOWED: dict[str, Any] = {"clock_mode": "realtime", "rate_hz": 100, "allow_faul
 
 
 def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
-    return run.ask(keys.fault("hal"), FaultRequest(kind=kind, target=target, **more))
+    return run.ask(keys.fault_key("hal"), FaultRequest(kind=kind, target=target, **more))
 
 
 def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is_refused_with_the_reason() -> None:
@@ -35,9 +35,9 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is
             (FaultRequest(kind="drop", target="actuator/joints"), "wrong_part", "is carried out by control"),
             (FaultRequest(kind="mute", target="joint_1", end=True), "wrong_state", "is not active; active: nothing"),
         ):
-            answer = run.ask(keys.fault("hal"), asked)
+            answer = run.ask(keys.fault_key("hal"), asked)
             assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
-        assert run.host.faults.noted == []
+        assert run.host.faults.notes == []
         answer = ask(run, "mute", "joint_2")
         assert answer.ok and answer.reason.startswith("mute of joint_2 has begun, at ") and answer.lifecycle == "armed"
         run.reaches("fault")
@@ -48,8 +48,8 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is
         wait_until(lambda: run.status.injected == [], "an end of it")
         assert run.lifecycle("clear").ok
         run.arm()
-        assert [text.split()[-1] for text in run.host.faults.noted] == ["begins", "ends"]
-        assert all(text.startswith("tick ") for text in run.host.faults.noted)
+        assert [text.split()[-1] for text in run.host.faults.notes] == ["begins", "ends"]
+        assert all(text.startswith("tick ") for text in run.host.faults.notes)
 
 
 def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
@@ -66,9 +66,9 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 
 def test_what_was_planned_and_cannot_be_done_is_told_as_a_fault_of_the_run() -> None:
     with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
-        told = run.host.authority.since_start
+        told = run.host.authority.faults_since_start
         wait_until(lambda: any(fault.what == "injection_refused" for fault in told.kept), "a word about it")
-        assert "is refused: backend 'lag' cannot do leak" in run.host.faults.noted[0]
+        assert "is refused: backend 'lag' cannot do leak" in run.host.faults.notes[0]
 
 
 def test_a_hanging_host_does_nothing_and_goes_on_afterwards() -> None:
@@ -89,10 +89,10 @@ def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
         reader = run.session.reader(keys.JOINTS, JointState)
         wait_until(reader.drain, "sensor samples")
         assert ask(run, "drop", keys.JOINTS, for_s=0.2).ok
-        wait_until(lambda: run.host.faults.noted, "its begin")
+        wait_until(lambda: run.host.faults.notes, "its begin")
         reader.drain()
-        wait_until(lambda: len(run.host.faults.noted) == 2, "its end")
-        begin, end = (int(text.split()[1].rstrip(":")) for text in run.host.faults.noted)
+        wait_until(lambda: len(run.host.faults.notes) == 2, "its end")
+        begin, end = (int(text.split()[1].rstrip(":")) for text in run.host.faults.notes)
         ticks: list[int] = []
         wait_until(lambda: ticks.extend(j.tick for j in reader.drain()) or (ticks and ticks[-1] > end), "new samples")
         assert not set(ticks) & set(range(begin, end))
@@ -102,7 +102,7 @@ def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
 
 
 def turn(injector: Injector, tick: int, arm_session: int) -> None:
-    injector.turn(tick * 10_000_000, arm_session, "armed" if arm_session else "disarmed")
+    injector.update(tick * 10_000_000, arm_session, "armed" if arm_session else "disarmed")
 
 
 def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> None:
@@ -113,7 +113,7 @@ def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> No
             turn(injector, 0, first_arming)
             for tick in range(1, 15):
                 turn(injector, tick, 1)
-            assert injector.on == expected
+            assert injector.active == expected
             injector.close()
 
 
@@ -140,9 +140,9 @@ def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_ne
         arrived: list[float] = []
         there.on_arrival(keys.CLOCK, lambda arrival: arrived.append(arrival.monotonic_ns * 1e-9))
         publisher = here.publisher(keys.CLOCK, Clock)
-        wait_until(publisher.heard, "a subscriber")
+        wait_until(publisher.has_subscriber, "a subscriber")
         straight = publisher._put
-        faults, delay = MessageFaults(here, 1), parse("delay:hal/clock@0=0.1")
+        faults, delay = MessageFaults(here, 1), parse_injection("delay:hal/clock@0=0.1")
         faults.begin(delay)
         sent_at = []
         for _ in range(5):
@@ -163,10 +163,10 @@ def test_a_publisher_that_is_declared_later_is_disturbed_too_and_a_flood_ends_wi
         arrived: list[bytes] = []
         there.on_arrival(keys.JOINTS, lambda arrival: arrived.append(arrival.payload))
         faults = MessageFaults(here, 1)
-        faults.begin(parse("flood:sensor/joints@0=2000"))
-        faults.begin(parse("corrupt:sensor/joints@0=0.5"))
+        faults.begin(parse_injection("flood:sensor/joints@0=2000"))
+        faults.begin(parse_injection("corrupt:sensor/joints@0=0.5"))
         publisher = here.publisher(keys.JOINTS, JointState)
-        wait_until(publisher.heard, "a subscriber")
+        wait_until(publisher.has_subscriber, "a subscriber")
         publisher.put(state(description()))
         wait_until(lambda: len(arrived) > 500, "a flood")
         assert 100 < len(set(arrived)) < len(arrived)

@@ -9,10 +9,10 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.host.cable_file import CABLES, FRESH_S, CableFile, kept_at
+from snakesim_hal.host.cable_file import CABLES, FRESH_S, CableFile, open_cable_file
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile, describe
+from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import Description
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import state
@@ -42,7 +42,7 @@ class Bench:
 
     def file(self, joint_2: str) -> None:
         robot = file_of(self.folder, joint_2)
-        described = describe(robot, backend="real", period_ns=10**7, lease_ns=5 * 10**7, config_hash="x")
+        described = describe_robot(robot, backend="real", period_ns=10**7, lease_ns=5 * 10**7, config_hash="x")
         self.joints, self.robot = robot.joint_table, msgspec.structs.replace(described, emulated=False)
 
     def host(self, *angles_rad: float, now_s: float = NOW_S, ends: bool = True) -> list[str]:
@@ -51,8 +51,8 @@ class Bench:
         others = writers()
         kept = CableFile(self.folder, self.joints, msgspec.structs.replace(self.robot, joints=serials), now_s)
         for angle_rad in angles_rad:
-            kept.take(state(self.robot, [0.0, angle_rad, 0.0]))
-        against = kept.cables.against_arming()
+            kept.update(state(self.robot, [0.0, angle_rad, 0.0]))
+        against = kept.cables.list_arming_obstacles()
         if ends:
             kept.close()  # on a computer that stutters a disk may take longer than a host waits for it
             wait_until(lambda: writers() <= others, "the file, written")
@@ -112,12 +112,12 @@ def test_a_host_that_was_killed_has_kept_it_and_a_file_that_cannot_be_read_is_un
 
 def test_only_joints_that_say_so_and_only_real_ones_are_counted(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    assert kept_at(tmp_path, bench.joints, msgspec.structs.replace(bench.robot, emulated=True)) is None
+    assert open_cable_file(tmp_path, bench.joints, msgspec.structs.replace(bench.robot, emulated=True)) is None
     bench.file("angle_max_rad = 3.1415\nangle_min_rad = -3.1415")
-    no_stops = kept_at(tmp_path, bench.joints, bench.robot)
-    assert no_stops is not None and "leave no room for end stops" in no_stops.cables.against_arming()[0]
+    no_stops = open_cable_file(tmp_path, bench.joints, bench.robot)
+    assert no_stops is not None and "leave no room for end stops" in no_stops.cables.list_arming_obstacles()[0]
     bench.file("")
-    assert kept_at(tmp_path, bench.joints, bench.robot) is None
+    assert open_cable_file(tmp_path, bench.joints, bench.robot) is None
 
 
 @pytest.mark.parametrize(

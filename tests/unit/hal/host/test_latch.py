@@ -30,25 +30,30 @@ def asked(latch: EstopLatch, what: str) -> str | None:
 def test_kept_found_and_released(tmp_path: Path) -> None:
     assert asked(EstopLatch(tmp_path / "no stop yet"), "release") is None
     first = EstopLatch(tmp_path)
-    assert first.found is None and asked(first, "engage") is None
+    assert first.left_by_earlier_host is None and asked(first, "engage") is None
     assert (tmp_path / ESTOP).is_file() and [path.name for path in tmp_path.iterdir()] == [ESTOP]
     second = EstopLatch(tmp_path)
-    assert second.found is not None and (second.found.who, second.found.tick) == ("anna", 7)
+    assert second.left_by_earlier_host is not None and (
+        second.left_by_earlier_host.who,
+        second.left_by_earlier_host.tick,
+    ) == ("anna", 7)
     assert asked(second, "engage") is None and asked(second, "release") is None
-    assert EstopLatch(tmp_path).found is None
+    assert EstopLatch(tmp_path).left_by_earlier_host is None
     assert asked(second, "release") is None
-    assert asked(second, "engage") is None and EstopLatch(tmp_path).found is not None
+    assert asked(second, "engage") is None and EstopLatch(tmp_path).left_by_earlier_host is not None
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"who":1}', b"\xff" * 100])
 def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -> None:
     (tmp_path / ESTOP).write_bytes(content)
     latch = EstopLatch(tmp_path)
-    assert latch.found is not None and "cannot be read" in latch.found.who
+    assert latch.left_by_earlier_host is not None and "cannot be read" in latch.left_by_earlier_host.who
     assert asked(latch, "engage") is None
     again = EstopLatch(tmp_path)
-    assert again.found is not None and again.found.who == "anna"  # a good file in its place
-    assert asked(latch, "release") is None and EstopLatch(tmp_path).found is None
+    assert (
+        again.left_by_earlier_host is not None and again.left_by_earlier_host.who == "anna"
+    )  # a good file in its place
+    assert asked(latch, "release") is None and EstopLatch(tmp_path).left_by_earlier_host is None
 
 
 def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
@@ -61,13 +66,13 @@ def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
 @pytest.fixture
 def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
     """A disk that hangs until the event is set."""
-    goes_on, write = Event(), under_test.write_whole
+    goes_on, write = Event(), under_test.write_atomically
 
     def slow(path: Path, content: bytes, *, durable: bool = False) -> None:
         goes_on.wait(30)
         write(path, content, durable=durable)
 
-    monkeypatch.setattr(under_test, "write_whole", slow)
+    monkeypatch.setattr(under_test, "write_atomically", slow)
     monkeypatch.setattr(under_test, "ANSWER_LIMIT_S", 0.3)
     yield goes_on
     goes_on.set()
@@ -86,7 +91,7 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
     latch.close()
     assert time.monotonic() - began < 2.0
     hanging.set()
-    wait_until(lambda: EstopLatch(tmp_path).found is not None, "the stop kept after all")
+    wait_until(lambda: EstopLatch(tmp_path).left_by_earlier_host is not None, "the stop kept after all")
     assert answers.empty()  # once each
 
 

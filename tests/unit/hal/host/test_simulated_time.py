@@ -96,9 +96,9 @@ def test_what_cannot_be_is_refused_in_words(
     simulated: bool, clock_mode: ClockMode, asked: dict[str, Any], word: str
 ) -> None:
     made = SimulatedTime(description(simulated_time=simulated), clock_mode, lambda: 0)
-    outcome = made.take(SimulatorRequest(**asked), 0)
+    outcome = made.carry_out(SimulatorRequest(**asked), 0)
     assert isinstance(outcome, Refusal) and outcome.word == word
-    assert not made.stands
+    assert not made.is_paused
 
 
 def test_safety_time_neither_jumps_nor_goes_back() -> None:
@@ -116,11 +116,11 @@ def test_safety_time_neither_jumps_nor_goes_back() -> None:
         ("speed", {"speed": 1.0}),
     ):
         before = made.safety_ns(tick)
-        made.take(SimulatorRequest(action=action, **more), tick)  # pyright: ignore[reportArgumentType]
+        made.carry_out(SimulatorRequest(action=action, **more), tick)  # pyright: ignore[reportArgumentType]
         assert made.safety_ns(tick) == before
         assert made.safety_ns(tick, wall[0] - 500) >= before - 500
         for _ in range(3):
-            if not made.stands:
+            if not made.is_paused:
                 tick += 1
             wall[0] += period_ns
             made.tick_done(tick)

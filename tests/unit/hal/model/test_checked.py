@@ -5,12 +5,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.checked import PROPERTIES, Checked, mounting_digest, why_unchecked
+from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord, mounting_digest, why_unchecked
 from snakesim_hal.wire.messages import Description
 from tests.unit.hal.rig import description, robot_file
 
 JOINTS = robot_file().joint_table
-CHECKED = Checked(
+CHECKED = StartCheckRecord(
     by="anna",
     on="2026-11-24",
     joints=mounting_digest(JOINTS),
@@ -45,7 +45,7 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
     ],
 )
 def test_it_counts_for_the_joints_and_drives_that_were_judged(
-    checked: Checked | None, here: Description, words: str
+    checked: StartCheckRecord | None, here: Description, words: str
 ) -> None:
     found = why_unchecked(checked, JOINTS, here)
     assert words in found if words else found == ""

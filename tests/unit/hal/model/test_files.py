@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_table, shipped
+from snakesim_hal.model.files import FileStruct, Table, decode, find_file, leaves, list_shipped, read_table
 
 
 class Part(FileStruct, frozen=True):
@@ -217,14 +217,14 @@ def test_a_file_that_is_not_there_is_named_and_so_are_those_that_are(tmp_path: P
 
 
 def test_find_takes_names_and_paths(tmp_path: Path) -> None:
-    assert find("triplet", "scenes").is_file()
-    assert find("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
-    assert find("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
-    assert find("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
+    assert find_file("triplet", "scenes").is_file()
+    assert find_file("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
+    assert find_file("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
+    assert find_file("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
     with pytest.raises(ConfigError) as caught:
-        find("planar31", "robots")
+        find_file("planar31", "robots")
     assert "no robot called 'planar31'" in str(caught.value)
-    assert all(name in str(caught.value) for name in shipped("robots"))
+    assert all(name in str(caught.value) for name in list_shipped("robots"))
 
 
 # --- where values come from ------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.model.fitting import spacing_m
-from snakesim_hal.model.scenario import RunConfig, load, parse_set, place_all, write
+from snakesim_hal.model.scenario import RunConfig, load, parse_set, place_obstacles, write_config
 from snakesim_hal.model.scene import SineRoute
 
 
@@ -42,7 +42,7 @@ def test_a_robot_of_other_joints_and_another_radius_gets_it_in_proportion() -> N
     assert field.max_corner_m[0] - field.min_corner_m[0] == pytest.approx(4.6) and field.clearance_m == pytest.approx(
         0.11
     )
-    assert len(place_all(config)) > 40  # and it lies clear of them
+    assert len(place_obstacles(config)) > 40  # and it lies clear of them
 
 
 def test_what_a_flag_sets_is_not_fitted_and_the_rest_is_marked() -> None:
@@ -56,5 +56,5 @@ def test_what_a_flag_sets_is_not_fitted_and_the_rest_is_marked() -> None:
 
 def test_a_fitted_scene_that_is_run_again_is_not_fitted_again(tmp_path: Path) -> None:
     config = clutter("robot=mamba")
-    write(config, tmp_path / "run.json")
+    write_config(config, tmp_path / "run.json")
     assert load(str(tmp_path / "run.json")).config == config

@@ -13,7 +13,7 @@ from snakesim_hal.model.kinematics import (
     link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,
-    yaw_of,
+    yaw_from_rotation,
 )
 
 ANGLE = st.floats(-3, 3)
@@ -113,5 +113,5 @@ def test_rotations_turn_as_their_quaternions_do(
 @given(yaw=st.floats(-3.1, 3.1))
 def test_yaw_there_and_back(yaw: float) -> None:
     rotation = rotation_from_quaternion(quaternion_from_yaw(yaw))
-    assert yaw_of(rotation) == pytest.approx(yaw, abs=1e-9)
+    assert yaw_from_rotation(rotation) == pytest.approx(yaw, abs=1e-9)
     assert rotation == pytest.approx(joint_rotation("yaw", yaw), abs=1e-9)

@@ -2,11 +2,11 @@
 
 import pytest
 
-from snakesim_hal.model.measured_force import FeltForce
+from snakesim_hal.model.measured_force import MeasuredForce
 
 
 def test_a_short_hard_blow_is_felt_as_a_long_soft_push_of_the_same_impulse() -> None:
-    blow, push = FeltForce(0.002), FeltForce(0.002)
+    blow, push = MeasuredForce(0.002), MeasuredForce(0.002)
     for step in range(25):
         blow.add({"peg": 100.0} if step == 3 else {})
         push.add({"peg": 4.0})
@@ -14,7 +14,7 @@ def test_a_short_hard_blow_is_felt_as_a_long_soft_push_of_the_same_impulse() -> 
 
 
 def test_contacts_are_felt_each_by_itself_and_forgotten_after_50_ms() -> None:
-    felt = FeltForce(0.01)
+    felt = MeasuredForce(0.01)
     for _ in range(5):
         felt.add({("peg_0", 1): 6.0, ("peg_1", 1): 9.0, ("peg_1", 2): 5.0})
     assert felt.max_n == pytest.approx(9.0)

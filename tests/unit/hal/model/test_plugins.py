@@ -18,8 +18,8 @@ from snakesim_hal.model.plugins import (
     SERVICES,
     find_installed,
     find_plugin,
-    installed,
-    offered,
+    list_installed,
+    offer_plugin,
     plugin_settings,
 )
 
@@ -38,8 +38,8 @@ class Wave:
 
 @pytest.mark.parametrize("group", [BACKENDS, CONTROLLERS, SERVICES])
 def test_everything_installed_loads_and_states_its_settings(group: str) -> None:
-    assert installed(group) == sorted(set(installed(group))) != []
-    for name in installed(group):
+    assert list_installed(group) == sorted(set(list_installed(group))) != []
+    for name in list_installed(group):
         plugin: Any = find_plugin(group, name)
         assert callable(plugin)
         if group != SERVICES:
@@ -51,7 +51,7 @@ def test_an_unknown_name_says_what_is_installed_and_how_one_is_added() -> None:
         find_plugin(CONTROLLERS, "wiggle")
     said = str(caught.value)
     assert said.startswith("no controller called 'wiggle' is installed; installed are ")
-    assert all(name in said for name in installed(CONTROLLERS)) and "'snakesim.controllers'" in said
+    assert all(name in said for name in list_installed(CONTROLLERS)) and "'snakesim.controllers'" in said
 
 
 def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) 
 
 def test_a_program_may_offer_what_a_name_stands_for() -> None:
     installed_one = find_plugin(CONTROLLERS, "hold")
-    with offered(CONTROLLERS, "hold", Plugin), offered(CONTROLLERS, "mine", Plugin):
+    with offer_plugin(CONTROLLERS, "hold", Plugin), offer_plugin(CONTROLLERS, "mine", Plugin):
         assert find_plugin(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "mine") is Plugin
     assert find_plugin(CONTROLLERS, "hold") is installed_one
     with pytest.raises(ConfigError, match="no controller called 'mine'"):

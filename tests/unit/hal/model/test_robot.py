@@ -7,22 +7,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import decode, read_part, shipped
+from snakesim_hal.model.files import decode, list_shipped, read_part
 from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Motor, Supply
-from snakesim_hal.model.robot import RobotFile, describe, layout_hash
+from snakesim_hal.model.robot import RobotFile, describe_robot, layout_hash
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, description, robot_file
 
 SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 
 
-@pytest.mark.parametrize("name", shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped("robots"))
 def test_every_shipped_robot_can_be_published(name: str) -> None:
     robot = decode(read_part(name, "robots"), RobotFile)
-    described = describe(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
-    assert Decoder(Description).decode(encode(described), encoding_of(Description)) == described
+    described = describe_robot(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
+    assert Decoder(Description).decode(encode(described), format_encoding(Description)) == described
     assert len(described.joints) == robot.chain.modules == len(described.links) - 1
     for joint in described.joints:
         assert joint.angle_min_rad < 0 < joint.angle_max_rad
@@ -112,10 +112,10 @@ def test_cameras_and_lidars_are_described_by_their_names_and_arrive_a_period_lat
     found = {sensor.key: (sensor.rate_hz, sensor.delay_s) for sensor in rich.sensors}
     del found[keys.JOINTS]
     assert found == {
-        keys.depth("head"): (20.0, 0.01),
-        keys.color("head"): (20.0, 0.01),
-        keys.depth("back"): (20.0, 0.03),
-        keys.ranges("front"): (100.0, 0.04),
+        keys.depth_key("head"): (20.0, 0.01),
+        keys.color_key("head"): (20.0, 0.01),
+        keys.depth_key("back"): (20.0, 0.03),
+        keys.ranges_key("front"): (100.0, 0.04),
     }
 
 

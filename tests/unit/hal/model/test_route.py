@@ -41,14 +41,14 @@ def test_positions_run_through_the_points_and_go_straight_on_at_both_ends() -> N
 
 @given(route=gentle(), s_m=st.floats(-1, 8))
 def test_the_fast_lookup_is_the_slow_one(route: Route, s_m: float) -> None:
-    assert route.at(s_m) == pytest.approx(tuple(route.position_w(s_m)), abs=1e-9)
+    assert route.point_at(s_m) == pytest.approx(tuple(route.position_w(s_m)), abs=1e-9)
 
 
 @given(route=gentle(), s_m=st.floats(-0.5, 7), step_m=st.floats(1e-4, 0.05))
 def test_no_chord_is_longer_than_its_arc_and_short_ones_are_nearly_as_long(
     route: Route, s_m: float, step_m: float
 ) -> None:
-    chord = math.dist(route.at(s_m), route.at(s_m + step_m))
+    chord = math.dist(route.point_at(s_m), route.point_at(s_m + step_m))
     assert 0.9 * step_m <= chord <= step_m * (1 + 1e-9)
 
 
@@ -66,7 +66,7 @@ def test_heading_of_a_circle() -> None:
 @settings(max_examples=60)
 def test_projection_is_the_nearest_point(route: Route, x: float, y: float) -> None:
     s = route.project(np.array([x, y]))
-    found = math.dist(route.at(s), (x, y))
+    found = math.dist(route.point_at(s), (x, y))
     tried = route.position_w(np.arange(-1.0, route.length_m + 1.0, 0.004))
     assert found <= float(np.hypot(*(tried - [x, y]).T).min()) + 1e-9
 
@@ -83,8 +83,8 @@ def test_projection_near_a_place_stays_on_its_branch() -> None:
 
 @given(route=gentle(), s_m=st.floats(0, 5), near_m=st.floats(-0.3, 0.3))
 def test_projection_near_the_right_place_finds_it(route: Route, s_m: float, near_m: float) -> None:
-    point = np.array(route.at(s_m))
-    assert math.dist(route.at(route.project(point, near_s_m=s_m + near_m)), point) < 1e-7
+    point = np.array(route.point_at(s_m))
+    assert math.dist(route.point_at(route.project(point, near_s_m=s_m + near_m)), point) < 1e-7
 
 
 # --- inflections -----------------------------------------------------------------------------------------------
@@ -144,11 +144,11 @@ def test_a_laid_chain_has_every_joint_on_the_route_at_its_right_distance(
 ) -> None:
     lay = lay_chain(route, tail_s_m, lengths_m)
     points = nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, lengths_m)
-    assert lay.tail_w == pytest.approx(route.at(tail_s_m))
+    assert lay.tail_w == pytest.approx(route.point_at(tail_s_m))
     assert len(lay.angles_rad) == len(lengths_m) - 1
     assert np.abs(lay.angles_rad).max() <= math.pi
     along = [route.project(point, near_s_m=tail_s_m + sum(lengths_m[:i])) for i, point in enumerate(points)]
-    assert max(math.dist(route.at(s), p) for s, p in zip(along, points, strict=True)) < 1e-5
+    assert max(math.dist(route.point_at(s), p) for s, p in zip(along, points, strict=True)) < 1e-5
     assert np.diff(along).min() > 0  # tail to head, in the direction of travel
 
 
@@ -163,9 +163,9 @@ def test_a_laid_chain_bends_the_way_the_route_does() -> None:
 
 @given(route=gentle(), s_m=st.floats(0, 4), distance_m=st.floats(0.01, 0.2))
 def test_the_next_point_is_ahead_at_the_straight_distance(route: Route, s_m: float, distance_m: float) -> None:
-    s = next_on_route(route, route.at(s_m), s_m, distance_m)
+    s = next_on_route(route, route.point_at(s_m), s_m, distance_m)
     assert s >= s_m + distance_m - 1e-6
-    assert math.dist(route.at(s), route.at(s_m)) == pytest.approx(distance_m, abs=1e-6)
+    assert math.dist(route.point_at(s), route.point_at(s_m)) == pytest.approx(distance_m, abs=1e-6)
 
 
 @given(axes=st.lists(st.sampled_from(["yaw", "pitch"]), min_size=1, max_size=12))

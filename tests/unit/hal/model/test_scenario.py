@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.participants import Participants
 from snakesim_hal.model.fault_plan import check_planned
-from snakesim_hal.model.files import shipped
+from snakesim_hal.model.files import list_shipped
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.scenario import (
@@ -23,15 +23,15 @@ from snakesim_hal.model.scenario import (
     WaypointGoal,
     capsules_at_start,
     config_hash,
+    find_start_pose,
     load,
     parse_set,
-    place_all,
-    read,
-    start_of,
-    surveyed,
-    write,
+    place_obstacles,
+    read_config,
+    survey_obstacles,
+    write_config,
 )
-from snakesim_hal.model.scene import route_of
+from snakesim_hal.model.scene import make_route
 from tests.unit.hal.rig import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
 
 
@@ -53,7 +53,7 @@ def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
 
 def test_a_flag_makes_another_field_or_another_goal() -> None:
     first, other = with_flags("clutter"), with_flags("clutter", "scene.random_field.0.seed=7")
-    assert place_all(first.config) != place_all(other.config)
+    assert place_obstacles(first.config) != place_obstacles(other.config)
     points = with_flags("clutter", 'mission.goal={kind="waypoints", points_m=[[3, 0], [5, 0.5]]}')
     assert points.config.mission.goal == WaypointGoal(points_m=[(3.0, 0.0), (5.0, 0.5)])
     with pytest.raises(ConfigError, match=r"mission\.map"):
@@ -62,11 +62,11 @@ def test_a_flag_makes_another_field_or_another_goal() -> None:
 
 def test_a_survey_is_off_by_its_error_and_by_the_same_for_everybody() -> None:
     exact, off = (with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005))
-    truth = np.array([placed.obstacle.position_w for placed in place_all(off)])
-    assert np.array_equal([one.position_w for one in surveyed(exact)], truth)
-    errors_m = np.array([one.position_w for one in surveyed(off)]) - truth
+    truth = np.array([placed.obstacle.position_w for placed in place_obstacles(off)])
+    assert np.array_equal([one.position_w for one in survey_obstacles(exact)], truth)
+    errors_m = np.array([one.position_w for one in survey_obstacles(off)]) - truth
     assert 0.003 < errors_m[:, :2].std() < 0.007 and not errors_m[:, 2].any()
-    assert surveyed(off) == surveyed(off)
+    assert survey_obstacles(off) == survey_obstacles(off)
     with pytest.raises(ConfigError, match="map_error_m"):
         with_flags("clutter", "mission.map_error_m=0.005")
 
@@ -83,19 +83,19 @@ def test_parts_stand_beside_the_scenario_or_are_shipped_and_flags_name_them_from
     assert found.table.origin_of("robot.name") == str(other)
 
 
-@pytest.mark.parametrize("name", shipped("scenarios"))
+@pytest.mark.parametrize("name", list_shipped("scenarios"))
 def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(name: str, tmp_path: Path) -> None:
     config = load(name).config
-    write(config, tmp_path / "config.json")
-    assert read(tmp_path / "config.json") == config
+    write_config(config, tmp_path / "config.json")
+    assert read_config(tmp_path / "config.json") == config
     again = load(str(tmp_path / "config.json")).config
     assert again == config and config_hash(again) == config_hash(config)
 
 
 def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Path) -> None:
     first = with_flags(write_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9").config
-    write(first, tmp_path / "config.json")
-    assert read(tmp_path / "config.json") == first
+    write_config(first, tmp_path / "config.json")
+    assert read_config(tmp_path / "config.json") == first
     again = with_flags(str(tmp_path / "config.json"), "seed=10")
     assert again.config == msgspec.structs.replace(first, seed=10)
     assert again.table.origin_of("seed") == "--set seed=10"
@@ -282,10 +282,10 @@ def test_scenes_that_do_not_fit_the_robot_are_refused(wrong: str, tmp_path: Path
 
 def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
     config = load(write_files(tmp_path)).config
-    route = route_of(config.scene)
+    route = make_route(config.scene)
     assert route is not None
-    pose = start_of(config)
-    assert pose.position_w == pytest.approx(route.at(0.1))
+    pose = find_start_pose(config)
+    assert pose.position_w == pytest.approx(route.point_at(0.1))
     rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
     lengths = config.robot.link_lengths_m
     origins, _ = link_frames((*pose.position_w, 0.0), rotation, pose.angles_rad, config.robot.axes, lengths)
@@ -295,14 +295,14 @@ def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
 
 def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> None:
     mixed = ROBOT_TOML.replace('axes = ["yaw"]', 'axes = ["pitch", "yaw"]').replace("modules = 3", "modules = 6")
-    pose = start_of(load(write_files(tmp_path, robot=mixed)).config)
+    pose = find_start_pose(load(write_files(tmp_path, robot=mixed)).config)
     assert pose.angles_rad[0::2].tolist() == [0.0, 0.0, 0.0]
     assert np.abs(pose.angles_rad[1::2]).min() > 0
 
 
 def test_off_the_route_the_snake_lies_straight_where_told() -> None:
     config = run_config(start={"on_route": False, "position_m": [1.0, 2.0], "yaw_rad": 0.5})
-    pose = start_of(config)
+    pose = find_start_pose(config)
     assert pose.position_w == (1.0, 2.0) and pose.yaw_rad == 0.5 and not pose.angles_rad.any()
     capsules = capsules_at_start(config)
     assert len(capsules) == 4 and capsules[0].rear_m == (1.0, 2.0)
@@ -314,10 +314,10 @@ def test_random_fields_stay_clear_of_the_start() -> None:
     field = {"seed": 1, "min_corner_m": [-0.3, -0.3], "max_corner_m": [0.7, 0.3], "density_per_m2": 30.0}
     field |= {"radius_m": [0.02, 0.03], "clearance_m": 0.01}
     config = run_config(scene__random_field=[field])
-    placed = place_all(config)
+    placed = place_obstacles(config)
     assert len(placed) == 18
     snake = capsules_at_start(config)
     rears, fronts = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
-    links = Outlines.of_segments(rears, fronts, snake[0].radius_m)
+    links = Outlines.from_segments(rears, fronts, snake[0].radius_m)
     for item in placed:
         assert links.distance_m(np.array(item.obstacle.position_w[:2])).min() - item.obstacle.radius_m >= 0.01 - 1e-9

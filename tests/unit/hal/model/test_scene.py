@@ -18,8 +18,8 @@ from snakesim_hal.model.scene import (
     Placed,
     SceneFile,
     check_clear,
-    place,
-    route_of,
+    make_route,
+    place_scene,
 )
 from snakesim_hal.wire.messages import Obstacle
 from tests.unit.hal.rig import SCENE
@@ -36,7 +36,7 @@ FIELD: dict[str, Any] = {
 SNAKE = [
     Capsule(name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04) for i in range(3)
 ]
-LINKS = Outlines.of_segments(
+LINKS = Outlines.from_segments(
     np.array([link.rear_m for link in SNAKE]), np.array([link.front_m for link in SNAKE]), 0.04
 )
 
@@ -48,11 +48,11 @@ def scene(**sections: Any) -> SceneFile:
 def refused_only_if(overlaps: bool, made: SceneFile, words: str) -> None:
     """A scene with an obstacle that overlaps the snake is refused with these words, and any other one is taken."""
     with pytest.raises(ConfigError, match=words) if overlaps else nullcontext():
-        check_clear(made, place(made), SNAKE)
+        check_clear(made, place_scene(made), SNAKE)
 
 
 def test_every_kind_of_obstacle_is_placed_as_described() -> None:
-    placed = place(
+    placed = place_scene(
         scene(
             cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}],
             box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}],
@@ -78,9 +78,9 @@ def test_every_kind_of_obstacle_is_placed_as_described() -> None:
 def test_what_obstacles_are_made_of_holds_for_all_of_a_row_or_field_and_leaves_their_places() -> None:
     made = {"friction": 0.1, "mass_kg": 2.0, "base_friction": 0.5}
     row = {"corridor_m": 0.06, "radius_m": 0.05, "count": 3}
-    plain = place(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
+    plain = place_scene(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
     leaning = {**FIELD, **made, "lean_up_to_rad": 0.2}
-    loose = place(scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning]))
+    loose = place_scene(scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning]))
     assert [item.obstacle for item in loose] == [item.obstacle for item in plain]
     assert {(item.friction, item.slides_at_n) for item in plain} == {(0.2, None)}
     assert {(item.friction, item.slides_at_n) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
@@ -113,9 +113,9 @@ def test_pegs_stand_at_their_distance_on_the_side_that_pushes_forward(
 ) -> None:
     row = {"corridor_m": corridor_m, "radius_m": radius_m, "count": count, "first": first}
     made = scene(route={**SINE, "amplitude_m": amplitude_m}, pegs_along_route=[row])
-    route = route_of(made)
+    route = make_route(made)
     assert route is not None
-    pegs = [item.obstacle for item in place(made)]
+    pegs = [item.obstacle for item in place_scene(made)]
     assert [peg.name for peg in pegs] == [f"peg_0_{first + k}" for k in range(count)]
     spots = route.inflections_s_m()[first:]
     for k, peg in enumerate(pegs):
@@ -124,20 +124,20 @@ def test_pegs_stand_at_their_distance_on_the_side_that_pushes_forward(
         assert np.linalg.norm(foot - center) - radius_m == pytest.approx(corridor_m)
         assert push @ route.tangent_w(spots[k]) == pytest.approx(0.0, abs=1e-6)
         assert push[0] > 0  # the route runs along x
-    sides = [math.copysign(1, peg.position_w[1] - route.at(s)[1]) for peg, s in zip(pegs, spots, strict=False)]
+    sides = [math.copysign(1, peg.position_w[1] - route.point_at(s)[1]) for peg, s in zip(pegs, spots, strict=False)]
     assert all(a == -b for a, b in itertools.pairwise(sides))
 
 
 def test_too_many_pegs_and_pegs_without_a_route_are_refused() -> None:
     row = {"corridor_m": 0.05, "radius_m": 0.05}
     with pytest.raises(ConfigError) as caught:
-        place(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
+        place_scene(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
     said = str(caught.value)
     assert all(word in said for word in ("pegs_along_route.0", "`count` = 12", "has 9 inflections", "at most 8")), said
     with pytest.raises(ConfigError, match=r"`pegs_along_route\.0`: the scene has no route; add a \[route\] section"):
-        place(scene(pegs_along_route=[{**row, "count": 1}]))
+        place_scene(scene(pegs_along_route=[{**row, "count": 1}]))
     with pytest.raises(ConfigError, match="at most 0"):
-        place(scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}]))
+        place_scene(scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}]))
 
 
 # --- random fields ---------------------------------------------------------------------------------------------
@@ -149,9 +149,9 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
     field = {**FIELD, "seed": seed, "clearance_m": clearance_m, "route_clearance_m": route_clearance_m}
     post = {"position_m": [1.0, 0.5], "radius_m": 0.1, "name": "post"}
     made = scene(route=SINE, cylinder=[post], random_field=[field])
-    route = route_of(made)
+    route = make_route(made)
     assert route is not None
-    pegs = [item.obstacle for item in place(made, SNAKE)]
+    pegs = [item.obstacle for item in place_scene(made, SNAKE)]
     placed = pegs[1:]
     assert len(placed) == round(5.0 * 4.0)
     for i, peg in enumerate(placed):
@@ -169,7 +169,7 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
 @settings(max_examples=4)
 def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
     field = {**FIELD, "seed": seed, "density_per_m2": 8.0, "box_fraction": 0.6, "clearance_m": 0.1}
-    placed = [item.obstacle for item in place(scene(random_field=[field]), SNAKE)]
+    placed = [item.obstacle for item in place_scene(scene(random_field=[field]), SNAKE)]
     assert {o.shape for o in placed} == {"cylinder", "box"}
     around = np.linspace(-1.0, 1.0, 41)
     square = np.concatenate([[(x, y), (y, x)] for x in around for y in (-1.0, 1.0)])
@@ -186,10 +186,10 @@ def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
 
 
 def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
-    first, again = (place(scene(random_field=[FIELD])) for _ in range(2))
+    first, again = (place_scene(scene(random_field=[FIELD])) for _ in range(2))
     assert first == again
-    assert place(scene(random_field=[{**FIELD, "seed": 8}])) != first
-    two = place(scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}]))
+    assert place_scene(scene(random_field=[{**FIELD, "seed": 8}])) != first
+    two = place_scene(scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}]))
     assert two[: len(first)] == first  # a second field does not stir the first
     assert {peg.obstacle.name for peg in two[len(first) :]} == {f"random_1_{k}" for k in range(20)}
     assert [p.obstacle.radius_m for p in two[len(first) :]] != [p.obstacle.radius_m for p in first]
@@ -201,16 +201,16 @@ def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
 def test_two_obstacles_with_one_name_are_refused() -> None:
     post = {"position_m": [1, 2], "radius_m": 0.1, "name": "post"}
     with pytest.raises(ConfigError, match="scene 'plain': two obstacles are called 'post'; rename one"):
-        place(scene(cylinder=[post, {**post, "position_m": [2, 2]}]))
+        place_scene(scene(cylinder=[post, {**post, "position_m": [2, 2]}]))
     with pytest.raises(ConfigError, match="'box_0'"):
-        place(scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}]))
+        place_scene(scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}]))
 
 
 def test_a_wall_of_no_length_and_a_route_of_equal_points_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"`wall\.0`: `from_m` and `to_m` are the same point"):
-        place(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
+        place_scene(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
     with pytest.raises(ConfigError, match=r"`route\.points_m`: .*no two neighbors"):
-        route_of(scene(route={"kind": "waypoints", "points_m": [[0, 0], [0, 0]]}))
+        make_route(scene(route={"kind": "waypoints", "points_m": [[0, 0], [0, 0]]}))
 
 
 # --- clear of the start ----------------------------------------------------------------------------------------
@@ -227,7 +227,7 @@ def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float,
 @given(x=st.floats(-0.5, 1.1), y=st.floats(-0.5, 0.5), yaw_rad=st.floats(-3, 3))
 def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, yaw_rad: float) -> None:
     made = scene(box=[{"position_m": [x, y], "size_m": [0.3, 0.1, 0.2], "yaw_rad": yaw_rad}])
-    (block,) = place(made)
+    (block,) = place_scene(made)
     line = np.column_stack([np.linspace(0, 0.6, 1200), np.zeros(1200)])
     gap = min(outline_distance_m(block.obstacle, point) for point in line) - 0.04
     assume(abs(gap) > 2e-3)
@@ -236,7 +236,7 @@ def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: floa
 
 def test_a_snake_may_start_on_a_step() -> None:
     made = scene(step=[{"position_m": [0.3, 0], "size_m": [2, 1], "height_m": 0.02}])
-    check_clear(made, place(made), SNAKE)
+    check_clear(made, place_scene(made), SNAKE)
 
 
 def test_distances_to_outlines() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import Table, find, read_table
+from snakesim_hal.model.files import Table, find_file, read_table
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML, parse_toml, read_text, write_text
 from snakesim_hal.network.router import open_router
@@ -102,9 +102,9 @@ def test_a_flag_of_any_length_is_one_short_line(text: str) -> None:
 def test_names_that_no_file_has() -> None:
     for name in ("a\0b.toml", "x" * 5000 + ".toml", "~nobody-of-this-name/x.toml"):
         with pytest.raises(ConfigError):
-            read_text(find(name, "scenarios"))
+            read_text(find_file(name, "scenarios"))
     with pytest.raises(ConfigError, match="no scenario called"):
-        find("x" * 5000, "scenarios")
+        find_file("x" * 5000, "scenarios")
     with pytest.raises(ConfigError, match="the list has entries"):
         Table({"a": [1]}, "x").put("a.²", 1, "--set")
 

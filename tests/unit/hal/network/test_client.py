@@ -18,7 +18,7 @@ def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Cl
     host, service = sessions
     client = Client(service, "control")
     publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
-    wait_until(publisher.heard, "the service listens", 5.0)
+    wait_until(publisher.has_subscriber, "the service listens", 5.0)
     for each in clocks:
         publisher.put(each)
     wait_until(lambda: client._clocks.qsize() == len(clocks), "all clocks there", 5.0)
@@ -45,7 +45,7 @@ def test_in_lockstep_a_sample_of_a_later_tick_is_not_read_although_it_is_here(
     client = Client(service, "guidance")
     feed, ticks = client.subscribe(keys.POSE, Pose), client.ticks(5.0)
     poses, clocks = (host.publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock)))
-    wait_until(lambda: poses.heard() and clocks.heard(), "the service listens", 5.0)
+    wait_until(lambda: poses.has_subscriber() and clocks.has_subscriber(), "the service listens", 5.0)
     poses.put(pose(3))
     seen: list[int | None] = []
     for at in (clock(2, arm_session=1), msgspec.structs.replace(clock(3, arm_session=1), newest={keys.POSE: 3})):
@@ -67,14 +67,14 @@ def test_a_tick_that_was_commanded_before_is_reported_done_when_it_is_shown_agai
 ) -> None:
     host, service = sessions
     client = Client(service, "control")
-    reports = host.reader(keys.done("control"), Done)
+    reports = host.reader(keys.done_key("control"), Done)
     publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
-    wait_until(publisher.heard, "the service listens", 5.0)
+    wait_until(publisher.has_subscriber, "the service listens", 5.0)
     ticks = client.ticks(5.0)
     for arm_session in (0, 1):
         publisher.put(clock(0, arm_session=arm_session))
         assert next(ticks) is not None
         if arm_session == 0:
             client.commanded_tick = 0
-        client.done(0)
+        client.report_done(0)
     assert received(reports, "the tick reported done") == [Done(tick=0)]

@@ -16,7 +16,7 @@ from snakesim_hal.host.inbox import LIMITS, SAMPLES, CommandArrival
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Arrival, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
@@ -50,9 +50,9 @@ def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]
         assert (statistics.ticks, statistics.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
         assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
         assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
-        assert not run.host.authority.faults and not run.host.authority.rejected
+        assert not run.host.authority.faults and not run.host.authority.rejected_counts
         assert run.host.authority.state == "disarmed" and passive(run.backend.enacted[-1])
-        return box.command_digest, box.layout.arrays(box.rows_from(0)[1])
+        return box.command_digest, box.layout.arrays(box.read_rows(0)[1])
 
 
 def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
@@ -76,7 +76,7 @@ def test_a_slow_participant_is_waited_for() -> None:
         client.announce()
         newest: dict[int, int] = {}
         wait = iter(client.ticks(silence_s=0.05))
-        client.done(next(clock.tick for clock in wait if clock is not None))
+        client.report_done(next(clock.tick for clock in wait if clock is not None))
         run.arm()
         due = 5
         for clock in wait:
@@ -84,7 +84,7 @@ def test_a_slow_participant_is_waited_for() -> None:
                 newest[clock.tick] = clock.newest["guidance"]
                 if clock.tick == due + 4:  # at the last moment
                     assert run.host.black_box.ticks <= due + 4
-                    client.done(due)
+                    client.report_done(due)
                     due += 5
             if run.ended():
                 break
@@ -157,7 +157,7 @@ def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is
         at = len(run.backend.enacted)
         late = command(run.host.description, 0.2, lease_epoch=held, sequence=10**6)  # the old holder has not heard yet
         run.session.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
-        refused = run.host.authority.rejected
+        refused = run.host.authority.rejected_counts
         wait_until(lambda: refused["wrong_epoch"] + refused["no_lease"] > 0, "the old holder's command refused")
         wait_until(lambda: len(run.backend.enacted) > at + 3, "three ticks")
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
@@ -187,14 +187,26 @@ def test_nothing_that_is_put_on_the_network_ends_the_host_and_all_of_it_is_count
         ENCODING_PREFIX + "JointCommand/9",
         ENCODING_PREFIX + "Done/9",
     ]
-    own = [encoding_of(JointCommand), encoding_of(Done), encoding_of(LeaseRequest), encoding_of(EstopRequest)]
-    samples = [keys.JOINT_COMMAND, keys.done("control"), keys.done("stranger"), "actuator/*", "hal/done/*", "**"]
+    own = [
+        format_encoding(JointCommand),
+        format_encoding(Done),
+        format_encoding(LeaseRequest),
+        format_encoding(EstopRequest),
+    ]
+    samples = [
+        keys.JOINT_COMMAND,
+        keys.done_key("control"),
+        keys.done_key("stranger"),
+        "actuator/*",
+        "hal/done/*",
+        "**",
+    ]
     with running(run_config()) as run, following(run.link, Follower()) as control:
         run.arm()
         put, get = run.session._zenoh.put, run.session._zenoh.get  # a stranger does not keep to our session
         for key, payload, encoding in itertools.product(samples, garbage, own + foreign):
             put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
-        counted = run.host.authority.rejected
+        counted = run.host.authority.rejected_counts
         # `**` reaches the host twice, by its two subscriptions.
         wait_until(lambda: sum(counted.values()) >= 7 * 32, "every sample counted")
         assert set(counted) == {"malformed", "unknown_message", "unknown_version"}
@@ -221,10 +233,10 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
         own = host.authority.lease.epoch
         for epoch, done_tick in ((0, -1), (own + 6, -1), (own, 0)):
             sent = command(host.description, 0.1, lease_epoch=epoch)
-            arrival = Arrival(keys.JOINT_COMMAND, encode(sent), encoding_of(JointCommand), time.monotonic_ns())
+            arrival = Arrival(keys.JOINT_COMMAND, encode(sent), format_encoding(JointCommand), time.monotonic_ns())
             host._inbox.handle(CommandArrival(arrival, Decoder(JointCommand)))
             assert host.participants["control"].done_tick == done_tick
-        assert host.authority.rejected["wrong_epoch"] == 2
+        assert host.authority.rejected_counts["wrong_epoch"] == 2
 
 
 def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
@@ -238,7 +250,7 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
         wait_until(lambda: host._inbox.dropped >= 400, "a full inbox")
         answers: list[Any] = []
         request = EstopRequest(who="a person")
-        asking = threading.Thread(target=lambda: answers.append(stranger.ask(keys.ESTOP, request, 10.0)))
+        asking = threading.Thread(target=lambda: answers.append(stranger.request(keys.ESTOP, request, 10.0)))
         asking.start()
         wait_until(lambda: host._inbox.waiting() > limit, "the estop in the inbox")
         thread = threading.Thread(target=host.run)

@@ -22,12 +22,12 @@ def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
     assert feed.newest() is None and feed.at(0) is None
     for tick in range(100):
         joints.put(state(robot, 0.1 * tick, tick=tick))
-        feed.take_in()
+        feed.store_arrived()
     newest, kept = feed.newest(), feed.at(99)
     assert newest is not None and newest.tick == 99 and kept is newest
     assert feed.at(50) is None and feed.at(90) is not None
     joints.put(state(robot, 0.0, tick=90))  # shown again: it came last
-    feed.take_in()
+    feed.store_arrived()
     newest = feed.newest()
     assert newest is not None and newest.tick == 90
     feed.clear()
@@ -48,7 +48,7 @@ def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never
         feed = client.subscribe(keys.JOINTS, JointState)
         clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
         joints = hal.publisher(keys.JOINTS, JointState, lossless=True)
-        wait_until(lambda: clocks.heard() and joints.heard(), "the client's subscriptions")
+        wait_until(lambda: clocks.has_subscriber() and joints.has_subscriber(), "the client's subscriptions")
         ticks = iter(client.ticks(silence_s=5.0))
         for tick in (3, 4):
             joints.put(state(robot, tick=tick))
@@ -81,9 +81,9 @@ def test_a_commander_asks_for_a_free_lease_and_gives_up_one_that_passed_on() -> 
         other = LeaseRequest(action="acquire", holder="teleop", priority=200)
         assert run.ask(keys.LEASE, other).ok
         ticks = (found for found in client.ticks(silence_s=1.0) if found is not None)
-        held = [commander.holds(next(ticks)) for _ in range(2)]
+        held = [commander.ensure_lease(next(ticks)) for _ in range(2)]
         assert held[0] is False and commander.refusal is not None and "held by teleop" in commander.refusal
-        wait_until(lambda: commander.holds(next(ticks)), "the end of teleop's lease", 10.0)
+        wait_until(lambda: commander.ensure_lease(next(ticks)), "the end of teleop's lease", 10.0)
         assert commander.refusal is None and run.host.authority.lease.holder == "pilot"
         assert run.ask(keys.LEASE, other).ok
-        wait_until(lambda: not commander.holds(next(ticks)), "the lease seen to have passed on")
+        wait_until(lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on")

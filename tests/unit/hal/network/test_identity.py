@@ -15,10 +15,10 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_registry import LocalRobot, local_robots, registered, robot_folder
 from snakesim_hal.network.private_channel import HostEnd, HostMessage, StarterEnd, socket_pair
-from snakesim_hal.network.run_key import RUN_KEY, is_proven, new_run_key, proven
+from snakesim_hal.network.run_key import RUN_KEY, add_proof, is_proven, new_run_key
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, request_to_arm
+from snakesim_hal.wire.messages import Description, make_arm_request
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.rig import description, run_config
@@ -26,7 +26,7 @@ from tests.unit.hal.rig import description, run_config
 
 def test_a_description_is_proven_by_the_runs_key_alone() -> None:
     described, key = description(), new_run_key()
-    ours = proven(described, key)
+    ours = add_proof(described, key)
     assert is_proven(ours, key) and is_proven(described, None)
     assert not is_proven(described, key) and not is_proven(ours, new_run_key())
     assert not is_proven(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
@@ -49,19 +49,19 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
     with running(run_config(clock_mode="realtime"), starter=HostEnd(its)) as run, following(run.link, Follower()):
 
         def ready() -> bool:
-            starter.take_in()
+            starter.receive()
             return starter.status is not None and starter.status.ready_to_arm
 
         wait_until(ready, "a status that is ready")
         robot = starter.description
         assert robot == run.host.description and robot is not None
-        arm = request_to_arm(robot, "the run")
-        starter.ask(msgspec.structs.replace(arm, host="another"))
-        wait_until(lambda: starter.take_in() or starter.answers, "an answer")
+        arm = make_arm_request(robot, "the run")
+        starter.send_request(msgspec.structs.replace(arm, host="another"))
+        wait_until(lambda: starter.receive() or starter.answers, "an answer")
         refused = starter.answers.pop()
         assert not refused.ok and refused.refusal == "wrong_host"
-        starter.ask(arm)
-        wait_until(lambda: starter.take_in() or starter.answers, "an answer")
+        starter.send_request(arm)
+        wait_until(lambda: starter.receive() or starter.answers, "an answer")
         assert starter.answers.pop().ok
         run.reaches("armed")
         assert run.status.why.startswith("armed by the run")
@@ -74,7 +74,7 @@ def test_a_starter_that_does_not_read_holds_up_nothing() -> None:
     with ours, its:
         host = HostEnd(its)
         for _ in range(5000):
-            host.say(HostMessage(description=description()))
+            host.send(HostMessage(description=description()))
 
 
 def a_robot() -> LocalRobot:

@@ -31,11 +31,11 @@ def test_a_difference_is_told_with_both_places(change: str, named: str, sessions
     here, there = sessions
     entries, own = ProcessEntries(here), own_entry("host", config())
     show_process(there, own_entry("control", config(change)))
-    wait_until(lambda: bool(entries.against(own, ["control"])), "an entry", 5.0)
-    wait_until(lambda: named in entries.against(own, ["control"])[0], named, 5.0)
-    (reported,) = entries.against(own, ["control"])
+    wait_until(lambda: bool(entries.find_problems(own, ["control"])), "an entry", 5.0)
+    wait_until(lambda: named in entries.find_problems(own, ["control"])[0], named, 5.0)
+    (reported,) = entries.find_problems(own, ["control"])
     assert f"(control, process {own.pid})" in reported and f"(host, process {own.pid})" in reported
-    assert entries.against(own, ["guidance"]) == []
+    assert entries.find_problems(own, ["guidance"]) == []
 
 
 def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]) -> None:
@@ -47,7 +47,7 @@ def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]
     show_process(there, service)
     show_process(there, msgspec.structs.replace(service, name="recorder", settings={}, messages={}))
     wait_until(lambda: len(here.present(keys.PROCESS_ALL)) == 2, "both", 5.0)
-    wait_until(lambda: entries.against(own, ["control", "recorder"]) == [], "no difference", 5.0)
+    wait_until(lambda: entries.find_problems(own, ["control", "recorder"]) == [], "no difference", 5.0)
 
 
 def test_another_version_of_a_message_is_reported_and_the_entry_counts_as_long_as_its_process_lives(
@@ -55,15 +55,19 @@ def test_another_version_of_a_message_is_reported_and_the_entry_counts_as_long_a
 ) -> None:
     here, there = sessions
     entries, own = ProcessEntries(here), own_entry("host", config())
-    key = keys.process("control", "1")
+    key = keys.process_key("control", "1")
     there.declare_token(key)
     wait_until(
-        lambda: entries.against(own, ["control"]) == ["control-1 has not published its settings yet"], "a token", 5.0
+        lambda: entries.find_problems(own, ["control"]) == ["control-1 has not published its settings yet"],
+        "a token",
+        5.0,
     )
     newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
     there.latched_publisher(key, Process).put(newer)
     wait_until(
-        lambda: "message JointCommand has version 2 on " in "".join(entries.against(own, ["control"])), "told", 5.0
+        lambda: "message JointCommand has version 2 on " in "".join(entries.find_problems(own, ["control"])),
+        "told",
+        5.0,
     )
     there.close()
-    wait_until(lambda: entries.against(own, ["control"]) == [], "gone", 5.0)
+    wait_until(lambda: entries.find_problems(own, ["control"]) == [], "gone", 5.0)

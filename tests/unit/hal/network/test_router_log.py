@@ -26,8 +26,8 @@ def reported(*lines: str) -> list[str]:
     said: list[str] = []
     log = RouterLog(said.append)
     for one in lines:
-        log.take(one)
-    log.turn()
+        log.process_line(one)
+    log.report_repetitions()
     return said
 
 
@@ -95,8 +95,8 @@ def test_a_flood_of_different_lines_is_bounded() -> None:
     log = RouterLog(said.append)
     for _ in range(3):
         for number in range(2 * MAX_BURST_LINES):
-            log.take(line(f"{SUBJECT} is unauthorized to Put (ingress) on {number:09}{'x' * 5000}"))
-        log.turn()
+            log.process_line(line(f"{SUBJECT} is unauthorized to Put (ingress) on {number:09}{'x' * 5000}"))
+        log.report_repetitions()
     assert len(said) <= MAX_BURST_LINES + 3 * LINES_PER_INTERVAL + 3
     assert max(map(len, said)) <= MAX_LINE_CHARACTERS
     assert "left out" in said[-1]

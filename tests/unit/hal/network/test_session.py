@@ -11,7 +11,7 @@ import zenoh
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
-from snakesim_hal.network.session import Arrival, Link, Publisher, Question, open_session
+from snakesim_hal.network.session import Arrival, Link, Publisher, Query, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
@@ -51,7 +51,7 @@ def test_a_stream_is_not_given_to_those_who_come_late() -> None:
         publisher = hal.publisher(keys.JOINTS, JointState)
         publisher.put(state(ROBOT, tick=1))
         reader = session.reader(keys.JOINTS, JointState)
-        wait_until(publisher.heard, "the subscription")
+        wait_until(publisher.has_subscriber, "the subscription")
         publisher.put(state(ROBOT, tick=2))
         assert [joints.tick for joints in received(reader, "the sample")] == [2]
 
@@ -60,11 +60,11 @@ def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
     with meeting("worm", "worm") as (hal, session):
         reader = session.reader(keys.JOINTS, JointState, depth=4)
         publisher = hal.publisher(keys.JOINTS, JointState, lossless=True)
-        wait_until(publisher.heard, "the subscription")
+        wait_until(publisher.has_subscriber, "the subscription")
         arrived: list[Arrival] = []
-        session.on_arrival(keys.done("end"), arrived.append)
-        end = hal.publisher(keys.done("end"), Done, lossless=True)
-        wait_until(end.heard, "the second subscription")
+        session.on_arrival(keys.done_key("end"), arrived.append)
+        end = hal.publisher(keys.done_key("end"), Done, lossless=True)
+        wait_until(end.has_subscriber, "the second subscription")
         for tick in range(20):
             publisher.put(state(ROBOT, tick=tick))
         end.put(Done(tick=0))
@@ -91,7 +91,7 @@ def test_a_session_closes_while_urgent_samples_arrive() -> None:
             publisher.put(Done(tick=0))
 
     with open_session(Link(endpoint, "a", listen=True)) as hal:
-        talker = threading.Thread(target=talk, args=(hal.publisher(keys.done("one"), Done),), daemon=True)
+        talker = threading.Thread(target=talk, args=(hal.publisher(keys.done_key("one"), Done),), daemon=True)
         talker.start()
         for _ in range(5):
             arrived: list[Arrival] = []
@@ -108,7 +108,7 @@ def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both()
         a.on_arrival(keys.DONE_ALL, heard["a"].append)
         b.on_arrival(keys.DONE_ALL, heard["b"].append)
         tool.on_arrival(f"**/{keys.DONE_ALL}", heard["tool"].append)
-        publishers = [session.publisher(keys.done(name), Done) for session, name in ((a, "a"), (b, "b"))]
+        publishers = [session.publisher(keys.done_key(name), Done) for session, name in ((a, "a"), (b, "b"))]
 
         def heard_everywhere() -> bool:
             for publisher in publishers:
@@ -123,9 +123,9 @@ def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both()
 
 
 def test_a_question_by_pattern_is_about_the_key_that_was_declared() -> None:
-    questions: list[Question] = []
+    questions: list[Query] = []
     with meeting("worm", None) as (hal, tool):
-        hal.on_question(keys.ESTOP, questions.append)
+        hal.on_query(keys.ESTOP, questions.append)
         for pattern in ("**", "worm/hal/*"):
             replies = tool._zenoh.get(pattern, timeout=5.0)
             wait_until(lambda: questions, "the question")
@@ -137,11 +137,11 @@ def test_a_question_by_pattern_is_about_the_key_that_was_declared() -> None:
 
 def test_an_answer_to_somebody_who_has_gone_hurts_nobody() -> None:
     endpoint = free_endpoint()
-    questions: list[Question] = []
+    questions: list[Query] = []
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
-        hal.on_question(keys.ESTOP, questions.append)
+        hal.on_query(keys.ESTOP, questions.append)
         with open_session(Link(endpoint, "worm")) as session, pytest.raises(NotConnectedError):
-            session.ask(keys.ESTOP, EstopRequest(who="a person"), timeout_s=0.1)
+            session.request(keys.ESTOP, EstopRequest(who="a person"), timeout_s=0.1)
         wait_until(lambda: questions, "the question")
         questions[0].reply(Answer(ok=True, reason=""))
 
@@ -159,7 +159,7 @@ def test_nobody_there_is_told_soon() -> None:
         open_session(Link(endpoint, "worm")) as session,
         pytest.raises(NotConnectedError, match="no answer on hal/lease"),
     ):
-        session.ask(keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2)
+        session.request(keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2)
     assert time.monotonic() - began < 5.0
     with pytest.raises(ConnectionError):
         raise NotConnectedError("it is the matching builtin, too")
@@ -185,7 +185,7 @@ def test_liveliness_shows_who_comes_who_was_there_and_who_goes() -> None:
             first.declare_alive("guidance")
             with open_session(Link(endpoint, "worm")) as second:
                 second.declare_alive("control")
-                hal.on_alive(lambda key, present: seen.append((keys.service_of(key), present)))
+                hal.on_alive(lambda key, present: seen.append((keys.parse_service(key), present)))
                 wait_until(lambda: len(seen) >= 2, "both tokens")
                 assert set(seen) == {("guidance", True), ("control", True)}
             wait_until(lambda: ("control", False) in seen, "control's going")
@@ -209,8 +209,8 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
     with open_router(path), open_session(Link(endpoint, "a")) as one, open_session(Link(endpoint, "a")) as two:
         arrived: list[Arrival] = []
         two.on_arrival(keys.DONE_ALL, arrived.append)
-        publisher = one.publisher(keys.done("x"), Done)
-        wait_until(publisher.heard, "the subscription")
+        publisher = one.publisher(keys.done_key("x"), Done)
+        wait_until(publisher.has_subscriber, "the subscription")
         publisher.put(Done(tick=1))
         wait_until(lambda: arrived, "the sample through the router")
 

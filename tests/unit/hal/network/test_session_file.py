@@ -27,7 +27,7 @@ def test_sessions_of_one_file_meet_at_its_router_and_stock_zenoh_reads_the_same_
     router = tmp_path / "router.json5"
     router.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
     path = written(tmp_path, f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
-    link = Link.of_file(read_session(path), "worm")
+    link = Link.from_session_file(read_session(path), "worm")
     assert link.endpoint == endpoint and link.namespace == "worm"
     with pytest.raises(NotConnectedError, match=r"lab\.json5"), open_session(link, connect_timeout_s=0.1):
         pass
@@ -72,6 +72,6 @@ def test_a_file_that_contradicts_what_every_session_needs_is_refused_by_name(
 def test_a_file_for_one_robot_is_no_way_to_another(tmp_path: Path) -> None:
     settings = {"mode": "client", "connect": {"endpoints": ["tcp/10.0.0.1:7447"]}, "namespace": "worm"}
     session = read_session(written(tmp_path, json.dumps(settings)))
-    assert Link.of_file(session).namespace == Link.of_file(session, "worm").namespace == "worm"
+    assert Link.from_session_file(session).namespace == Link.from_session_file(session, "worm").namespace == "worm"
     with pytest.raises(ConfigError, match="'worm', not 'eel'"):
-        Link.of_file(session, "eel")
+        Link.from_session_file(session, "eel")

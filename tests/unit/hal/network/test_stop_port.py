@@ -12,8 +12,8 @@ from snakesim_hal.network.stop_port import (
     ANSWER,
     REQUEST,
     Reply,
-    ask_to_stop,
     open_stop_port,
+    request_stop,
     serve_stops,
     stop_address,
 )
@@ -37,7 +37,7 @@ def served() -> Iterator[tuple[int, list[str]]]:
 
 def test_a_stop_is_taken_and_answered_in_the_robots_name() -> None:
     with served() as (port, asked):
-        answer = ask_to_stop(LOOPBACK, port, "anna", 5.0)
+        answer = request_stop(LOOPBACK, port, "anna", 5.0)
         assert answer is not None and (answer.robot, answer.text) == ("lab/worm", "done")
         assert asked == ["anna"]
 
@@ -48,7 +48,7 @@ def test_a_stop_is_taken_and_answered_in_the_robots_name() -> None:
 def test_what_is_no_stop_is_not_taken(datagram: bytes) -> None:
     with served() as (port, asked), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(datagram, (LOOPBACK, port))
-        assert ask_to_stop(LOOPBACK, port, "anna", 5.0) is not None
+        assert request_stop(LOOPBACK, port, "anna", 5.0) is not None
         assert asked == ["anna"]
 
 
@@ -63,7 +63,7 @@ def test_an_answer_from_elsewhere_or_to_another_question_does_not_count() -> Non
     with open_stop_port(LOOPBACK, 0) as silent, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as liar:
         port = silent.getsockname()[1]
         answers: list[object] = []
-        asking = threading.Thread(target=lambda: answers.append(ask_to_stop(LOOPBACK, port, "anna", 0.5)))
+        asking = threading.Thread(target=lambda: answers.append(request_stop(LOOPBACK, port, "anna", 0.5)))
         asking.start()
         request, sender = silent.recvfrom(200)
         liar.sendto(ANSWER + request[8:24] + b"lab/worm\ndone", sender)
@@ -78,7 +78,7 @@ def test_nobody_has_the_port() -> None:
         with pytest.raises(NotConnectedError, match=rf"udp/127\.0\.0\.1:{port}.*--endpoint"):
             open_stop_port(LOOPBACK, port)
     with pytest.raises(NotConnectedError, match="no host takes"):
-        ask_to_stop(LOOPBACK, port, "anna", 5.0)
+        request_stop(LOOPBACK, port, "anna", 5.0)
 
 
 @pytest.mark.parametrize(

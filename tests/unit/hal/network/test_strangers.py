@@ -12,7 +12,7 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.route import Route
 from snakesim_hal.network.client import Client, Commander
-from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
@@ -97,14 +97,14 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
     ],
 )
 def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
-    wrong = mismatch(message, ROBOT)
+    wrong = find_mismatch(message, ROBOT)
     assert (wrong.reason if wrong is not None else None) == why
 
 
 def test_what_passes_as_a_path_makes_a_route() -> None:
     tiny = 5e-324  # the shortest step there is: its length is no number to divide by
     for path in ([(0.0, 0.0), (tiny, 0.0)], [(1e6, 0.0), (-1e6, 0.0)]):
-        if mismatch(trajectory(*path), ROBOT) is None:
+        if find_mismatch(trajectory(*path), ROBOT) is None:
             assert Route(path).length_m > 0
 
 
@@ -121,7 +121,9 @@ def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out()
         assert client.description() == client.description() == ROBOT  # asked again, it is remembered
         clocks = hal.publisher(keys.CLOCK, Clock)
         asked, felt = hal.publisher(keys.INTENT, Intent), hal.publisher(keys.JOINTS, JointState)
-        wait_until(lambda: clocks.heard() and asked.heard() and felt.heard(), "everybody heard")
+        wait_until(
+            lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(), "everybody heard"
+        )
         for speed in (0.1, 0.2):
             asked.put(Intent(timestamp_ns=5, who="operator", speed_m_s=speed))
         felt.put(state(ROBOT, 0.1, tick=3))
@@ -147,10 +149,10 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
             keys.LEASE, lambda query: query.reply(keys.LEASE, b"\xc1", encoding="zenoh/bytes")
         )
         with pytest.raises(NotConnectedError, match="hal/lease cannot be decoded: unknown_message"):
-            session.ask(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
+            session.request(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
         commander = Commander(Client(session, "control"), ROBOT)
         time.sleep(0.3)  # it asks at most so often
-        assert not commander.holds(CLOCK)
+        assert not commander.ensure_lease(CLOCK)
         assert commander.refusal is not None and "cannot be decoded" in commander.refusal
         assert session.rejected == {"unknown_message": 2}
         stranger.undeclare()
@@ -162,7 +164,7 @@ def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> N
         for listener in (hal, session):
             listener.on_arrival(keys.JOINTS, lambda arrival: heard.append(len(arrival.payload)))
         publisher = stranger.publisher(keys.JOINTS, JointState, lossless=True)
-        wait_until(publisher.heard, "somebody listening")
+        wait_until(publisher.has_subscriber, "somebody listening")
         put: Any = stranger._zenoh.put  # pyright: ignore[reportPrivateUsage] - a stranger does not keep to our session
         for length in (MAX_PAYLOAD_BYTES, 10 * MAX_PAYLOAD_BYTES, 1):
             put(keys.JOINTS, bytes(length), congestion_control=zenoh.CongestionControl.BLOCK)
@@ -178,9 +180,9 @@ def test_large_images_arrive_where_they_are_expected() -> None:
         open_session(Link(endpoint, "worm", max_bytes=largest)) as session,
         open_session(Link(endpoint, "worm")) as small,
     ):
-        readers = [each.reader(keys.depth("head"), DepthImage) for each in (session, small)]
-        publisher = hal.publisher(keys.depth("head"), DepthImage, lossless=True)
-        wait_until(publisher.heard, "somebody listening")
+        readers = [each.reader(keys.depth_key("head"), DepthImage) for each in (session, small)]
+        publisher = hal.publisher(keys.depth_key("head"), DepthImage, lossless=True)
+        wait_until(publisher.has_subscriber, "somebody listening")
         sent = msgspec.structs.replace(image(bytes(largest)), width=1280, height=960)
         publisher.put(sent)
         wait_until(lambda: readers[0].drain() == [sent], "the image")
@@ -205,7 +207,7 @@ def test_a_flood_is_dropped_unread_but_for_the_newest_that_is_wanted() -> None:
         reader, asked = session.reader(keys.JOINTS, JointState), list[int]()
         joints, after = hal.publisher(keys.JOINTS, JointState, lossless=True), session.reader(keys.CLOCK, Clock)
         clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
-        wait_until(lambda: joints.heard() and clocks.heard(), "both readers")
+        wait_until(lambda: joints.has_subscriber() and clocks.has_subscriber(), "both readers")
         for tick in range(101):
             joints.put(state(ROBOT, tick=tick))
         clocks.put(CLOCK)

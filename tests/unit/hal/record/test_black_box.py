@@ -10,8 +10,8 @@ import pytest
 
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
-from snakesim_hal.safety.authority import Decision
+from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
+from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Mode
 from tests.unit.hal.rig import contact, description, pose, state
@@ -19,11 +19,11 @@ from tests.unit.hal.rig import contact, description, pose, state
 ROBOT = description()
 
 
-def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Decision:
-    return Decision(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
+def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> TickDecision:
+    return TickDecision(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
 
 
-def digest(*rows: tuple[int, Decision], angle: float = 0.0) -> str:
+def digest(*rows: tuple[int, TickDecision], angle: float = 0.0) -> str:
     box = BlackBox(ROBOT)
     for tick, reported in rows:
         box.record(tick, tick * 10_000_000, Samples(state(ROBOT, angle)), reported)
@@ -33,10 +33,10 @@ def digest(*rows: tuple[int, Decision], angle: float = 0.0) -> str:
 def all_rows(box: BlackBox) -> dict[str, Any]:
     """Everything that the box holds, as columns."""
     rows = bytearray()
-    row, taken = box.rows_from(0)
+    row, taken = box.read_rows(0)
     while taken:
         rows += taken
-        row, taken = box.rows_from(row + len(taken) // box.layout.row_bytes)
+        row, taken = box.read_rows(row + len(taken) // box.layout.row_bytes)
     return box.layout.arrays(bytes(rows))
 
 
@@ -53,7 +53,7 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
         joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
         box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
     columns = all_rows(box)
-    assert digest_of(columns) == box.command_digest
+    assert compute_digest(columns) == box.command_digest
     assert box.ticks == count and all(len(column) == count for column in columns.values())
     assert columns["time_s"] == pytest.approx(0.01 * np.arange(count))
     assert columns["angle_rad"][-1].tolist() == pytest.approx([0.1, 0.2, 0.001 * (count - 1)])
@@ -82,7 +82,7 @@ def test_the_digest_stands_for_tick_mode_target_and_torque_limit_and_nothing_els
 
 
 def on_disk(box: BlackBox, path: Path, torn: int = 0) -> Path:
-    content = box.layout.header() + box.rows_from(0)[1]
+    content = box.layout.header() + box.read_rows(0)[1]
     path.write_bytes(content[: len(content) - torn])
     return path
 
@@ -98,12 +98,12 @@ def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int
     assert set(columns) == set(whole) and columns["tick"].tolist() == list(range(5 - bool(torn)))
     for name, column in columns.items():
         assert np.array_equal(column, whole[name][: len(column)], equal_nan=True), name
-    assert (digest_of(columns) == box.command_digest) == (not torn)
+    assert (compute_digest(columns) == box.command_digest) == (not torn)
 
 
 def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
     _, columns = read_black_box(on_disk(BlackBox(ROBOT), tmp_path / "box"))
-    assert columns["angle_rad"].shape == (0, 3) and digest_of(columns) == BlackBox(ROBOT).command_digest
+    assert columns["angle_rad"].shape == (0, 3) and compute_digest(columns) == BlackBox(ROBOT).command_digest
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_when_nobody_takes_them_the_newest_rows_are_kept() -> None:
     box = BlackBox(ROBOT, memory_bytes=10 * BlackBox(ROBOT).layout.row_bytes)
     for tick in range(25):
         box.record(tick, tick, Samples(state(ROBOT, 0.001 * tick)), decision())
-    first, rows = box.rows_from(3)
+    first, rows = box.read_rows(3)
     assert first == 16 and all_rows(box)["tick"].tolist() == list(range(16, 25)) and box.ticks == 25
     assert box.layout.arrays(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
     assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))  # of all, kept or not
@@ -149,7 +149,7 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
     def take() -> None:
         row = 0
         while not over.is_set():
-            first, rows = box.rows_from(row)
+            first, rows = box.read_rows(row)
             columns = box.layout.arrays(rows)
             same = columns["angle_rad"][:, 0] == columns["tick"]
             torn.extend(columns["tick"][~same].tolist())
@@ -169,7 +169,7 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
 def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
     robot = description(chain__modules=100)
     box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
-    reported = Decision(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    reported = TickDecision(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
     for tick in range(300):
         box.record(tick, tick, row, reported)
     peaks = [0] * 700

@@ -13,19 +13,19 @@ import msgspec
 import pytest
 
 from snakesim_hal.backend import SafeSetpoints, Samples
-from snakesim_hal.programs.host_program import record_of
+from snakesim_hal.programs.host_program import create_host_record
 from snakesim_hal.run_log import writer as under_test
-from snakesim_hal.run_log.black_box import BlackBox, digest_of, read_black_box
+from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
-from snakesim_hal.safety.authority import Decision
+from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire.messages import Description, Mode
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.rig import description, run_config, state
 
 ROBOT = description()
-TOLD = Decision(SafeSetpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
+TOLD = TickDecision(SafeSetpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
 ROW = BlackBox(ROBOT).layout.row_bytes
 
 
@@ -79,7 +79,7 @@ def test_rows_and_numbers_are_on_disk_within_a_second_and_all_of_them_at_the_end
         fill(box, *range(40, 45))
     assert ticks_on_disk(tmp_path) == list(range(45))
     assert reported(tmp_path) == remembered(memory) == Numbers(45, 0, "")
-    assert digest_of(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
+    assert compute_digest(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
     assert msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=Description) == ROBOT
     assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
 
@@ -168,7 +168,9 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
         running(run_config(clock_mode="lockstep"), max_ticks=75) as run,
         following(run.link, Follower()),
     ):
-        with HostRecordWriter(run.host.black_box, run.host.description, partial(record_of, run.host), tmp_path, memory):
+        with HostRecordWriter(
+            run.host.black_box, run.host.description, partial(create_host_record, run.host), tmp_path, memory
+        ):
             layout = run.host.black_box.layout
             disk.space, disk.hangs = len(layout.header()) + 6 * layout.row_bytes, True
             run.arm()

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from hypothesis.stateful import RuleBasedStateMachine
 
-from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.safety.authority import Authority, TickDecision
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire.messages import Answer, JointCommand, LifecycleState, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS
@@ -98,7 +98,7 @@ class Model(RuleBasedStateMachine):
         self.silent: set[int] = set()
         self.shares = [1.0] * JOINTS
         self.reported = True  # the motors were told of the last stop
-        self.last: Decision | None = None
+        self.last: TickDecision | None = None
 
     @property
     def live(self) -> bool:
@@ -199,10 +199,10 @@ class Model(RuleBasedStateMachine):
         assert answer.ok == ok and (answer.refusal is None) == ok, answer
         assert answer.reason and answer.epoch == self.epoch and answer.lifecycle == self.state
 
-    def check_aside(self, decision: Decision) -> None:
+    def check_aside(self, decision: TickDecision) -> None:
         points = decision.setpoints
         assert points.isolated == self.aside and len(self.aside) <= self.max_isolated
-        assert self.authority.isolated == [f"joint_{i + 1}" for i in sorted(self.aside)]
+        assert self.authority.isolated_joints == [f"joint_{i + 1}" for i in sorted(self.aside)]
         for i in self.aside:
             assert (points.mode[i], points.target[i], points.torque_limit_nm[i]) == (Mode.PASSIVE, 0.0, 0.0)
 
@@ -213,7 +213,7 @@ class Model(RuleBasedStateMachine):
     def torques(self) -> Any:
         return pytest.approx(self.of_the_rest([TORQUE * share for share in self.shares]))
 
-    def check_safe(self, decision: Decision) -> None:
+    def check_safe(self, decision: TickDecision) -> None:
         assert decision.sequence is None and not decision.limited
         action = self.action if self.state == "fault" and self.halt is not None else "passive"
         assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
@@ -227,13 +227,13 @@ class Model(RuleBasedStateMachine):
         assert set(self.of_the_rest(decision.setpoints.mode)) <= {mode}
         assert decision.setpoints.target == [0.0] * JOINTS
 
-    def check_held(self, decision: Decision, angle_rad: list[float]) -> None:
+    def check_held(self, decision: TickDecision, angle_rad: list[float]) -> None:
         assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION} and not decision.limited
         held = [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
         assert self.of_the_rest(decision.setpoints.target) == self.of_the_rest(held)
         assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
 
-    def check_commanded(self, decision: Decision, sent: JointCommand) -> None:
+    def check_commanded(self, decision: TickDecision, sent: JointCommand) -> None:
         for i in self.aside:
             assert decision.limited.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
         assert self.of_the_rest(decision.setpoints.mode) == self.of_the_rest(sent.mode)
@@ -248,7 +248,7 @@ class Model(RuleBasedStateMachine):
             else:
                 assert decision.setpoints.target[i] == 0.0 and i not in decision.limited
 
-    def check_target(self, i: int, decision: Decision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
+    def check_target(self, i: int, decision: TickDecision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
         """Inside the limits, no faster than allowed, as near to what is wanted as that permits; else named."""
         angle, velocity, torque = (column[i] for column in self.measured)
         target = decision.setpoints.target[i]

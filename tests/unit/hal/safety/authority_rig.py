@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.safety.authority import Authority, TickDecision
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.wire.messages import Answer, EstopRequest, LeaseRequest, LifecycleRequest, Mode
 from tests.unit.hal.rig import PERIOD_NS, command, description, power, state
@@ -44,18 +44,18 @@ class Rig:
         }
         values = {"tick": self.tick, **values}
         asked = command(self.robot, target, mode, **values)
-        return self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=0)
+        return self.authority.offer_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=0)
 
     def arm(self) -> Answer:
         return self.authority.on_lifecycle(ARM, self.now_ns)
 
-    def pass_tick(self, periods: int = 1) -> Decision:
+    def pass_tick(self, periods: int = 1) -> TickDecision:
         self.now_ns += periods * PERIOD_NS
         self.tick += periods
-        self.authority.expire(self.now_ns, self.tick)
+        self.authority.check_deadlines(self.now_ns, self.tick)
         return self.authority.decide()
 
-    def tick_with(self, *command: Any, **other: Any) -> Decision:
+    def tick_with(self, *command: Any, **other: Any) -> TickDecision:
         """A command, and what is decided at the end of its tick."""
         self.send(*command, **other)
         return self.pass_tick()
@@ -75,7 +75,7 @@ def armed(**robot: Any) -> Rig:
     return rig
 
 
-def modes(decision: Decision) -> set[Mode]:
+def modes(decision: TickDecision) -> set[Mode]:
     return set(decision.setpoints.mode)
 
 

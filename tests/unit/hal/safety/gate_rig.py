@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.safety.limit_names import name_active_limits
-from snakesim_hal.safety.limiter import bumpless_target, limit_command
+from snakesim_hal.safety.limiter import find_bumpless_target, limit_command
 from snakesim_hal.wire.messages import JointCommand, Mode
 from tests.unit.hal.rig import description
 
@@ -24,7 +24,9 @@ TINY = 1e-9
 
 def bumpless(modes: list[Mode], measured: Measured) -> list[float]:
     now = zip(measured.angle_rad, measured.velocity_rad_s, measured.torque_nm, strict=True)
-    return [bumpless_target(joint, mode, *state) for joint, mode, state in zip(ROBOT.joints, modes, now, strict=True)]
+    return [
+        find_bumpless_target(joint, mode, *state) for joint, mode, state in zip(ROBOT.joints, modes, now, strict=True)
+    ]
 
 
 def every(angle: float = 0.0, velocity: float = 0.0, torque: float = 0.0) -> Measured:

@@ -27,7 +27,7 @@ def test_the_way_to_armed() -> None:
     ]
     for step, against in steps:
         step()
-        assert rig.authority.against_arming(rig.now_ns) == against
+        assert rig.authority.list_unmet_conditions(rig.now_ns) == against
         answer = rig.arm() if against else None
         assert answer is None or (not answer.ok and answer.reason == "; ".join(against))
         assert rig.authority.state == "disarmed"
@@ -97,20 +97,20 @@ def test_a_state_of_another_number_of_joints_is_no_state(column: str, length: in
     values = [True] * length if column == "valid" else [0] * length
     rig.observe(**{column: values})
     decision = rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.why == "no joint state of 3 joints"
+    assert rig.authority.state == "fault" and rig.authority.reason == "no joint state of 3 joints"
     assert decision.setpoints.target == [0.0] * JOINTS
 
 
 def test_only_the_joints_that_are_not_known_are_named() -> None:
     rig = Rig()
     rig.observe(0.1, age_ns=[FRESH_NS, FRESH_NS + 1, 0])
-    assert rig.authority.against_arming(0)[0] == "no valid and fresh state of joint_2"
+    assert rig.authority.list_unmet_conditions(0)[0] == "no valid and fresh state of joint_2"
 
 
 def test_what_is_told_of_a_long_robot_fits_into_a_message() -> None:
     rig = Rig(chain__modules=100)
     rig.observe(0.1, valid=[False] * 100)
-    assert len(rig.authority.against_arming(0)[0]) == 400
+    assert len(rig.authority.list_unmet_conditions(0)[0]) == 400
     rig.observe(0.1)
     rig.acquire()
     rig.send(9.0)
@@ -186,8 +186,8 @@ def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_l
         assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINTS)
     rig.tick_with(0.2, arm_session=0)
     assert rig.authority.state == "fault" and rig.authority.faults[0].what == "lease_expired"
-    assert rig.authority.rejected == {"before_arming": 5}
-    assert (rig.authority.accepted, rig.authority.standby) == (1, 1)
+    assert rig.authority.rejected_counts == {"before_arming": 5}
+    assert (rig.authority.accepted_count, rig.authority.standby_count) == (1, 1)
 
 
 def test_after_a_disarm_arming_needs_a_new_command() -> None:
@@ -226,15 +226,15 @@ def test_a_lease_that_ran_out_is_free_before_a_tick_has_noticed() -> None:
     assert not rig.acquire("teleop").ok
     rig.now_ns += 1
     answer = rig.acquire("teleop")
-    assert answer.ok and answer.lifecycle == "disarmed" and rig.authority.why == "lease passed to teleop"
+    assert answer.ok and answer.lifecycle == "disarmed" and rig.authority.reason == "lease passed to teleop"
 
 
 def test_a_command_that_names_no_arming_never_moves_an_armed_robot() -> None:
     rig = armed()
     rig.pass_tick()
     bare = command(ROBOT, 0.2, tick=rig.tick, sequence=50, lease_epoch=rig.authority.lease.epoch)
-    assert rig.authority.offer(bare, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "before_arming"
-    assert rig.authority.rejected == {"before_arming": 1}
+    assert rig.authority.offer_command(bare, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "before_arming"
+    assert rig.authority.rejected_counts == {"before_arming": 1}
     assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINTS)
 
 
@@ -246,10 +246,10 @@ def test_a_command_that_was_under_way_when_the_robot_was_armed_is_nobodys_mistak
     rig.send(0.1)
     assert rig.arm().ok
     assert rig.send(0.1, arm_session=0) == "before_arming"
-    assert rig.authority.standby == 2 and not rig.authority.rejected
+    assert rig.authority.standby_count == 2 and not rig.authority.rejected_counts
     rig.tick = 8
     assert rig.send(0.1, arm_session=0) == "before_arming"
-    assert rig.authority.standby == 2 and rig.authority.rejected == {"before_arming": 1}
+    assert rig.authority.standby_count == 2 and rig.authority.rejected_counts == {"before_arming": 1}
 
 
 @pytest.mark.parametrize("wrong", [{"arm_session": 0}, {"arm_session": 2}, {"layout": "other"}, {"tick": 10**6}])
@@ -336,7 +336,7 @@ def test_a_robot_that_nobody_checked_is_armed_by_an_explicit_word_alone() -> Non
     refused = rig.arm()
     assert refused.refusal == "not_checked" and "nobody has checked it; to arm it" in refused.reason
     armed = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, unchecked=True), rig.now_ns)
-    assert armed.ok and ", unchecked" in rig.authority.why
+    assert armed.ok and ", unchecked" in rig.authority.reason
 
 
 def test_a_cable_of_which_nobody_knows_how_far_it_is_wound_is_not_overruled_by_a_word() -> None:

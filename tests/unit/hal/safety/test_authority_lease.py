@@ -69,7 +69,7 @@ def test_refused_commands_neither_keep_the_lease_nor_reach_a_motor(wrong: dict[s
         assert decision.sequence == good and decision.setpoints.target == pytest.approx([0.1] * JOINTS)
     rig.tick_with(**{"target": 0.2, **wrong})
     assert rig.authority.state == "fault"
-    assert sum(rig.authority.rejected.values()) == 5
+    assert sum(rig.authority.rejected_counts.values()) == 5
 
 
 def test_asking_to_renew_is_not_commanding() -> None:
@@ -119,12 +119,12 @@ def test_a_released_lease_stops_the_robot_without_a_fault() -> None:
 def test_a_holder_that_is_gone_frees_the_lease_but_explains_nothing_away() -> None:
     rig = armed()
     rig.authority.on_estop(ESTOP, 3)
-    rig.authority.holder_gone("control is gone")
-    assert rig.authority.lease.holder is None and "a person" in rig.authority.why
+    rig.authority.on_holder_gone("control is gone")
+    assert rig.authority.lease.holder is None and "a person" in rig.authority.reason
     rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     rig.acquire()
-    rig.authority.holder_gone("control is gone")
-    assert rig.authority.why == "control is gone"
+    rig.authority.on_holder_gone("control is gone")
+    assert rig.authority.reason == "control is gone"
     rig = armed()
-    rig.authority.holder_gone("control is gone")  # armed, only the lease decides
+    rig.authority.on_holder_gone("control is gone")  # armed, only the lease decides
     assert rig.authority.lease.holder == "control" and rig.authority.state == "armed"

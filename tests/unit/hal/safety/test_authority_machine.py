@@ -269,11 +269,11 @@ class Everything(Model):
         expected = next((REASONS[defect] for defect in DEFECTS if defect in defects), None)
         if not self.live:
             expected = "no_lease"
-        counted = self.authority.rejected[expected] if expected else 0
-        refusal = self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
+        counted = self.authority.rejected_counts[expected] if expected else 0
+        refusal = self.authority.offer_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
         self.offered += 1
         if expected is not None:
-            assert refusal == expected and self.authority.rejected[expected] == counted + 1
+            assert refusal == expected and self.authority.rejected_counts[expected] == counted + 1
             self.rejected += 1
             return
         if self.state == "armed" and asked.arm_session != self.arm_session:
@@ -289,9 +289,9 @@ class Everything(Model):
 
     @rule(reason=st.sampled_from(["malformed", "unknown_version"]))
     def send_what_is_no_command(self, reason: str) -> None:
-        counted = self.authority.rejected[reason]
-        self.authority.reject(reason)
-        assert self.authority.rejected[reason] == counted + 1
+        counted = self.authority.rejected_counts[reason]
+        self.authority.count_rejection(reason)
+        assert self.authority.rejected_counts[reason] == counted + 1
         self.offered += 1
         self.rejected += 1
 
@@ -313,7 +313,7 @@ class Everything(Model):
                 i in self.aside or mode == Mode.PASSIVE or (mode == Mode.POSITION and abs(target - angle) <= FAR)
                 for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
             )
-        assert (not self.authority.against_arming(self.now_ns)) == ready
+        assert (not self.authority.list_unmet_conditions(self.now_ns)) == ready
         reported = {
             "wrong_robot": robot == "worm",
             "wrong_backend": backend == "lag",
@@ -366,7 +366,7 @@ class Everything(Model):
 
     @rule()
     def holder_gone(self) -> None:
-        self.authority.holder_gone("the holder is gone")
+        self.authority.on_holder_gone("the holder is gone")
         if self.state != "armed":
             self.drop_lease()
 
@@ -435,12 +435,12 @@ class Everything(Model):
                 self.fail()
             else:
                 self.drop_lease()
-        self.authority.expire(self.now_ns, self.tick)
+        self.authority.check_deadlines(self.now_ns, self.tick)
         up_to = None if self.lag is None else self.tick - self.lag
-        limited = self.authority.limited.total()
+        limited = self.authority.limited_counts.total()
         decision = self.authority.decide(up_to)
         self.check_aside(decision)
-        assert self.authority.limited.total() == limited + len(decision.limited)
+        assert self.authority.limited_counts.total() == limited + len(decision.limited)
         if self.state != "armed":
             self.reported = True
             self.check_safe(decision)
@@ -460,17 +460,17 @@ class Everything(Model):
         if not hasattr(self, "authority"):
             return
         found = self.authority
-        assert found.state == self.state, f"{found.state}, not {self.state}: {found.why}"
+        assert found.state == self.state, f"{found.state}, not {self.state}: {found.reason}"
         assert found.arm_session == self.arm_session
         expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
         assert found.lease.epoch == self.epoch  # the model's only ever grows
-        assert (found.lease.holder, found.lease.live(self.now_ns)) == (self.holder, self.live)
+        assert (found.lease.holder, found.lease.is_live(self.now_ns)) == (self.holder, self.live)
         assert not self.holder or found.lease == expected
-        assert found.why and len(found.why) <= 500
+        assert found.reason and len(found.reason) <= 500
         assert len(found.faults) == self.faults and all(len(fault.cause) <= 500 for fault in found.faults)
-        assert found.rejected.total() == self.rejected
-        assert found.accepted == len(self.since_arming) or found.arm_session > 1
-        assert found.accepted + found.standby + found.rejected.total() == self.offered
+        assert found.rejected_counts.total() == self.rejected
+        assert found.accepted_count == len(self.since_arming) or found.arm_session > 1
+        assert found.accepted_count + found.standby_count + found.rejected_counts.total() == self.offered
 
 
 @pytest.mark.parametrize("batch", range(-(-SEQUENCES // PER_TEST)))

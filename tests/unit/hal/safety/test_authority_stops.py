@@ -101,7 +101,7 @@ def test_a_fault_does_not_turn_an_estop_into_something_milder() -> None:
     rig = armed()
     rig.authority.on_estop(ESTOP, 1)
     rig.authority.fault(Fault(tick=2, what="hot", cause="hot"))
-    assert rig.authority.state == "estop" and "a person" in rig.authority.why
+    assert rig.authority.state == "estop" and "a person" in rig.authority.reason
     assert [fault.what for fault in rig.authority.faults] == ["estop", "hot"]
 
 
@@ -110,51 +110,54 @@ def test_faults_are_kept_up_to_a_limit_the_first_and_the_newest() -> None:
     for i in range(100):
         rig.authority.fault(Fault(tick=i, what="hot", cause="hot"))
     assert [fault.tick for fault in rig.authority.faults] == [*range(16), *range(84, 100)]
-    assert rig.authority.since_clear.left_out == rig.authority.since_start.left_out == 68
+    assert rig.authority.faults_since_clear.left_out == rig.authority.faults_since_start.left_out == 68
     assert (MAX_FAULTS_KEPT, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
     rig.authority.on_lifecycle(CLEAR, 0)
-    assert rig.authority.faults == [] and rig.authority.since_clear.left_out == 0
-    assert len(rig.authority.since_start.kept) == MAX_FAULTS_KEPT and rig.authority.since_start.left_out == 68
+    assert rig.authority.faults == [] and rig.authority.faults_since_clear.left_out == 0
+    assert (
+        len(rig.authority.faults_since_start.kept) == MAX_FAULTS_KEPT
+        and rig.authority.faults_since_start.left_out == 68
+    )
 
 
 @pytest.mark.parametrize("by", ["fault", "estop"])
 def test_what_stopped_the_robot_is_kept_however_much_comes_after_it(by: str) -> None:
     rig = armed()
     for i in range(16):
-        rig.authority.note(Fault(tick=i, what="late", cause="late"))
+        rig.authority.record_fault(Fault(tick=i, what="late", cause="late"))
     if by == "fault":
         rig.authority.fault(Fault(tick=16, what="hot", cause="hot"))
     else:
         rig.authority.on_estop(ESTOP, 16)
         rig.authority.on_estop(ESTOP, 17)  # it is stopped already
     for i in range(18, 100):
-        rig.authority.note(Fault(tick=i, what="late", cause="late"))
+        rig.authority.record_fault(Fault(tick=i, what="late", cause="late"))
     assert [fault.tick for fault in rig.authority.faults] == [*range(17), *range(85, 100)]
     for i in range(100):  # of one that was never stopped
-        (rig := rig if i else Rig()).authority.note(Fault(tick=i, what="late", cause="late"))
+        (rig := rig if i else Rig()).authority.record_fault(Fault(tick=i, what="late", cause="late"))
     assert len(rig.authority.faults) == MAX_FAULTS_KEPT
 
 
 def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:
     rig = armed()
     rig.authority.fault(Fault(tick=1, what="hot", cause="x" * 501))
-    assert rig.authority.why == rig.authority.faults[0].cause == "x" * 500
+    assert rig.authority.reason == rig.authority.faults[0].cause == "x" * 500
     rig = armed()
     rig.authority.fault(Fault(tick=1, what="hot", cause=""))
-    assert rig.authority.why == "hot"
+    assert rig.authority.reason == "hot"
 
 
 def test_the_first_fault_is_why_and_what_it_brings_about_is_listed() -> None:
     rig = armed()
     for what in ("bus_off", *["watchdog"] * 40):
         rig.authority.fault(Fault(tick=1, what=what, cause=f"because of {what}"))
-    assert rig.authority.why == rig.authority.faults[0].cause == "because of bus_off"
+    assert rig.authority.reason == rig.authority.faults[0].cause == "because of bus_off"
     assert rig.authority.faults[1].cause == "because of watchdog"
 
 
 def test_a_note_stops_nothing() -> None:
     rig = armed()
-    rig.authority.note(Fault(tick=1, what="service_lost", cause="guidance is gone"))
+    rig.authority.record_fault(Fault(tick=1, what="service_lost", cause="guidance is gone"))
     assert rig.authority.state == "armed"
     assert [fault.reach for fault in rig.authority.faults] == ["none"], "so nobody takes it for the reason of a stop"
 
@@ -186,7 +189,7 @@ def test_what_the_gate_changes_is_counted_by_limit() -> None:
     rig.pass_tick()
     decision = rig.tick_with([0.1, 1.0, 2.0])
     assert decision.limited == {1: "angle_rate", 2: "angle"}
-    assert rig.authority.limited == {"angle_rate": 1, "angle": 1}
+    assert rig.authority.limited_counts == {"angle_rate": 1, "angle": 1}
 
 
 def test_a_lease_epoch_is_never_accepted_twice() -> None:
@@ -197,7 +200,9 @@ def test_a_lease_epoch_is_never_accepted_twice() -> None:
     for _ in range(5):
         assert rig.acquire().ok
         epoch = rig.authority.lease.epoch
-        assert all(rig.authority.offer(c, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "wrong_epoch" for c in old)
+        assert all(
+            rig.authority.offer_command(c, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "wrong_epoch" for c in old
+        )
         old.append(command(rig.robot, sequence=10**6, lease_epoch=epoch))
         rig.pass_tick(10)
 
@@ -254,8 +259,8 @@ def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> No
     receive(rig, [20.0, 92.5, 20.0])
     decision = rig.tick_with(0.1)
     assert decision.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
-    assert decision.limited == {1: "thermal"} and rig.authority.limited == {"thermal": 1}
-    assert rig.authority.derated == {"joint_2": pytest.approx(0.6)}
+    assert decision.limited == {1: "thermal"} and rig.authority.limited_counts == {"thermal": 1}
+    assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
     receive(rig, [20.0, 110.0, 20.0])
     decision = rig.pass_tick()
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
@@ -268,7 +273,7 @@ def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> No
     receive(rig, [20.0, 70.0, 20.0])
     rig.pass_tick()
     rig.send(0.1)
-    assert rig.arm().ok and rig.authority.derated == {}
+    assert rig.arm().ok and rig.authority.derated_joints == {}
 
 
 def test_who_tells_nothing_of_its_health_is_noted() -> None:
@@ -316,11 +321,11 @@ def test_time_may_stand_still_until_a_robot_is_armed_so_no_report_is_awaited() -
 
 def test_what_never_became_a_command_is_counted_by_reason() -> None:
     rig = armed()
-    rig.authority.reject("malformed")
-    assert rig.authority.rejected == {"malformed": 1} and rig.authority.state == "armed"
+    rig.authority.count_rejection("malformed")
+    assert rig.authority.rejected_counts == {"malformed": 1} and rig.authority.state == "armed"
 
 
 def test_what_is_published_of_a_joint_without_a_number_is_its_last_good_state() -> None:
     rig = armed()
-    reported = rig.authority.readable(state(rig.robot, [0.2, float("nan"), 0.2]))
+    reported = rig.authority.replace_unreadable(state(rig.robot, [0.2, float("nan"), 0.2]))
     assert reported.angle_rad == [0.2, 0.1, 0.2] and reported.valid == [True, False, True]

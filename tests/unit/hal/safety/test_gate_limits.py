@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
 from snakesim_hal.safety.limit_names import name_active_limits
 from snakesim_hal.safety.limiter import (
-    bumpless_target,
+    find_bumpless_target,
     limit_command,
     stoppable_speed,
     torque_bounds_at_ends,
@@ -249,13 +249,13 @@ def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
 
 def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
     joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=2.0)
-    assert bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
-    assert bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
+    assert find_bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
+    assert find_bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
 
 
 def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
-    assert bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
+    assert find_bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
     measured, last = every(torque=4.0), before(Mode.PASSIVE)

@@ -16,7 +16,7 @@ def lame(**robot: Any) -> Rig:
     rig = armed(safety__max_isolated_joints=1, **robot)
     rig.observe(0.1, valid=SAYS_NO)
     rig.tick_with(0.1)
-    assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2"]
+    assert rig.authority.state == "armed" and rig.authority.isolated_joints == ["joint_2"]
     return rig
 
 
@@ -28,7 +28,7 @@ def test_by_default_one_joint_stops_the_robot() -> None:
     rig = armed()
     rig.observe(0.1, valid=SAYS_NO)
     rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.isolated == []
+    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
     (fault,) = rig.authority.faults
     assert fault.joint == "joint_2" and fault.reach == "robot"
 
@@ -37,7 +37,7 @@ def test_a_joint_that_fails_is_passive_and_the_others_go_on() -> None:
     rig = lame()
     (fault,) = rig.authority.faults
     assert (fault.what, fault.joint, fault.reach) == ("state_invalid", "joint_2", "joint")
-    assert rig.authority.why == "armed, without joint_2: no valid and fresh state of joint_2"
+    assert rig.authority.reason == "armed, without joint_2: no valid and fresh state of joint_2"
     for _ in range(20):
         rig.observe(0.1, valid=SAYS_NO)
         assert rig.send(0.12, torque_limit_nm=[3.0] * JOINTS) is None
@@ -47,7 +47,7 @@ def test_a_joint_that_fails_is_passive_and_the_others_go_on() -> None:
         assert points.target == [0.12, 0.0, 0.12] and points.torque_limit_nm == [3.0, 0.0, 3.0]
         assert points.isolated == {1} and decision.limited == {1: "isolated"}
     assert rig.authority.state == "armed" and len(rig.authority.faults) == 1
-    assert rig.authority.limited["isolated"] == 21
+    assert rig.authority.limited_counts["isolated"] == 21
 
 
 def test_nothing_is_limited_where_nothing_is_asked() -> None:
@@ -74,11 +74,11 @@ def test_two_that_fail_at_once_are_two() -> None:
     rig = armed(safety__max_isolated_joints=1)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.isolated == []
+    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
     rig = armed(safety__max_isolated_joints=2)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
-    assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2", "joint_3"]
+    assert rig.authority.state == "armed" and rig.authority.isolated_joints == ["joint_2", "joint_3"]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_two_that_fail_at_once_are_two() -> None:
 def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
     rig = armed(safety__max_isolated_joints=3)
     rig.authority.fault(fault)
-    assert rig.authority.state == "fault" and rig.authority.isolated == []
+    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
 
 
 def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
@@ -113,7 +113,7 @@ def test_while_disarmed_no_joint_is_set_aside() -> None:
     answer = rig.arm()
     assert answer.refusal == "not_ready" and "joint_2" in answer.reason
     rig.authority.fault(broken())
-    assert rig.authority.state == "fault" and rig.authority.isolated == []
+    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
 
 
 def test_it_may_be_armed_again_without_the_joint() -> None:
@@ -134,7 +134,7 @@ def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
-    assert rig.authority.isolated == [] and rig.authority.faults == []
+    assert rig.authority.isolated_joints == [] and rig.authority.faults == []
     rig.send(0.1)
     assert "no joint state since the clear" in rig.arm().reason
     rig.observe(0.1)
@@ -150,14 +150,14 @@ def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
     assert rig.authority.state == "fault"
     points = rig.pass_tick().setpoints
     assert points.isolated == {1} and points.mode[1] is Mode.PASSIVE and points.torque_limit_nm[1] == 0.0
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated == []
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
 
 
 def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
     rig = lame()
     rig.authority.on_estop(ESTOP, rig.tick)
-    assert rig.authority.isolated == ["joint_2"]
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated == []
+    assert rig.authority.isolated_joints == ["joint_2"]
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
 
 
 def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
@@ -191,7 +191,7 @@ def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
 def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None:
     rig = armed(safety__max_isolated_joints=1)
     for tick in range(before):
-        rig.authority.note(Fault(tick=tick, what="noted", cause=""))
+        rig.authority.record_fault(Fault(tick=tick, what="noted", cause=""))
     rig.authority.fault(Fault(tick=1000, what="leak", cause="water"))
     log = getattr(rig.authority, kept)
     for tick in range(2000, 2100):

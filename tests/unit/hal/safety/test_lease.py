@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.lease import Lease, LeaseDecision, freed, renewed, rule
+from snakesim_hal.safety.lease import Lease, LeaseDecision, decide_lease_request, free_lease, renew_lease
 from snakesim_hal.wire.messages import LeaseRequest
 
 TERM = 50
@@ -37,7 +37,7 @@ GRANTED = {
 @pytest.mark.parametrize("case", GRANTED)
 def test_granted(case: str) -> None:
     lease, asked, now, ruling = GRANTED[case]
-    assert rule(lease, asked, now, TERM) == ruling
+    assert decide_lease_request(lease, asked, now, TERM) == ruling
 
 
 REFUSED = {
@@ -58,21 +58,21 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_and_nothing_changed(case: str) -> None:
     lease, asked, now, words = REFUSED[case]
-    ruling = rule(lease, asked, now, TERM)
+    ruling = decide_lease_request(lease, asked, now, TERM)
     assert ruling.lease == lease and not ruling.changed_hands
     assert ruling.refusal is not None and words in ruling.refusal
-    assert ruling.word == ("lease_held" if asked.action == "acquire" else "not_holder")
+    assert ruling.refusal_word == ("lease_held" if asked.action == "acquire" else "not_holder")
 
 
 def test_the_refusal_says_how_long_it_may_take() -> None:
     lease = Lease("control", 4, 100, 50_000_000)
-    ruling = rule(lease, request("acquire", "teleop"), 20_000_000, TERM)
+    ruling = decide_lease_request(lease, request("acquire", "teleop"), 20_000_000, TERM)
     assert ruling.refusal is not None and "for another 30 ms" in ruling.refusal
 
 
 def test_live_until_the_last_nanosecond() -> None:
-    assert HELD.live(1000) and not HELD.live(1001) and not FREE.live(0)
-    assert freed(HELD) == Lease(epoch=4) and renewed(HELD, 2000, TERM).expires_ns == 2050
+    assert HELD.is_live(1000) and not HELD.is_live(1001) and not FREE.is_live(0)
+    assert free_lease(HELD) == Lease(epoch=4) and renew_lease(HELD, 2000, TERM).expires_ns == 2050
 
 
 def test_nobody_changes_a_lease_in_place() -> None:
@@ -97,12 +97,12 @@ def test_over_any_history_every_holder_has_an_epoch_of_its_own(history: list[tup
     for action, holder, epoch, priority, passes in history:
         now += passes
         before = lease
-        ruling = rule(lease, request(action, holder, epoch, priority), now, TERM)
+        ruling = decide_lease_request(lease, request(action, holder, epoch, priority), now, TERM)
         lease = ruling.lease
         assert lease.epoch in (before.epoch, before.epoch + 1)
         assert (lease.epoch > before.epoch) == (ruling.changed_hands and lease.holder is not None)
         assert lease.expires_ns <= now + TERM or lease == before
         if lease.holder is not None:
             assert holders.setdefault(lease.epoch, lease.holder) == lease.holder
-        if before.live(now) and ruling.changed_hands and lease.holder is not None:
+        if before.is_live(now) and ruling.changed_hands and lease.holder is not None:
             assert priority > before.priority

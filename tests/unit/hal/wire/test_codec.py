@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Clock,
@@ -31,7 +31,7 @@ each_message = pytest.mark.parametrize("message", ALL, ids=lambda message: messa
 def take(message: type[Message], payload: bytes) -> Message | None:
     """What the decoder makes of bytes: a message of the right type, or None for a WireError `malformed`."""
     try:
-        found = DECODERS[message].decode(payload, encoding_of(message))
+        found = DECODERS[message].decode(payload, format_encoding(message))
     except WireError as error:
         assert error.reason == "malformed"
         return None
@@ -141,7 +141,7 @@ def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
     assert take(JointState, fits) is not None
     too_large = encode({**valid, "other": b"x" * MAX_PAYLOAD_BYTES})
     with pytest.raises(WireError, match=str(MAX_PAYLOAD_BYTES)):
-        DECODERS[JointState].decode(too_large, encoding_of(JointState))
+        DECODERS[JointState].decode(too_large, format_encoding(JointState))
 
 
 def test_the_largest_images_are_taken_and_nothing_else_of_their_size() -> None:

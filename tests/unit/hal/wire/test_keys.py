@@ -16,9 +16,9 @@ def concrete(key: str) -> str:
 
 
 @pytest.mark.parametrize("row", keys.SPACE, ids=lambda row: row.key)
-def test_every_key_of_the_space_parses_back(row: keys.Row) -> None:
+def test_every_key_of_the_space_parses_back(row: keys.KeyRow) -> None:
     key = concrete(row.key)
-    assert keys.message_at(key) is row.message
+    assert keys.find_message(key) is row.message
     assert keys.split_namespace(key) is None  # without a namespace there is nothing to split off
     assert row.kind in ("stream", "latched", "query", "liveliness") and row.writer and row.about
 
@@ -36,15 +36,15 @@ def test_every_key_constant_is_in_the_space() -> None:
 
 @given(name=CHUNK)
 def test_services_are_found_in_their_keys_and_cameras_and_lidars_have_keys_of_their_own(name: str) -> None:
-    assert keys.service_of(keys.done(name)) == keys.service_of(keys.alive(name)) == name
-    assert keys.message_at(keys.done(name)) is Done
-    assert keys.message_at(keys.depth(name)) is DepthImage
-    assert keys.message_at(keys.color(name)) is ColorImage
-    assert keys.message_at(keys.ranges(name)) is Ranges
+    assert keys.parse_service(keys.done_key(name)) == keys.parse_service(keys.alive_key(name)) == name
+    assert keys.find_message(keys.done_key(name)) is Done
+    assert keys.find_message(keys.depth_key(name)) is DepthImage
+    assert keys.find_message(keys.color_key(name)) is ColorImage
+    assert keys.find_message(keys.ranges_key(name)) is Ranges
 
 
 @given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))
-def test_namespaces_split_off(namespace: str, row: keys.Row) -> None:
+def test_namespaces_split_off(namespace: str, row: keys.KeyRow) -> None:
     key = concrete(row.key)
     assert keys.split_namespace(f"{namespace}/{key}") == (namespace, key)
 
@@ -66,11 +66,11 @@ def test_namespaces_split_off(namespace: str, row: keys.Row) -> None:
     ],
 )
 def test_keys_outside_the_space_parse_to_nothing(key: str) -> None:
-    assert keys.message_at(key) is None
+    assert keys.find_message(key) is None
     assert keys.split_namespace(key) is None
 
 
 @pytest.mark.parametrize("pattern", ["**", "*", "hal/done/*", "alive/**"])
 def test_a_pattern_put_by_a_stranger_names_no_service_and_breaks_nothing(pattern: str) -> None:
     """Zenoh lets anybody put on a pattern; the host then sees the pattern as the key."""
-    assert keys.service_of(pattern) in ("**", "*")
+    assert keys.parse_service(pattern) in ("**", "*")

@@ -14,7 +14,7 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, Message, Trajectory
-from snakesim_hal.wire.outgoing import checked
+from snakesim_hal.wire.outgoing import encode_checked
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 STREAMED = {row.message: row.key for row in keys.SPACE if row.kind == "stream" and row.message and "*" not in row.key}
@@ -26,7 +26,7 @@ each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: 
 @settings(max_examples=10)
 def test_what_readers_accept_is_sent_as_it_is(message: type[Message], data: st.DataObject) -> None:
     sent = data.draw(messages_of(message))
-    assert checked(STREAMED[message], sent) == encode(sent)
+    assert encode_checked(STREAMED[message], sent) == encode(sent)
 
 
 @each_message
@@ -35,7 +35,7 @@ def test_whatever_is_out_of_its_bounds_is_named_by_its_field(message: type[Messa
     for at, info in places(example, inspect.type_info(message)):
         for poison in poisons(info) if at else ():
             with pytest.raises(WireError) as caught:
-                checked(STREAMED[message], message(**replaced(example, at, poison)))
+                encode_checked(STREAMED[message], message(**replaced(example, at, poison)))
             assert caught.value.detail.startswith(f"{message.__name__}.{at[0]}"), (at, poison)
             assert ", must be " in caught.value.detail
 
@@ -71,5 +71,5 @@ INFINITE, SHORT, ARRAY = (1.0, math.inf), (1.0,), np.ones(2)
 )
 def test_the_wrong_value_is_shown_alone(key: str, message: Message, words: str) -> None:
     with pytest.raises(WireError) as caught:
-        checked(key, message)
+        encode_checked(key, message)
     assert re.search(words, caught.value.detail), caught.value.detail

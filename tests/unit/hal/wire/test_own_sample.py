@@ -8,9 +8,9 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.wire import quantities as q
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import OwnSample
-from snakesim_hal.wire.own_sample import own_kind, schema_of
+from snakesim_hal.wire.own_sample import make_message_schema, parse_custom_message
 
 
 class Skin(OwnSample, frozen=True, kw_only=True):
@@ -35,8 +35,8 @@ GOOD: dict[str, Any] = {"pressed_n": [1.5, None], "flow_m_s": (1.0, 2.0, 3.0), "
 
 
 def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_reads_where_and_when() -> None:
-    kind, sample = own_kind(schema_of(Skin, "skin")), Skin(**PLACE, **GOOD)
-    decoded = Decoder(kind.message).decode(encode(sample), encoding_of(Skin))
+    kind, sample = parse_custom_message(make_message_schema(Skin, "skin")), Skin(**PLACE, **GOOD)
+    decoded = Decoder(kind.message).decode(encode(sample), format_encoding(Skin))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
     assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
     assert kind.numbers(decoded) == pytest.approx(
@@ -44,7 +44,7 @@ def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_re
         | {f"flow_m_s.{i}": i + 1 for i in range(3)},
         nan_ok=True,
     )
-    assert Decoder(OwnSample).decode(encode(sample), encoding_of(Skin)) == OwnSample(**PLACE)
+    assert Decoder(OwnSample).decode(encode(sample), format_encoding(Skin)) == OwnSample(**PLACE)
 
 
 @pytest.mark.parametrize(
@@ -63,9 +63,9 @@ def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_re
 )
 def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
     written = msgspec.msgpack.encode(PLACE | GOOD | wrong)
-    for message in (Skin, own_kind(schema_of(Skin, "skin")).message):
+    for message in (Skin, parse_custom_message(make_message_schema(Skin, "skin")).message):
         with pytest.raises(WireError) as caught:
-            Decoder(message).decode(written, encoding_of(Skin))
+            Decoder(message).decode(written, format_encoding(Skin))
         assert next(iter(wrong)) in str(caught.value)
 
 
@@ -98,7 +98,7 @@ class Empty(OwnSample, frozen=True, kw_only=True):
 )
 def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message: Any, words: str) -> None:
     with pytest.raises(ConfigError, match="sensor 'skin': model x") as caught:
-        schema_of(message, "sensor 'skin': model x")
+        make_message_schema(message, "sensor 'skin': model x")
     assert words in str(caught.value)
 
 
@@ -121,4 +121,4 @@ def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message
 )
 def test_a_schema_of_a_stranger_does_nothing_but_be_refused(schema: str) -> None:
     with pytest.raises(WireError):
-        own_kind(schema)
+        parse_custom_message(schema)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.checked import PROPERTIES, Checked
+from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.robot import RobotFile, with_modes
 from snakesim_operator.features.commissioning.robot_edit import change_joints, joints_on_drives, write_checked
@@ -47,7 +47,7 @@ def test_a_change_that_is_not_valid_leaves_the_file_as_it_was(tmp_path: Path) ->
 def test_what_was_checked_is_read_as_it_was_written_also_what_was_confirmed_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "snake.toml"
     path.write_text('extends = "planar13"\nname = "snake"\n')
-    checked = Checked(
+    checked = StartCheckRecord(
         by="anna",
         on="2026-11-24",
         joints="5b2c4b1d9e0f7a36",

@@ -11,7 +11,7 @@ import pytest
 from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, MessageAge, PageAction
-from snakesim_operator.features.console.web.server import page_server
+from snakesim_operator.features.console.web.server import serve_pages
 from tests.attack.means.page import Page
 from tests.harness.wait import wait_until
 from tests.unit.operator.console.rig import ReadyStop
@@ -99,7 +99,7 @@ def test_answers_that_nobody_asked_for_make_nothing_younger() -> None:
 def test_what_may_move_a_robot_is_not_done_late_and_what_stops_it_is() -> None:
     done: list[str] = []
     late: list[float] = []
-    with page_server(open_port(None), stop=ReadyStop()) as (server, _):
+    with serve_pages(open_port(None), stop=ReadyStop()) as (server, _):
         admission = Admission()
         group = server.gui.add_button_group("Robot", ("Arm", "Disarm"))
         hold = server.gui.add_button("Hold")
@@ -142,7 +142,7 @@ def _update(handle: Any, value: object) -> dict[str, Any]:
 
 def test_a_page_without_a_scene_is_a_viewer_and_may_stop() -> None:
     stopped: list[int] = []
-    with page_server(open_port(None), stop=ReadyStop()) as (server, address):
+    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")
         server.admission.admit(button, handler=lambda viewer, _action: stopped.append(viewer))
         with Page(address, draws=False) as page:
@@ -160,7 +160,7 @@ def test_a_real_page_answers_what_it_is_asked(capfd: pytest.CaptureFixture[str])
         if len(ages) == 1:
             raise RuntimeError(f"unexpected, of viewer {viewer}")
 
-    with page_server(open_port(None), stop=ReadyStop()) as (server, address):
+    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address):
         button = server.gui.add_button("Go")
         server.admission.admit(button, handler=act)
         with Page(address) as page:

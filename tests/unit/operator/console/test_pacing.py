@@ -6,7 +6,7 @@ from typing import Any
 import viser
 
 from snakesim_operator.base.console_port import open_port
-from snakesim_operator.features.console.web.server import page_server
+from snakesim_operator.features.console.web.server import serve_pages
 from tests.viewer import ASKED, Viewer, viewing
 
 CHANGES = 200
@@ -14,7 +14,7 @@ LIMIT_S = 20.0
 
 
 def test_a_slow_page_gets_the_newest_state_only() -> None:
-    with page_server(open_port(None)) as (server, address):
+    with serve_pages(open_port(None)) as (server, address):
         text = server.gui.add_text("Tick", "0")
 
         async def slow() -> list[str]:
@@ -36,7 +36,7 @@ def test_a_slow_page_gets_the_newest_state_only() -> None:
 
 
 def test_a_page_that_keeps_up_gets_every_change() -> None:
-    with page_server(open_port(None)) as (server, address):
+    with serve_pages(open_port(None)) as (server, address):
         text = server.gui.add_text("Tick", "")
 
         async def quick() -> list[str]:

@@ -10,14 +10,14 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import capsules_at_start, load
-from snakesim_operator.base.console_port import address_of, open_port
-from snakesim_operator.base.page_origin import why_refused
+from snakesim_operator.base.console_port import open_port, page_address
+from snakesim_operator.base.page_origin import explain_refusal
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.page import page_html
-from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, expected_snapshot
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, make_expected_snapshot
 from snakesim_operator.features.console.scene.drawing import draw
 from snakesim_operator.features.console.scene.scene_colors import LEGEND
-from snakesim_operator.features.console.web.server import page_server
+from snakesim_operator.features.console.web.server import serve_pages
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description, status
 from tests.viewer import watch
@@ -25,11 +25,15 @@ from tests.viewer import watch
 
 def test_a_page_is_of_the_same_host_and_port_or_refused():
     for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):  # a tunnel has another port
-        assert why_refused(host, f"http://{host}") is None and why_refused(host, None) is None
-        assert why_refused(host, "http://evil.example") and why_refused(host, "null") and why_refused(host, "")
-    assert "http://localhost:8081" in (why_refused("localhost:8080", "http://localhost:8081") or "")
-    assert "has to be a name of this computer" in (why_refused("evil.example:8080", "http://evil.example:8080") or "")
-    assert why_refused("localhost:8080", "https://mine.example", also=["https://mine.example"]) is None
+        assert explain_refusal(host, f"http://{host}") is None and explain_refusal(host, None) is None
+        assert (
+            explain_refusal(host, "http://evil.example") and explain_refusal(host, "null") and explain_refusal(host, "")
+        )
+    assert "http://localhost:8081" in (explain_refusal("localhost:8080", "http://localhost:8081") or "")
+    assert "has to be a name of this computer" in (
+        explain_refusal("evil.example:8080", "http://evil.example:8080") or ""
+    )
+    assert explain_refusal("localhost:8080", "https://mine.example", also=["https://mine.example"]) is None
 
 
 def test_a_port_that_is_taken_is_an_error_and_no_other_port():
@@ -41,10 +45,10 @@ def test_a_browser_that_comes_before_the_page_gets_it():
     listening = open_port(None)
     with socket.create_connection(listening.getsockname(), timeout=10.0) as early:
         early.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        viewers = [threading.Thread(target=come, args=(address_of(listening),)) for _ in range(3)]
+        viewers = [threading.Thread(target=come, args=(page_address(listening),)) for _ in range(3)]
         for viewer in viewers:
             viewer.start()
-        with page_server(listening) as (server, _):
+        with serve_pages(listening) as (server, _):
             assert early.recv(15) == b"HTTP/1.1 200 OK"
             wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
         for viewer in viewers:
@@ -56,7 +60,7 @@ def come(address: str) -> None:
 
 
 def test_nobody_can_open_a_tunnel_to_the_internet():
-    with page_server(open_port(None)) as (server, _):
+    with serve_pages(open_port(None)) as (server, _):
         assert server.request_share_url() is None
 
 
@@ -87,7 +91,7 @@ def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
 
 def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
     config = load("triplet").config
-    snapshot = expected_snapshot(config)
+    snapshot = make_expected_snapshot(config)
     drawing = draw(snapshot, None)
     assert drawing is not None
     start = capsules_at_start(config)

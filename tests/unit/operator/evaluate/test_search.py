@@ -11,7 +11,7 @@ import optuna
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import find
+from snakesim_hal.model.files import find_file
 from snakesim_hal.model.textfiles import read_text
 from snakesim_operator.features.evaluate import optimize as search
 from snakesim_operator.features.evaluate.case import Case, CaseOutcome
@@ -95,7 +95,7 @@ def test_another_search_is_refused_with_every_difference(kept: Path, other: dict
 
 def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> None:
     scenario = tmp_path / "own.toml"
-    text = read_text(find("triplet", "scenarios"))
+    text = read_text(find_file("triplet", "scenarios"))
     scenario.write_text(text)
     searched(tmp_path / "search.db", scenario=str(scenario))
     assert "rate_hz = 100" in text

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import shipped
+from snakesim_hal.model.files import list_shipped
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
 from snakesim_operator.features.evaluate.case import Case
@@ -66,7 +66,7 @@ def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
     assert {case.id for case in make_cases(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
 
 
-@pytest.mark.parametrize("name", shipped("suites"))
+@pytest.mark.parametrize("name", list_shipped("suites"))
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title

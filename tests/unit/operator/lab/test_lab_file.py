@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.roles import ABOUT, TABLE, Role, permissions
+from snakesim_hal.wire.roles import ROLE_DESCRIPTIONS, TABLE, Role, list_permissions
 from snakesim_operator.features.lab.identities import identities
 from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
 
@@ -45,16 +45,16 @@ def test_what_does_not_fit_is_named(tmp_path: Path, old: str, new: str, said: st
 def test_every_key_has_a_role_that_writes_it() -> None:
     """A key that is new in the key space names a writer that `snakesim_hal/wire/roles.py` knows."""
     assert not [line.key for line in TABLE if not line.writers or (line.kind == "query" and not line.answerers)]
-    assert set(ABOUT) == set(Role)
+    assert set(ROLE_DESCRIPTIONS) == set(Role)
 
 
 def test_only_the_robot_speaks_for_itself_and_only_its_gnc_commands_it() -> None:
     """What the rules are for; the rest is in the table."""
     for role in Role:
-        granted = list(permissions(role, ["control"], faults=True))
+        granted = list(list_permissions(role, ["control"], faults=True))
         puts = {key for flow, message, key in granted if (flow, message) == ("ingress", "put")}
         assert ("actuator/joints" in puts) == (role is Role.GNC)
         own = {key for key in puts if key.startswith(("hal/", "sensor/")) and not key.startswith("hal/done/")}
         assert bool(own) == (role is Role.ROBOT)
-    faults = {message for role in Role for _, message, key in permissions(role) if key.startswith("fault/")}
+    faults = {message for role in Role for _, message, key in list_permissions(role) if key.startswith("fault/")}
     assert not faults

@@ -29,7 +29,7 @@ from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.recording.recover import recover
+from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -121,7 +121,7 @@ def test_joint_states_are_to_the_byte_what_the_library_of_their_schema_writes() 
 
 
 def test_joints_forces_and_state_come_as_often_as_the_robot_tells_them(run: Path) -> None:
-    raw = list(RecordingReader(run / RECORDING).messages())
+    raw = list(RecordingReader(run / RECORDING).read_messages())
     wire = Counter(one.key for one in raw)
     with (run / RECORDING).open("rb") as file:
         read = list(make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages())
@@ -173,7 +173,7 @@ def test_images_come_with_their_camera(run: Path) -> None:
 
 def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
     channels, key = FoxgloveChannels(ROBOT), "sensor/depth/head"
-    sent = {one.key: one.payload for one in RecordingReader(run / RECORDING).messages((keys.DESCRIPTION, key))}
+    sent = {one.key: one.payload for one in RecordingReader(run / RECORDING).read_messages((keys.DESCRIPTION, key))}
     whole = msgspec.msgpack.decode(sent[key], type=DepthImage)
     torn = msgspec.msgpack.encode(msgspec.structs.replace(whole, depth=whole.depth[:-1]))
     channels.convert(keys.DESCRIPTION, sent[keys.DESCRIPTION], 0)
@@ -222,8 +222,8 @@ def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_image
     """As one that was killed: test_recording.py kills one."""
     torn = tmp_path / "torn.mcap"
     recording = Recording(torn, "planar13_camera")
-    for number, one in enumerate(RecordingReader(run / RECORDING).messages()):
-        recording.take(Arrival(one.key, one.payload, one.encoding, one.wall_ns))
+    for number, one in enumerate(RecordingReader(run / RECORDING).read_messages()):
+        recording.write_arrival(Arrival(one.key, one.payload, one.encoding, one.wall_ns))
         if number % 100 == 0:
             recording.flush()
     found: dict[str, Any] = {}
@@ -233,7 +233,7 @@ def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_image
             found[channel.topic] = one
     assert len(found[f"{ROBOT}/joint_states"].joints) == 13 and found[f"{ROBOT}/tf"].transforms
     assert len(found[f"{ROBOT}/head/depth/image_raw"].data) > 1000
-    count, lacks = recover(torn, tmp_path / "whole.mcap")  # for readers that want an index
+    count, lacks = recover_recording(torn, tmp_path / "whole.mcap")  # for readers that want an index
     whole = shown(tmp_path / "whole.mcap")
     assert count > 500 and len(whole[f"{ROBOT}/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")

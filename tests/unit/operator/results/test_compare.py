@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.robot import describe, identified
-from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
+from snakesim_hal.model.robot import describe_robot, with_serials
+from snakesim_hal.model.scenario import RunConfig, load, parse_set, write_config
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Mode
 from snakesim_operator.results.compare.command import compare
@@ -81,7 +81,7 @@ def made_up(
 
 
 def describe_of(run: RunConfig):
-    return describe(run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x")
+    return describe_robot(run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x")
 
 
 def shown(difference: Difference) -> tuple[str, str]:
@@ -212,7 +212,7 @@ def test_a_set_point_holds_until_the_next_one() -> None:
 def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
     """As a simulator and joint modules describe one robot."""
     a, b = made_up(), made_up()
-    described = identified(b.description, [f"AE{i:02d}" for i in range(JOINTS)], ["1.0"] * JOINTS)
+    described = with_serials(b.description, [f"AE{i:02d}" for i in range(JOINTS)], ["1.0"] * JOINTS)
     imu = next(sensor for sensor in described.sensors if sensor.key == keys.IMU)
     slower = msgspec.structs.replace(imu, rate_hz=5.0)
     sensors = [slower, *(sensor for sensor in reversed(described.sensors) if sensor is not imu)]
@@ -228,8 +228,8 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
 
 def test_other_drives_are_named() -> None:
     a, b = made_up(), made_up()
-    of_a = identified(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
-    of_b = identified(a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS)
+    of_a = with_serials(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
+    of_b = with_serials(a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS)
     difference = differ(dataclasses.replace(a, description=of_a), dataclasses.replace(b, description=of_b))
     assert difference.settings == []
     assert "drives: another serial number at 1 of 13 joints, another firmware version at 13" in table(difference)
@@ -329,7 +329,7 @@ def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
         (tmp_path / name).write_text("{")
     with pytest.raises(ConfigError, match=r"config\.json: not valid JSON"):
         compare(tmp_path, tmp_path)
-    write(configured(), tmp_path / "config.json")
+    write_config(configured(), tmp_path / "config.json")
     with pytest.raises(ConfigError, match="the record of this run is damaged"):
         compare(tmp_path, tmp_path)
     (tmp_path / "description.json").write_bytes(msgspec.json.encode(describe_of(configured())))

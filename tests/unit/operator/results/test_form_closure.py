@@ -45,6 +45,6 @@ def test_an_obstacle_counts_once_where_it_is_nearest_to_the_body() -> None:
         for x, y in ((0.3, 0.105), (0.55, -0.1), (0.8, 0.2))
     ]
     chain = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
-    places, normals = contacts_beside(chain, 0.04, Outlines.of(pegs))
+    places, normals = contacts_beside(chain, 0.04, Outlines.from_obstacles(pegs))
     assert places == pytest.approx(np.array([[0.3, 0.04], [0.55, -0.04]]), abs=0.011)
     assert normals == pytest.approx(np.array([[0.0, -1.0], [0.0, 1.0]]), abs=0.11)

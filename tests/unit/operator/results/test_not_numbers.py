@@ -13,12 +13,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal.model.scenario import write
+from snakesim_hal.model.scenario import write_config
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.run_log.black_box import Layout
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import encoding_of
+from snakesim_hal.wire.codec import format_encoding
 from snakesim_operator.playback.export import arrays
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording
@@ -55,13 +55,13 @@ WRONG = st.sampled_from(WRONG_NUMBERS)
 
 def write_record(folder: Path, record: RunRecord) -> None:
     """A record as a run leaves it."""
-    write(record.config, folder / CONFIG)
+    write_config(record.config, folder / CONFIG)
     (folder / DESCRIPTION).write_bytes(msgspec.json.encode(record.description))
     (folder / HOST_RECORD).write_bytes(msgspec.json.encode(record.host))
     messages = [(keys.CONTROL_STATE, state) for state in record.control] + [
         (keys.WORLD, world) for world in record.worlds
     ]
-    layout, count = Layout.of(record.description), len(record.time_s)
+    layout, count = Layout.for_robot(record.description), len(record.time_s)
     encoded = [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages]
     record_messages(folder, encoded, count)
     rows = bytearray(count * layout.row_bytes)
@@ -77,9 +77,9 @@ def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int)
     (folder / RECORDING).unlink(missing_ok=True)
     recording = Recording(folder / RECORDING)
     for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
-        message = keys.message_at(key)
+        message = keys.find_message(key)
         assert message is not None
-        recording.take(Arrival(key, payload, encoding_of(message), 0))
+        recording.write_arrival(Arrival(key, payload, format_encoding(message), 0))
     recording.close({})
 
 

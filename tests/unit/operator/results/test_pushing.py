@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set, place_all
+from snakesim_hal.model.scenario import load, parse_set, place_obstacles
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.report.pushing import pushing
@@ -54,7 +54,7 @@ def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
     config = msgspec.structs.replace(
         record.config, mission=msgspec.structs.replace(record.config.mission, map="perceived")
     )
-    truth = [placed.obstacle for placed in place_all(config)]
+    truth = [placed.obstacle for placed in place_obstacles(config)]
     shifted = [
         msgspec.structs.replace(one, position_w=(one.position_w[0] + 0.01, *one.position_w[1:]), position_sd_m=0.01)
         for one in truth

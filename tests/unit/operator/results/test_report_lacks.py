@@ -19,7 +19,7 @@ from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.verdict import Verdict, verdict
 from snakesim_operator.results.summary import summarise
-from snakesim_operator.run.conclusion import explain
+from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
 from tests.unit.operator.results.recorded import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
 
@@ -111,13 +111,15 @@ def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
 def test_a_run_that_went_on_with_a_fault_that_stopped_nothing(record: RunRecord, joint: str | None) -> None:
     """The host noted it before the first arming; the run was complete."""
     noting = Authority(record.description)
-    noting.note(Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint))
+    noting.record_fault(
+        Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint)
+    )
     host = msgspec.structs.replace(record.host, faults=noting.faults, ended="complete")
     page = read(changed(record, host=host))
     assert "Stopped by a fault" not in page.text and "went on without" not in page.text
     assert "a fault (supply and heat are unknown, and ignored), 2 commands refused" in page.text
     ending = Ending()
-    explain(ending, host, record.config)
+    note_reasons(ending, host, record.config)
     assert ending.reason is None, "or `snakesim run` ends with exit code 1"
 
 

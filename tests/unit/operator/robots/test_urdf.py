@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import decode, read_part, shipped
+from snakesim_hal.model.files import decode, list_shipped, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
 from snakesim_operator.cli import main
 from snakesim_operator.features.robots.command import export_robot, import_robot
-from snakesim_operator.features.robots.exporting import urdf_of
-from snakesim_operator.features.robots.imported import Imported, Order
-from snakesim_operator.features.robots.importing import robot_of
-from snakesim_operator.features.robots.meshes import vertices
-from snakesim_operator.features.robots.toml_text import toml_of
+from snakesim_operator.features.robots.exporting import export_urdf
+from snakesim_operator.features.robots.imported import Imported, ImportOptions
+from snakesim_operator.features.robots.importing import import_urdf
+from snakesim_operator.features.robots.meshes import read_vertices
+from snakesim_operator.features.robots.toml_text import format_toml
 from snakesim_operator.run.in_process import simulate
 from snakesim_sim_backend.model import build
 from snakesim_sim_backend.settings import SimSettings
 
 HERE = Path(__file__).parent / "urdf"
 SLIDER, HEXA = HERE / "slider8.urdf", HERE / "hexa_snake_mm.urdf"
-HEXA_ORDER = Order(scale=0.001, up="y")
+HEXA_ORDER = ImportOptions(scale=0.001, up="y")
 READ_ALL = '<mujoco><compiler fusestatic="false" discardvisual="false" strippath="true" meshdir="{}"/></mujoco></robot>'
 
 
@@ -55,7 +55,7 @@ def hinge_inertia(model: mujoco.MjModel) -> np.ndarray:
 
 
 def ours(found: Imported, tmp_path: Path) -> mujoco.MjModel:
-    (tmp_path / "robot.toml").write_text(toml_of(found.table.values, []))
+    (tmp_path / "robot.toml").write_text(format_toml(found.table.values, []))
     return simulated(tmp_path / "robot.toml")
 
 
@@ -65,11 +65,11 @@ def simulated(robot: Path) -> mujoco.MjModel:
     return build(beside, SimSettings()).model
 
 
-@pytest.mark.parametrize("name", shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped("robots"))
 def test_every_shipped_robot_comes_back_as_it_was(name: str, tmp_path: Path) -> None:
     file, back = tmp_path / "robot.urdf", tmp_path / "robot.toml"
     export_robot(name, file)
-    import_robot(file, Order(), back)
+    import_robot(file, ImportOptions(), back)
     assert robot_at(back) == robot_at(name)
 
 
@@ -81,33 +81,33 @@ def test_each_joint_keeps_its_own_limits_and_friction_on_the_way_there_and_back(
         "[joints.joint_5]\nangle_rad = 0.8\ntorque_nm = 2.5\nfriction_nm = 0.1\nvoltage_v = 22.0\n"
     )
     export_robot(str(own), tmp_path / "own.urdf")
-    import_robot(tmp_path / "own.urdf", Order(), back)
+    import_robot(tmp_path / "own.urdf", ImportOptions(), back)
     robot = robot_at(own)
     assert robot_at(back) == robot
-    theirs = by_mujoco(urdf_of(robot))
+    theirs = by_mujoco(export_urdf(robot))
     assert theirs.joint("joint_2").range == pytest.approx([-0.4, 1.5708])
     assert theirs.joint("joint_5").range == pytest.approx([-0.8, 0.8])
     assert theirs.joint("joint_5").frictionloss[0] == 0.1 and theirs.joint("joint_4").frictionloss[0] == 0.0
     text = (tmp_path / "own.urdf").read_text()
     assert text.count('lower="-0.4"') == 1
     edited.write_text(text.replace('lower="-0.4"', 'lower="-0.7"'))
-    found = robot_of(edited, Order())
+    found = import_urdf(edited, ImportOptions())
     assert found.robot.joint_table[1].limits.lower_rad == -0.7, "what was changed in the URDF counts"
     assert "angle_min_rad differs from that of the others: joint_2 (joint_2) -0.7 rad" in found.changed
 
 
 def test_a_robot_from_elsewhere_has_exceptions_only_where_its_joints_differ() -> None:
-    slider, hexa = robot_of(SLIDER, Order()).robot, robot_of(HEXA, HEXA_ORDER).robot
+    slider, hexa = import_urdf(SLIDER, ImportOptions()).robot, import_urdf(HEXA, HEXA_ORDER).robot
     assert slider.limits.torque_nm == 4.1 and len(slider.joints) == 1
     assert [joint.limits.torque_nm for joint in slider.joint_table].count(3.8) == 1
     sides = [(joint.limits.lower_rad, joint.limits.upper_rad) for joint in hexa.joint_table]
     assert sides == [(-1.5, 1.5), (-1.4, 1.6), *[(-1.5, 1.5)] * 4], "its angle is negated"
 
 
-@pytest.mark.parametrize("name", shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped("robots"))
 def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str) -> None:
     robot = robot_at(name)
-    theirs = by_mujoco(urdf_of(robot))
+    theirs = by_mujoco(export_urdf(robot))
     own = simulated(Path(name))
     np.testing.assert_allclose(hinge_inertia(theirs), hinge_inertia(own), rtol=1e-6, atol=1e-9)
     for i in range(robot.chain.modules + 1):
@@ -126,7 +126,7 @@ def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str)
 
 
 def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
-    found = robot_of(SLIDER, Order())
+    found = import_urdf(SLIDER, ImportOptions())
     theirs = by_mujoco(SLIDER.read_text(), HERE / "meshes")
     sign = np.array([-1.0 if "hinge0" in name and "negated" in name else 1.0 for name in found.names[9:]])
     np.testing.assert_allclose(
@@ -138,7 +138,7 @@ def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_pat
 def test_an_alternating_snake_in_millimetres_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
     whole = HEXA.read_text().replace('ixx="0" iyy="0" izz="0"', 'ixx="110" iyy="120" izz="50"')
     (tmp_path / "whole.urdf").write_text(whole)
-    found = robot_of(tmp_path / "whole.urdf", HEXA_ORDER)
+    found = import_urdf(tmp_path / "whole.urdf", HEXA_ORDER)
     assert found.robot.axes == ["yaw", "pitch"] * 3
     sign = np.array([-1.0 if "negated" in name else 1.0 for name in found.names[7:]])
     theirs = hinge_inertia(by_mujoco(whole)) * 1e-6 * np.outer(sign, sign)
@@ -148,11 +148,13 @@ def test_an_alternating_snake_in_millimetres_has_the_inertia_that_mujoco_reads(t
 @pytest.mark.parametrize(
     ("file", "order", "scenario", "controller"),
     [
-        (SLIDER, Order(tail="seg08"), "peg_row", "obstacle_triplet"),
+        (SLIDER, ImportOptions(tail="seg08"), "peg_row", "obstacle_triplet"),
         (HEXA, HEXA_ORDER, "mamba_hills", "lateral_undulation"),
     ],
 )
-def test_snakes_from_elsewhere_run(file: Path, order: Order, scenario: str, controller: str, tmp_path: Path) -> None:
+def test_snakes_from_elsewhere_run(
+    file: Path, order: ImportOptions, scenario: str, controller: str, tmp_path: Path
+) -> None:
     robot = tmp_path / "robot.toml"
     import_robot(file, order, robot)
     result = simulate(config(scenario, robot, f"controller={controller}", "duration_s=2"))
@@ -160,12 +162,12 @@ def test_snakes_from_elsewhere_run(file: Path, order: Order, scenario: str, cont
     assert np.abs(np.diff(result.record.angle_rad, axis=0)).max() > 1e-3, "its joints move"
     again, exported = tmp_path / "again.toml", tmp_path / "again.urdf"
     export_robot(str(robot), exported)
-    import_robot(exported, Order(), again)
+    import_robot(exported, ImportOptions(), again)
     assert robot_at(again) == robot_at(robot)
 
 
 def test_what_cannot_be_carried_over_is_named_with_its_lines() -> None:
-    slider, hexa = robot_of(SLIDER, Order()), robot_of(HEXA, HEXA_ORDER)
+    slider, hexa = import_urdf(SLIDER, ImportOptions()), import_urdf(HEXA, HEXA_ORDER)
     left_out, changed = "\n".join(slider.left_out + hexa.left_out), "\n".join(slider.changed + hexa.changed)
     for words in (
         "<transmission> left out: lines 26, 41",
@@ -224,7 +226,7 @@ def test_a_urdf_that_is_no_snake_is_refused_with_the_place(case: str, tmp_path: 
     file = tmp_path / "robot.urdf"
     file.write_text(text)
     with pytest.raises(ConfigError, match=re.escape(words)):
-        robot_of(file, Order())
+        import_urdf(file, ImportOptions())
 
 
 def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,21 +241,21 @@ def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_an_existing_robot_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "worm.toml").write_text("mine")
     with pytest.raises(ConfigError, match="is there already"):
-        import_robot(SLIDER, Order(), tmp_path / "worm.toml")
+        import_robot(SLIDER, ImportOptions(), tmp_path / "worm.toml")
 
 
 def test_a_mesh_may_be_text_or_binary_and_one_that_is_not_there_is_told(tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_text(
         "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 2 0\n"
     )
-    assert vertices(tmp_path / "a.stl").max(axis=0).tolist() == [1.0, 2.0, 0.0]
-    assert vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx([90.0, 32.0, 32.0])
+    assert read_vertices(tmp_path / "a.stl").max(axis=0).tolist() == [1.0, 2.0, 0.0]
+    assert read_vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx([90.0, 32.0, 32.0])
     (tmp_path / "b.stl").write_bytes(b"solid\nvertex a b c\n")
     with pytest.raises(ConfigError, match="a vertex is not three numbers"):
-        vertices(tmp_path / "b.stl")
+        read_vertices(tmp_path / "b.stl")
     (tmp_path / "far.urdf").write_text(SLIDER.read_text())
     assert "mesh 'package://slider_description/meshes/head.obj' left out: not on this computer" in "\n".join(
-        robot_of(tmp_path / "far.urdf", Order()).left_out
+        import_urdf(tmp_path / "far.urdf", ImportOptions()).left_out
     )
 
 

@@ -22,9 +22,9 @@ from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.command import import_robot
-from snakesim_operator.features.robots.exporting import urdf_of
-from snakesim_operator.features.robots.imported import Imported, Order
-from snakesim_operator.features.robots.importing import robot_of
+from snakesim_operator.features.robots.exporting import export_urdf
+from snakesim_operator.features.robots.imported import Imported, ImportOptions
+from snakesim_operator.features.robots.importing import import_urdf
 from snakesim_operator.features.robots.joint_limits import NUMBERS
 
 SNAKE = (Path(__file__).parent / "urdf" / "every_attribute.urdf").read_text()
@@ -208,7 +208,7 @@ def _try(row: Row, value: str | None, file: Path) -> Tried:
     _written(root, file)
     line = _line_of(root, element)
     try:
-        return Tried(line, value, found=robot_of(file, Order()))
+        return Tried(line, value, found=import_urdf(file, ImportOptions()))
     except ConfigError as error:
         return Tried(line, value, str(error))
 
@@ -266,7 +266,7 @@ def _accounted(row: Row, tried: Tried, base: RobotFile) -> bool:
 
 
 def _imported(text: str, file: Path) -> Imported:
-    return robot_of(_written(ET.fromstring(text), file), Order())
+    return import_urdf(_written(ET.fromstring(text), file), ImportOptions())
 
 
 def _unread(file: Path) -> list[Row]:
@@ -282,7 +282,7 @@ def test_whatever_is_not_read_is_reported_whatever_it_says(tmp_path: Path) -> No
     """All of it at once, which is many times as fast; see the next test for the values that are read."""
     file = tmp_path / "robot.urdf"
     rows = _unread(file)
-    base = robot_of(file, Order()).robot
+    base = import_urdf(file, ImportOptions()).robot
     assert len(rows) > 30
     for kind in ("zero", "negative", "huge"):
         root = ET.fromstring(SNAKE)
@@ -290,7 +290,7 @@ def test_whatever_is_not_read_is_reported_whatever_it_says(tmp_path: Path) -> No
         for row in rows:
             value = str(_values(row.name, _given(row))[kind])
             places.append((row, _edit(root, row, value), value))
-        found = robot_of(_written(root, file), Order())
+        found = import_urdf(_written(root, file), ImportOptions())
         assert found.robot == base
         for row, element, value in places:
             assert _is_reported(found.left_out, _line_of(root, element), value), f"{row.name} = {value[:50]}"
@@ -330,7 +330,7 @@ def _edited(tmp_path: Path, *edits: tuple[str, str]) -> Imported:
         text = text.replace(old, new)
     file = tmp_path / "robot.urdf"
     file.write_text(text)
-    return robot_of(file, Order())
+    return import_urdf(file, ImportOptions())
 
 
 def test_each_joint_has_its_own_friction_and_one_without_has_none(tmp_path: Path) -> None:
@@ -400,36 +400,36 @@ def test_bounds_are_those_of_a_robot_file() -> None:
 
 def test_what_is_edited_in_an_export_of_ours_counts_or_is_reported(tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
-    text = urdf_of(decode(read_part("planar13_camera", "robots"), RobotFile))
+    text = export_urdf(decode(read_part("planar13_camera", "robots"), RobotFile))
     file.write_text(text)
-    back = robot_of(file, Order())
+    back = import_urdf(file, ImportOptions())
     assert not back.changed and not back.assumed and not back.doubtful
     assert all("a name of its own" in line for line in back.left_out), "the way there and back loses nothing"
     camera = text.replace("<width>160</width>", "<width>320</width>", 1)
     file.write_text(camera)
-    assert any("<width> left out: '320'" in line for line in robot_of(file, Order()).left_out)
+    assert any("<width> left out: '320'" in line for line in import_urdf(file, ImportOptions()).left_out)
     file.write_text(text.replace("</robot>", '<snakesim key="chain.modules" value="3"/></robot>'))
     with pytest.raises(ConfigError, match="which links and joints say; remove this element"):
-        robot_of(file, Order())
+        import_urdf(file, ImportOptions())
     once_more = '<snakesim key="safety.action" value="&quot;passive&quot;"/></robot>'
     file.write_text(text.replace("</robot>", once_more))
     with pytest.raises(ConfigError, match="as another one has"):
-        robot_of(file, Order())
+        import_urdf(file, ImportOptions())
 
 
 def test_a_check_of_another_robot_is_no_check_of_this_one(tmp_path: Path) -> None:
     like = tmp_path / "like.toml"
     like.write_text('extends = "planar13"\n[checked]\nby = "me"\non = "today"\njoints = "abc"\nbackend = "can"\n')
     (tmp_path / "robot.urdf").write_text(SNAKE)
-    assert robot_of(tmp_path / "robot.urdf", Order(like=str(like))).robot.checked is None
+    assert import_urdf(tmp_path / "robot.urdf", ImportOptions(like=str(like))).robot.checked is None
 
 
 def test_the_printed_length_is_that_of_the_whole_body(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`length_m` of a robot leaves the rounded caps of tail and head out."""
     (tmp_path / "robot.urdf").write_text(SNAKE)
-    import_robot(tmp_path / "robot.urdf", Order(), tmp_path / "robot.toml")
+    import_robot(tmp_path / "robot.urdf", ImportOptions(), tmp_path / "robot.toml")
     printed = capsys.readouterr().out
-    robot = robot_of(tmp_path / "robot.urdf", Order()).robot
+    robot = import_urdf(tmp_path / "robot.urdf", ImportOptions()).robot
     assert f"3 joints (yaw), {robot.length_m + 2 * robot.module.radius_m:.3f} m, 1.260 kg" in printed
     assert "<material><color rgba>" not in printed, "values of looks are in the file only"
     assert "<material><color rgba> left out: '0.5 0.6 0.7 1' (line 3)" in (tmp_path / "robot.toml").read_text()

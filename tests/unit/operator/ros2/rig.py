@@ -3,7 +3,7 @@
 import msgspec
 
 from snakesim_hal.model.files import read_part
-from snakesim_hal.model.robot import RobotFile, describe
+from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import Description
 
 SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, else as other programs for ROS 2 have them
@@ -20,4 +20,4 @@ SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, els
 def of_robot(name: str) -> Description:
     """Description of a shipped robot."""
     file = msgspec.convert(read_part(name, "robots").values, RobotFile)
-    return describe(file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16)
+    return describe_robot(file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16)

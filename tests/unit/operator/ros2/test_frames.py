@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_of
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_from_rotation
 from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, make_ros_name
 from snakesim_operator.features.ros2.messages import Transform
 from snakesim_operator.features.ros2.urdf import make_urdf
@@ -52,7 +52,7 @@ def test_optical_frames_look_along_z() -> None:
     optical = rotation_from_quaternion(OPTICAL_IN_CAMERA)
     right, down, forward = optical.T
     assert np.allclose(forward, [1, 0, 0]) and np.allclose(right, [0, -1, 0]) and np.allclose(down, [0, 0, -1])
-    assert yaw_of(np.eye(3)) == 0.0
+    assert yaw_from_rotation(np.eye(3)) == 0.0
 
 
 def test_names_that_ros_allows() -> None:

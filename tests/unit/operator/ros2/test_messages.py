@@ -11,7 +11,7 @@ from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
 from snakesim_hal.wire import messages as m
-from snakesim_hal.wire.own_sample import own_kind, schema_of
+from snakesim_hal.wire.own_sample import make_message_schema, parse_custom_message
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
@@ -186,7 +186,7 @@ def test_scans(sent: m.Ranges) -> None:
 
 
 def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
-    kind = own_kind(schema_of(Skin, "skin"))
+    kind = parse_custom_message(make_message_schema(Skin, "skin"))
     sample: Any = kind.message(**PLACE, **GOOD)
     seen = read(ros.NUMBERS, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
     assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)

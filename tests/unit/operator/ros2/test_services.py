@@ -58,7 +58,7 @@ def test_values_of_parameters_keep_their_type(value: Any) -> None:
 
 
 def test_a_parameter_is_described_with_unit_and_range() -> None:
-    lead = Parameter("speed_kp_s", 0.2, unit="s", about="how far ahead", least=0.0, most=1.0)
+    lead = Parameter("speed_kp_s", 0.2, unit="s", description="how far ahead", minimum=0.0, maximum=1.0)
     seen = _make_descriptor("control.speed_kp_s", lead)
     assert (seen.description, seen.additional_constraints) == ("how far ahead [s]", ">= 0, <= 1")
     (span,) = seen.floating_point_range

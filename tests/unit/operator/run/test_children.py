@@ -5,14 +5,14 @@ import time
 
 import pytest
 
-from snakesim_operator.run.children import start
+from snakesim_operator.run.children import start_child
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
 def test_an_interrupt_while_a_child_starts_leaves_no_traceback(after_s: float) -> None:
     said = bytearray()
-    child = start("control", ["snakesim_hal.programs.service_program", "control", "--help"], said.extend)
+    child = start_child("control", ["snakesim_hal.programs.service_program", "control", "--help"], said.extend)
     time.sleep(after_s)
     child.process.send_signal(signal.SIGINT)
-    assert child.process.wait(30) == 0, child.words.last()
-    assert child.words.last() and b"Traceback" not in said
+    assert child.process.wait(30) == 0, child.output.last_lines()
+    assert child.output.last_lines() and b"Traceback" not in said

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.run.folder import LOCK, claimed, named_after
+from snakesim_operator.run.folder import LOCK, default_folder, locked_folder
 from tests.harness.wait import wait_until
 
 HOLD = """
@@ -35,17 +35,17 @@ def leave(folder: Path, **files: str) -> None:
 
 def test_a_folder_is_held_and_let_go(tmp_path: Path) -> None:
     out, said = tmp_path / "deep" / "run", list[str]()
-    with claimed(out, said.append) as held:
+    with locked_folder(out, said.append) as held:
         assert held == out and content(out) == {LOCK: str(os.getpid())}
         with pytest.raises(ConfigError, match=rf"another run is writing there, process {os.getpid()}"):
-            claimed(out, said.append).__enter__()
+            locked_folder(out, said.append).__enter__()
     assert content(out) == {} and said == []
 
 
 def test_an_earlier_run_is_moved_aside_every_time(tmp_path: Path) -> None:
     out, said = tmp_path / "run", list[str]()
     for number in range(3):
-        with claimed(out, said.append):
+        with locked_folder(out, said.append):
             leave(out, config_json=f"{number}", notes_txt="mine")
             os.utime(out / "config.json", (1.8e9, 1.8e9))  # one after the other, within a second
     assert content(out)["config.json"] == "2"
@@ -61,18 +61,18 @@ OLD = ["host.json", "blackbox.rows", "recording.mcap", "telemetry.jsonl", "black
 @pytest.mark.parametrize("name", OLD)
 def test_a_run_that_was_killed_is_an_earlier_run_too(tmp_path: Path, name: str) -> None:
     leave(tmp_path / "run", **{name.replace(".", "_"): "x"})
-    with claimed(tmp_path / "run", lambda _: None) as out:
+    with locked_folder(tmp_path / "run", lambda _: None) as out:
         assert not (out / name).exists()
 
 
 def test_what_is_no_run_stays(tmp_path: Path) -> None:
     leave(tmp_path / "run", notes_txt="mine")
-    with claimed(tmp_path / "run", pytest.fail) as out:
+    with locked_folder(tmp_path / "run", pytest.fail) as out:
         assert content(out)["notes.txt"] == "mine"
 
 
 def test_half_written_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
-    with claimed(tmp_path / "run", pytest.fail) as out:
+    with locked_folder(tmp_path / "run", pytest.fail) as out:
         (out / "host.json.partial").write_text("")
     assert content(out) == {}
 
@@ -85,12 +85,12 @@ def test_a_second_process_is_refused_before_it_touches_anything_and_a_killed_one
         leave(out, config_json="of the holder")
         before = content(out)
         with pytest.raises(ConfigError, match=rf"--out {out}: .*process {holder.pid}; choose another folder"):
-            claimed(out, pytest.fail).__enter__()
+            locked_folder(out, pytest.fail).__enter__()
         assert content(out) == before and list(tmp_path.iterdir()) == [out]
         holder.send_signal(signal.SIGKILL)
         holder.wait(10)
         said: list[str] = []
-        with claimed(out, said.append):
+        with locked_folder(out, said.append):
             assert len(said) == 1
     finally:
         holder.kill()
@@ -131,7 +131,7 @@ def test_nothing_is_written_into_a_folder_that_was_just_moved_aside(
         return open_file(path, *args, dir_fd=dir_fd)
 
     monkeypatch.setattr(os, "open", late)
-    with claimed(out, pytest.fail):
+    with locked_folder(out, pytest.fail):
         assert content(out) == {LOCK: str(os.getpid())} and content(aside) == {"notes.txt": "mine"}
 
 
@@ -139,7 +139,7 @@ def test_nothing_is_written_into_a_folder_that_was_just_moved_aside(
 def test_what_cannot_be_a_folder_is_wrong_input(tmp_path: Path, out: str) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(ConfigError, match=rf"--out {tmp_path / out}: .*; choose another folder"):
-        claimed(tmp_path / out, pytest.fail).__enter__()
+        locked_folder(tmp_path / out, pytest.fail).__enter__()
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -147,12 +147,12 @@ def test_the_folder_that_one_is_in_is_not_moved_away(tmp_path: Path, monkeypatch
     leave(tmp_path, config_json="x")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="you are in it; choose another folder"):
-        claimed(Path(), pytest.fail).__enter__()
+        locked_folder(Path(), pytest.fail).__enter__()
     assert content(tmp_path) == {"config.json": "x"}
 
 
 def test_a_run_that_is_given_no_folder_gets_a_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    first = named_after("triplet")
+    first = default_folder("triplet")
     first.mkdir(parents=True)
-    assert re.fullmatch(r"runs/triplet-\d{8}-\d{6}", str(first)) and not named_after("triplet").exists()
+    assert re.fullmatch(r"runs/triplet-\d{8}-\d{6}", str(first)) and not default_folder("triplet").exists()

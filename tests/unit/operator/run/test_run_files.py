@@ -18,9 +18,9 @@ class Disk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.space, self.hangs, self.goes_on = 2**30, False, Event()
-        self._write, self._whole = os.write, under_test.write_whole
+        self._write, self._whole = os.write, under_test.write_atomically
         monkeypatch.setattr(under_test.os, "write", self.write)
-        monkeypatch.setattr(under_test, "write_whole", self.write_whole)
+        monkeypatch.setattr(under_test, "write_atomically", self.write_whole)
         monkeypatch.setattr(under_test, "RETRY_S", 0.02)
         monkeypatch.setattr(under_test, "LIMIT_S", 0.3)
 

@@ -44,7 +44,7 @@ def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
         run.arm()
         with open_session(Link(run.link.endpoint, "lab/other")) as impostor:
             impostor.declare_alive("hal")
-            impostor.on_question(
+            impostor.on_query(
                 keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))
             )
             with pytest.raises(RefusedError, match="NOT CONFIRMED"):

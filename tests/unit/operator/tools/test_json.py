@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.files import shipped
+from snakesim_hal.model.files import list_shipped
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Status
@@ -18,7 +18,7 @@ from tests.unit.hal.rig import description, status
 def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenarios", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
-    assert sorted(reported["robots"]) == shipped("robots") and reported["scenarios"]["triplet"]
+    assert sorted(reported["robots"]) == list_shipped("robots") and reported["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
     reported = json.loads(capsys.readouterr().out)
     assert reported["robot.limits.torque_nm"] == {"value": 3, "origin": "--set robot.limits.torque_nm=3"}

@@ -64,7 +64,7 @@ def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("reported", [state("standing still"), None], ids=["goes on", "time stands"])
 def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | None) -> None:
-    before, now = parameters.change(Control(reported).operator, CHANGES, "ada")
+    before, now = parameters.change_parameters(Control(reported).operator, CHANGES, "ada")
     assert (before.changes, now.changes, now.who) == (0, 1, "ada")
 
 
@@ -72,11 +72,11 @@ def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | Non
 def test_a_value_that_ends_control_is_named_with_the_reason(gone: bool) -> None:
     control = Control(state(WHY, failed=True), gone=gone)
     with pytest.raises(ControllerError) as caught:
-        parameters.change(control.operator, CHANGES, "ada")
+        parameters.change_parameters(control.operator, CHANGES, "ada")
     said = f"control.propulsion_n=20: accepted, and then control has ended: {WHY}. The robot stops. "
     assert str(caught.value) == f"{said}Start control again with another value"
 
 
 def test_settings_that_vanish_without_a_reason_are_not_confirmed() -> None:
     with pytest.raises(RefusedError, match="NOT CONFIRMED"):
-        parameters.change(Control(None, gone=True).operator, CHANGES, "ada")
+        parameters.change_parameters(Control(None, gone=True).operator, CHANGES, "ada")

@@ -129,7 +129,7 @@ def test_a_robot_that_no_way_reaches_is_not_stopped_and_the_answer_says_why(
     def closed(*_: object) -> None:
         raise NotConnectedError("closed")
 
-    monkeypatch.setattr(StopRequester, "ask", closed)
+    monkeypatch.setattr(StopRequester, "request_stop", closed)
     with pytest.raises(RefusedError, match=r"ValueError: no session; search: .*Too many open files"):
         bench.stop.stop("anna")
     monkeypatch.undo()

@@ -53,19 +53,19 @@ def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) 
 
 
 def test_only_what_is_looked_at() -> None:
-    sensor = SensorDescription(key=keys.depth("head"), rate_hz=20.0, delay_s=0.0)
+    sensor = SensorDescription(key=keys.depth_key("head"), rate_hz=20.0, delay_s=0.0)
     robot = msgspec.structs.replace(description(), sensors=[sensor])
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as beside:
-        images = hal.publisher(keys.depth("head"), DepthImage)
+        images = hal.publisher(keys.depth_key("head"), DepthImage)
         (camera,) = cameras_of(beside, robot, 80)
         camera.publish_preview()
-        assert not images.heard()
+        assert not images.has_subscriber()
         with open_session(Link(endpoint, "worm")) as far:
-            seen = far.reader(keys.preview(keys.depth("head")), Preview)
-            wait_until(lambda: camera.publish_preview() or images.heard(), "the image fetched")
+            seen = far.reader(keys.preview_key(keys.depth_key("head")), Preview)
+            wait_until(lambda: camera.publish_preview() or images.has_subscriber(), "the image fetched")
             images.put(depth(3))
             found: list[Preview] = []
             wait_until(lambda: camera.publish_preview() or found.extend(seen.drain()) or found, "a preview")
             assert found[0].tick == 3 and found[0].width == 80
-        wait_until(lambda: camera.publish_preview() or not images.heard(), "the image left alone again")
+        wait_until(lambda: camera.publish_preview() or not images.has_subscriber(), "the image left alone again")

@@ -70,8 +70,8 @@ def test_every_refusal_is_told() -> None:
         )
     )
     words = set(re.findall(r'(?:refusal|word)="(\w+)"|_no\([^"]*"[^"]*", "(\w+)"\)', source))
-    asked = {word for pair in words for word in pair if word} | set(lifecycle.ORDER)
-    assert len(asked) > len(lifecycle.ORDER) + 3
+    asked = {word for pair in words for word in pair if word} | set(lifecycle.REFUSAL_ORDER)
+    assert len(asked) > len(lifecycle.REFUSAL_ORDER) + 3
     for word in commands | asked:
         assert f"`{word}`" in PROTOCOL, word
 
@@ -90,8 +90,8 @@ def test_the_endpoint_is_the_default() -> None:
 
 ROWS = {
     "`actuator/joints`": (keys.JOINT_COMMAND, JointCommand),
-    "`hal/clock`, `hal/done/*`": (keys.done("control"), Done),
-    "`sensor/depth/*`, `sensor/color/*`": (keys.depth("head"), DepthImage),
+    "`hal/clock`, `hal/done/*`": (keys.done_key("control"), Done),
+    "`sensor/depth/*`, `sensor/color/*`": (keys.depth_key("head"), DepthImage),
     "other streams": (keys.JOINTS, JointState),
     "`hal/description`, `hal/status`": (keys.DESCRIPTION, Description),
 }

@@ -14,9 +14,9 @@ from jsonschema import Draft202012Validator
 from msgspec import inspect
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.model.files import read_part, shipped
+from snakesim_hal.model.files import list_shipped, read_part
 from snakesim_hal.model.scenario import load
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, Message
 from snakesim_operator.this_computer.schemas import contract, write_schemas
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
@@ -89,13 +89,13 @@ def test_every_message_fits_its_schema(message: type[Message], data: st.DataObje
 
 @each_message
 def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> None:
-    assert json.loads(CONTRACT[of(message)])["encoding"] == encoding_of(message)
+    assert json.loads(CONTRACT[of(message)])["encoding"] == format_encoding(message)
     example = plain_example(message)
     assert fits(example, of(message))
     for field in example:
         rest = {name: value for name, value in example.items() if name != field}
         try:
-            Decoder(message).decode(encode(rest), encoding_of(message))
+            Decoder(message).decode(encode(rest), format_encoding(message))
             taken = True
         except WireError:
             taken = False
@@ -117,13 +117,13 @@ def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message
 
 @pytest.mark.parametrize(("kind", "schema"), [("robots", "robot"), ("scenes", "scene")])
 def test_every_shipped_file_fits_its_schema_and_names_itself(kind: str, schema: str) -> None:
-    for name in shipped(kind):
+    for name in list_shipped(kind):
         values = read_part(name, kind).values
         assert fits(values, f"files/{schema}.json"), name
         assert values["name"] == name
 
 
-@pytest.mark.parametrize("name", shipped("scenarios"))
+@pytest.mark.parametrize("name", list_shipped("scenarios"))
 def test_every_shipped_scenario_loads_and_fits_the_schema_of_a_run(name: str) -> None:
     config = load(name).config
     assert config.name == name

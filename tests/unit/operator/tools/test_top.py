@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import encode, encoding_of
+from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.monitoring.top import table_of, top
@@ -20,7 +20,7 @@ MS = 1_000_000
 
 
 def arrival(key: str, message: Message, at_ms: float) -> Arrival:
-    return Arrival(key, encode(message), encoding_of(type(message)), round(at_ms * MS))
+    return Arrival(key, encode(message), format_encoding(type(message)), round(at_ms * MS))
 
 
 def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
@@ -41,7 +41,7 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
 
 def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -> None:
     traffic = Traffic("worm")
-    traffic.add(Arrival("sensor/joints", b"noise", encoding_of(JointState), 0))
+    traffic.add(Arrival("sensor/joints", b"noise", format_encoding(JointState), 0))
     for i in range(MAX_KEYS + 10):
         traffic.add(Arrival(f"evil/{i}", b"x", "", i))
     for i in range(2 * KEPT):

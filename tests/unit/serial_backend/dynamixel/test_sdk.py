@@ -13,7 +13,7 @@ from dynamixel_sdk import (
 )
 
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_hal.model.fault_kinds import parse
+from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import emulator_on
 from snakesim_serial_backend.dynamixel.emulator import FIRMWARE, MODEL, EmulatedDynamixel
@@ -119,7 +119,7 @@ def test_goals_of_all_move_all_and_sync_reads_say_where_they_are(bench: Bench) -
 
 
 def test_whoever_is_silent_silences_all_behind_it(bench: Bench) -> None:
-    bench.emulator.inject(parse("mute:joint_2@0-9"), begins=True)
+    bench.emulator.inject(parse_injection("mute:joint_2@0-9"), begins=True)
     read = GroupSyncRead(bench.port, SDK, at.PRESENT, 10)
     for servo in (1, 2, 3):
         read.addParam(servo)
@@ -157,13 +157,13 @@ def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
 def test_an_alert_is_in_every_answer_until_a_restart_which_is_silent_for_a_while(bench: Bench) -> None:
     bench.enable()
     port = bench.port
-    bench.emulator.inject(parse("overheat:joint_1@0-9"), begins=True)
+    bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=True)
     bench.pass_time(0.1)
     errors, result, said = SDK.read1ByteTxRx(port, 1, at.HARDWARE_ERROR)
     assert (errors, result, said & ALERT) == (at.HardwareError.OVERHEATING, COMM_SUCCESS, ALERT)
     assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
     assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
-    bench.emulator.inject(parse("overheat:joint_1@0-9"), begins=False)
+    bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=False)
     bench.emulator.body.thermal.winding_c[:] = 20.0
     assert SDK.reboot(port, 1)[0] == COMM_SUCCESS
     assert SDK.ping(port, 1)[1] == COMM_RX_TIMEOUT
