@@ -18,4 +18,6 @@ for backend in ("sim", "can", "odrive", "moteus", "dynamixel", "mixed"):
     alike = statistics.correlation(*torques)
     joints = " ".join(joint.removeprefix("joint_") for joint in run.summary.propulsion_joints) or "none"
     moved_m = run.metrics["path_distance_m"]
-    print(f"{backend:9} moved {moved_m:.3f} m, propulsion joints {joints}, torque correlation {alike:.2f}, {run.ended}")
+    print(
+        f"{backend:9} moved {moved_m:.3f} m, propulsion joints {joints}, torque correlation {alike:.2f}, {run.status}"
+    )

@@ -37,7 +37,7 @@ for backend, has, changes in ROWS:
     lost = "measured" if off is None else f"at most {100 * off:.1f} cm off"
     torque_nm = max(one.peak_joint_torque_nm or 0.0 for one in said)
     energy = sum(one.energy_j or 0.0 for one in said) / sum(abs(one.path_distance_m or 0.0) + 1e-9 for one in said)
-    ended = " ".join(sorted({run.ended for run in runs}))
+    ended = " ".join(sorted({run.status for run in runs}))
     print(
         f"{backend:9} {has:32} moved {moved} m, pose {lost}, contacts from {said[0].contacts_from}, "
         f"{energy:.0f} J/m, largest torque {torque_nm:.1f} N·m, {ended}",

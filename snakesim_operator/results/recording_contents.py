@@ -174,7 +174,7 @@ class Contents:
             if tick not in joints or tick not in applied or tick not in clocks:
                 continue
             state = joints[tick]
-            if clocks[tick].arm_session and state.is_of(joint_count):
+            if clocks[tick].arm_session and state.has_joint_count(joint_count):
                 rows.append(_Row(tick, state, applied[tick], pose, peak_n, touched))
         return rows
 

@@ -88,9 +88,9 @@ def test_a_good_answer_passes_as_it_is() -> None:
         (points(torque_limit_nm=[7.0, -1.0, 7.0]), r".*_limit_nm\[1\] \(joint_2\) is -1.0, must be .* N·m from 0"),
         (
             points(mode=[1, 1, 1]),
-            r"setpoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION",
+            r"RequestedSetpoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION",
         ),
-        (points(mode=[Mode.POSITION, 7, "x"]), r"setpoints.mode\[1\] \(joint_2\) is 7"),
+        (points(mode=[Mode.POSITION, 7, "x"]), r"RequestedSetpoints.mode\[1\] \(joint_2\) is 7"),
         (reported(why=None), "Report.why is None, must be a str"),
         (reported(usable_push_points="3"), "Report.usable_push_points is '3'"),
         (reported(propulsion_joint=3), "Report.propulsion_joint is 3, must be None or an int from 0 to 2"),

@@ -47,7 +47,9 @@ def test_a_processor_that_cannot_or_is_not_known_is_left_alone(computer: Path, f
 
 
 def measured_with(code: str, **more: str) -> dict[str, str]:
-    show = "import json; from snakesim_hal.base import arithmetic; {}; print(json.dumps(arithmetic.measured()))"
+    show = (
+        "import json; from snakesim_hal.base import arithmetic; {}; print(json.dumps(arithmetic.measure_arithmetic()))"
+    )
     unset = {name: value for name, value in os.environ.items() if name not in arithmetic.common_environment()}
     done = subprocess.run(
         [sys.executable, "-c", show.format(code)], env={**unset, **more}, capture_output=True, check=True

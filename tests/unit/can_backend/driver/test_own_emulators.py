@@ -120,7 +120,7 @@ def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.M
 def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
     ending: str, child: Child, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(own_emulators, "START_LIMIT_S", 5.0)
+    monkeypatch.setattr(own_emulators, "SERVICE_START_LIMIT_S", 5.0)
     child.does("print('no such physics_model', flush=True)", ending)
     with pytest.raises(BackendError, match="the emulated joint modules did not start"):
         EmulatorProcess(RUN, ON_VCAN, None, stepped=False)

@@ -23,7 +23,7 @@ def motor(**robot):
 
 
 def drive(motors, mode, target, limit=RATED_NM):
-    motors.drive(0, mode, target, limit, 40.0, 1.0, SPEED)
+    motors.set_demand(0, mode, target, limit, 40.0, 1.0, SPEED)
 
 
 def test_torque_mode_follows_as_a_first_order_lag():

@@ -186,7 +186,7 @@ def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid", "power_unknown"]
 
 
-@pytest.mark.parametrize("kept", ["since_clear", "since_start"])
+@pytest.mark.parametrize("kept", ["faults_since_clear", "faults_since_start"])
 @pytest.mark.parametrize("before", [0, 3, 20, 50])
 def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None:
     rig = armed(safety__max_isolated_joints=1)

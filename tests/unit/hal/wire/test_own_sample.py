@@ -111,7 +111,7 @@ def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message
         '{"title":"A","properties":5}',
         '{"title":"a b","properties":{"x":{"type":"boolean"}}}',
         '{"title":"A","properties":{"__init__":{"type":"boolean"}}}',
-        '{"title":"A","properties":{"contradiction":{"type":"boolean"}}}',
+        '{"title":"A","properties":{"find_contradiction": {"type": "boolean"}}}',
         '{"title":"A","properties":{"x":{"type":"string","maxLength":5,"pattern":"(a+)+$"},"y":7}}',
         '{"title":"A","properties":{"x":{"type":"integer","minimum":"a","maximum":2}}}',
         '{"title":"A","properties":{"x":{"type":"integer","minimum":0,"maximum":1e400}}}',

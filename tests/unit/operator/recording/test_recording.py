@@ -93,7 +93,7 @@ KILLED = """
 import os, sys, time
 from pathlib import Path
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.recording.recover import recover
+from snakesim_operator.recording.recover import recover_recording
 from tests.unit.operator.recording.test_recording import clock
 recording = Recording(Path(sys.argv[1]))
 for tick in range(10**9):

@@ -16,8 +16,8 @@ from tests.harness.wait import wait_until
 HOLD = """
 import sys, time
 from pathlib import Path
-from snakesim_operator.run.folder import claimed
-with claimed(Path(sys.argv[1]), print):
+from snakesim_operator.run.folder import locked_folder
+with locked_folder(Path(sys.argv[1]), print):
     print("held", flush=True)
     time.sleep(60)
 """
