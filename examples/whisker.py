@@ -28,7 +28,7 @@ class Whisker(OwnSample, frozen=True, kw_only=True):
     bend_rad: Annotated[float, bounded(-1.6, 1.6, "rad"), about("from its rest, positive to the left; 0: it is free")]
     bend_max_rad: Annotated[float, bounded(0.1, 1.6, "rad"), about("it bends no further: there it is pressed flat")]
 
-    def contradiction(self) -> str:
+    def find_contradiction(self) -> str:
         if abs(self.bend_rad) <= self.bend_max_rad:
             return ""
         return f"bent by {self.bend_rad} rad, and it bends no further than {self.bend_max_rad} rad"

@@ -97,7 +97,7 @@ from snakesim_operator.recording.recover import recover_recording
 from tests.unit.operator.recording.test_recording import clock
 recording = Recording(Path(sys.argv[1]))
 for tick in range(10**9):
-    recording.take(clock(tick))
+    recording.write_arrival(clock(tick))
     recording.flush_when_due()
     print(time.monotonic(), tick, flush=True)
     time.sleep(0.002)
