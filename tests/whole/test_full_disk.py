@@ -1,8 +1,6 @@
 """An export that does not fit on the disk is named, and leaves no half file; an earlier file stays as it was."""
 
-import resource
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +9,7 @@ from snakesim.training.curve import write_curve
 from snakesim.training.search import Generation
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.store import write_tables
+from tests.harness.file_size import max_file_size
 from tests.whole.command import run_to_summary, snakesim
 
 FITS_BYTES = 2000  # less than any of these exports takes
@@ -23,17 +22,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ended, _ = run_to_summary(out, "triplet", "--duration", "0.5")
     assert ended.code == 0, ended.err
     return out
-
-
-@contextmanager
-def small_disk() -> Iterator[None]:
-    """No file may become longer than FITS_BYTES, neither here nor in child processes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (FITS_BYTES, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize(
@@ -56,7 +44,7 @@ def test_an_export_that_does_not_fit_is_named_and_leaves_nothing(
     run: Path, tmp_path: Path, command: list[str], name: str
 ) -> None:
     out = tmp_path / name
-    with small_disk():
+    with max_file_size(FITS_BYTES):
         ended = snakesim(command[0], str(run), *command[1:], "--out", str(out), cwd=tmp_path)
     assert ended.code == 2 and f"{out}: cannot be written: " in ended.err, ended.out + ended.err
     assert list(tmp_path.iterdir()) == []
@@ -74,6 +62,6 @@ def test_what_searches_and_evaluations_leave_is_whole_or_as_before(
     tmp_path: Path, write: Callable[[Path], object], name: str
 ) -> None:
     (tmp_path / name).write_text("an earlier one")
-    with small_disk(), pytest.raises(ConfigError, match=f"{name}: cannot be written: File too large"):
+    with max_file_size(FITS_BYTES), pytest.raises(ConfigError, match=f"{name}: cannot be written: File too large"):
         write(tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "an earlier one")]

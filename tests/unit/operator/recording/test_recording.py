@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -31,6 +30,7 @@ from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.tap import Tap
 from tests.harness.endpoint import free_endpoint
+from tests.harness.file_size import max_file_size
 from tests.harness.wait import wait_until
 from tests.unit.hal import rig
 from tests.unit.hal.rig import PERIOD_NS, description
@@ -94,6 +94,7 @@ import os, sys, time
 from pathlib import Path
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
+from tests.harness.file_size import max_file_size
 from tests.unit.operator.recording.test_recording import clock
 recording = Recording(Path(sys.argv[1]))
 for tick in range(10**9):
@@ -125,19 +126,13 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
-    try:
+    with max_file_size(20_000):
         recording = Recording(tmp_path / "a.mcap")
         for tick in range(5000):
             recording.write_arrival(clock(tick))
             if tick % 50 == 0:
                 recording.flush()
         recording.close({})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, ignored)
     assert "File too large" in recording.failure
     reader = RecordingReader(tmp_path / "a.mcap")
     ticks = [one.time_ns // PERIOD_NS for one in reader.read_messages()]
