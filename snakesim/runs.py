@@ -49,7 +49,7 @@ def run(
             moves a real robot needs this.
 
     Returns:
-        The result, also of a run that ended with a fault: `Result.ended` says how it ended.
+        The result, also of a run that ended with a fault: `Result.status` says how it ended.
 
     Raises:
         ConfigError: An argument is wrong; nothing was run.

@@ -87,7 +87,7 @@ class BackendFactory(Protocol):
     Settings: type[msgspec.Struct]  # the scenario's [backends.<name>] section
 
     def check(self, config: "RunConfig", settings: Any) -> tuple[ClockMode, ...]:
-        """The supported paces, the preferred one first; a real robot supports real time only. Opens nothing.
+        """The supported clock modes, the preferred one first; a real robot supports real time only. Opens nothing.
 
         Raises ConfigError for a run that this backend does not support at any clock mode, so that nothing is started.
         """

@@ -5,7 +5,7 @@ calls in the same order in each of them. Once in every tick, the caller
 
 1. reads the sensors: `samples = cycle.sample(tick, timestamp_ns)`,
 2. lets the safety core judge them: `cycle.observe(samples, now_ns)`,
-3. offers the commands that have arrived: `cycle.safety.offer(...)`,
+3. offers the commands that have arrived: `cycle.safety.offer_command(...)`,
 4. lets the safety core decide: `decision = cycle.decide(now_ns, tick)`,
 5. hands the setpoints to the motors: `cycle.enact(decision)`,
 6. lets one control period pass: `cycle.advance()`.

@@ -84,7 +84,7 @@ class HostOptions:
     realtime_warnings: Sequence[str] = ()  # real-time measures that the operating system refused
 
     # The robot.
-    faults: Faults | None = None  # injected ones, as `faults_of_host` returns them; None: requests are refused
+    faults: Faults | None = None  # injected ones, as `create_host_faults` returns them; None: requests are refused
     unchecked: str = ""  # why only an explicit word arms it, as `why_unchecked` returns it
     cables: CableFile | None = None  # of joints without end stops
 

@@ -61,7 +61,7 @@ def make_draws(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
 
 
 def parse_draw(text: str) -> tuple[str, list[str]]:
-    """Return keys and bounds of the `key=low:high` of a --draw option, for `draws_of`.
+    """Return keys and bounds of the `key=low:high` of a --draw option, for `make_draws`.
 
     Raises:
         ConfigError: A part of it is missing.

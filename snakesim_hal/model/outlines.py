@@ -163,14 +163,14 @@ def gaps_m(single: Outlines, others: Outlines) -> Floats:
 
 
 def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Return the point of a chain that is nearest to each outline, among the positions `SHARES` along every link.
+    """Return the point of a chain that is nearest to each outline, among `LINK_FRACTIONS` of every link.
 
     Args:
         nodes_w: (n, 2) tail end, joints and head end, m.
         outlines: m outlines.
 
     Returns:
-        Index of the point among all `SHARES` of all links (m,), the point itself (m, 2), and its distance (m,).
+        Index of the point among all `LINK_FRACTIONS` of all links (m,), the point itself (m, 2), and its distance (m,).
     """
     rear = nodes_w[:-1, None]
     run = np.diff(nodes_w, axis=0)[:, None]

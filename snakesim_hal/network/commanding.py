@@ -3,8 +3,8 @@
 It is a client like any other. The host's limiter limits each command; without commands the lease ends within 50 to 100
 ms, and an armed robot goes into its stop mode.
 
-Threads: the thread that creates a `Commanding` makes every call. Commands are sent only while it is in a call, so it
-must call `wait` or `turn` in every tick.
+Threads: the thread that creates a `CommandingClient` makes every call. Commands are sent only while it is in a call,
+so it must call `wait` or `turn` in every tick.
 """
 
 import time

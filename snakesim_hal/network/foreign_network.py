@@ -3,7 +3,7 @@
 A bridge joins it as a client of an explicit endpoint. That network cannot delay the robot's own one: it is another
 session, samples are dropped rather than waited for, and only the newest of each key is kept.
 
-Threads: the bridge's thread makes every call, except `RawReader.take`, which Zenoh's thread calls.
+Threads: the bridge's thread makes every call, except `RawReader.store`, which Zenoh's thread calls.
 """
 
 import time

@@ -3,7 +3,7 @@
 Over it the host sends its description and its status, and takes requests. So the starter knows, without
 trusting anything on the network, which robot that is, its state, and that it is this one that is armed.
 
-Threads: any thread of the host may send with `HostEnd.say`; requests arrive in a thread of the channel. The starter
+Threads: any thread of the host may send with `HostEnd.send`; requests arrive in a thread of the channel. The starter
 makes every call of `StarterEnd` from one thread.
 """
 

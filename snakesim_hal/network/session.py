@@ -4,7 +4,7 @@ A session connects to explicit endpoints, without scouting, and sees one namespa
 opens Zenoh and has its settings; `local_network` has the same sessions within one process, without Zenoh.
 
 Threads: every method may be called from any thread of the process. Zenoh calls the callbacks that `on_arrival`,
-`on_question` and `on_alive` register in its own threads, so they must return at once: they store what arrived, and
+`on_query` and `on_alive` register in its own threads, so they must return at once: they store what arrived, and
 the process handles it in a thread of its own.
 """
 

@@ -188,7 +188,7 @@ class StopRequester:
 
 
 def request_stop(host: str, port: int, who: str, timeout_s: float) -> StopAnswer | None:
-    """Send a stop request to one stop port, as `StopRequester.ask` does.
+    """Send a stop request to one stop port, as `StopRequester.request_stop` does.
 
     Raises:
         NotConnectedError: the port is closed.

@@ -42,8 +42,10 @@ class Motors:
 
         # State.
         self.torque_nm: Floats = np.zeros(count)
-        self.heat: Floats = np.zeros(count)  # N²·m²; sum of torque squared over the steps since `take_heat`
-        self._steps = 0  # since `take_heat`
+        self.heat: Floats = np.zeros(
+            count
+        )  # N²·m²; sum of torque squared over the steps since `pop_mean_square_torque`
+        self._steps = 0  # since `pop_mean_square_torque`
 
         # Demand, by the latest setpoints: kp (position - angle) + kd (velocity - speed) + feedforward.
         self._kp = np.zeros(count)  # N·m/rad

@@ -8,7 +8,7 @@ an incomplete last row, as after a SIGKILL.
 
 `command_digest` is a hash over every applied setpoint, so runs with equal digests drove the motors equally.
 
-Threads: the host's thread records; the writer's thread reads rows with `rows_from` meanwhile, without a lock.
+Threads: the host's thread records; the writer's thread reads rows with `read_rows` meanwhile, without a lock.
 """
 
 import hashlib

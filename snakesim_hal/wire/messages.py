@@ -482,7 +482,7 @@ class Status(Message, frozen=True, kw_only=True):
     clock_mode: Annotated[ClockMode, PACE]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     lifecycle: Annotated[LifecycleState, LIFECYCLE]
-    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arm_session")]
+    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arming")]
     lease_holder: Annotated[q.Name | None, about("null: the lease is free")]
     lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")]
     commands_accepted: Annotated[q.Count, about("while armed")]

@@ -124,7 +124,7 @@ def request_from_host(
 def request_while_driving(
     session: Session, request: LifecycleRequest, done: str, link: Link, turn: Callable[[], object]
 ) -> None:
-    """Query the host, as `ask_host`, and call `turn` meanwhile: without commands an armed robot would get a fault."""
+    """Query the host, as `request_from_host`, and call `turn` meanwhile: an armed robot needs commands all the time."""
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(request_from_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
         while not answer.done():

@@ -82,9 +82,9 @@ class Bench:
         overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
         config = with_backend_modes(load(self._scenario, overrides).config, self.factory)
         # The tests' own controller is the only service.
-        paces = self.factory.check(config, backend_settings(config, self.factory))
+        clock_modes = self.factory.check(config, backend_settings(config, self.factory))
         clock_mode = (
-            "lockstep" if "lockstep" in paces else "realtime"
+            "lockstep" if "lockstep" in clock_modes else "realtime"
         )  # the first: quick, and the same on every machine
         return msgspec.structs.replace(config, clock_mode=clock_mode, services={HOLDER: Service()})
 

@@ -81,4 +81,4 @@ def test_servos_that_stop_while_the_host_is_frozen_are_reported_and_stay_off(pos
     assert ended.code == 1 and record.lifecycle == "fault", ended.said
     stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
     assert len(stopped) == 13, record.faults
-    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arm_session"
+    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"

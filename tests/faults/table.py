@@ -200,14 +200,14 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
-        "drives stop by themselves; fault names the joint; no drive is enabled again before clear and arm_session",
+        "drives stop by themselves; fault names the joint; no drive is enabled again before clear and arming",
         "a watchdog, 100 ms; at 50 Hz (T = 20 ms) for the driver 3 T, and 100 ms for what drives report by themselves",
         (
             Row(
                 "drive_host_frozen",
                 "host: SIGSTOP for 1 s, then SIGCONT",
                 "every drive off by its own watchdog; each stop a fault that names its joint; none enabled again",
-                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before clear and arm_session",
+                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before clear and arming",
                 0.0,
                 "drives enabled again",
                 dict.fromkeys(DRIVE_TYPES, drives.host_frozen),
@@ -369,7 +369,7 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "bus-off, error-passive, transmit queue full, interface down, receive overflow, babbling node, duplicate id",
-        "fault; recovers only to disarmed; duplicate refused at arm_session",
+        "fault; recovers only to disarmed; duplicate refused at arming",
         "2-3 T; flood 100 ms",
         (
             bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off"),

@@ -36,7 +36,7 @@ def out_of_time(request: Request) -> Iterator[Trial]:
             "reordered": (partial(stranger.again, 2), "replayed"),
             "duplicated": (partial(stranger.again, 1), "replayed"),
             "future": (partial(stranger.out_of_time, 50), "from_the_future"),
-            "without an arm_session": (stranger.without_arming, "before_arming"),
+            "without an arm session": (stranger.without_arming, "before_arming"),
         }
 
     yield from _among_good_ones(request, kinds)

@@ -65,7 +65,7 @@ def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
     if status is None or status.lifecycle != "fault":
         return recovered(observer, None, "; ".join([*failures, f"not stopped: {observer.in_words()}"]))
     if any(h.message.sequence is not None for h in observer.applied):
-        failures.append("commands were applied without an arm_session")
+        failures.append("commands were applied without an arm session")
     if not any(fault.what == "lease_expired" for fault in status.faults):
         failures.append(f"not because of the lease: {status.why}")
     return recovered(observer, value, "; ".join(failures))
