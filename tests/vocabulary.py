@@ -44,7 +44,8 @@ def count(pattern: str, *paths: str) -> int:
     listed = subprocess.run(["git", "ls-files", *paths], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     found = 0
     for name in listed.stdout.splitlines():
-        if name.endswith((".py", ".md", ".toml", ".html", ".js")) and name != "CHANGELOG.md":
+        is_ours = "/vendor/" not in name and name != "CHANGELOG.md"
+        if is_ours and name.endswith((".py", ".md", ".toml", ".html", ".js")):
             found += len(re.findall(word, (REPOSITORY / name).read_text()))
     return found
 

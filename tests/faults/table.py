@@ -153,7 +153,7 @@ def stream_row(name: str, key: str, oldest_ms: float) -> Row:
     return Row(
         name,
         f"{key}: all of it is lost",
-        "the push ends, every joint holds its position, control/state names the stream; goes on when it is back",
+        "the push ends, every joint holds its position, control/state names the stream; continues when it is back",
         f"{oldest_ms:.0f} ms, which is how old it may be, and a tick (10 ms) of injector, control and host",
         oldest_ms + 3 * PERIOD_MS,
         "ms",
@@ -338,7 +338,7 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "a stream that control acts on stops: of a sensor, of guidance, of navigation",
-        "without joint states: safe stop; without another: the controller holds, and goes on when it is back",
+        "without joint states: safe stop; without another: the controller holds, and continues when it is back",
         "joints: 30 ms and the lease; others: their `max_age`",
         (
             Row(

@@ -128,8 +128,8 @@ def second_controller(request: Request) -> Iterator[Trial]:
             yield _second(observer, stranger, answered_ms)
         request.note(f"the lease request was answered within {max(answered_ms):.0f} ms")
         request.note(
-            "who reads the epoch from hal/clock and forges the next sequence is not kept out by the limiter: nothing "
-            "authenticates here, a router's access control does"
+            "the limiter does not reject a client that reads the epoch from hal/clock and forges the next sequence: "
+            "nothing authenticates here, a router's access control does"
         )
 
 
