@@ -8,6 +8,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 from queue import Empty
 from typing import Protocol
 
@@ -33,6 +34,8 @@ PRESENCE = 1
 SAMPLES = 2
 REQUESTS = 3
 LIMITS = (64, None, 4096, 64)  # presence comes from known services only, so its lane needs no bound
+
+RequestDecoder = Decoder[LeaseRequest] | Decoder[LifecycleRequest] | Decoder[EstopRequest] | Decoder[SimulatorRequest]
 
 
 class Receiver(Protocol):
@@ -110,20 +113,20 @@ class _LocalRequest:
 
 
 @dataclass(frozen=True)
-class _Query:
+class _RemoteRequest:
     """A request that came over Zenoh."""
 
-    question: Query
-    decoder: Decoder[LeaseRequest] | Decoder[LifecycleRequest] | Decoder[EstopRequest] | Decoder[SimulatorRequest]
+    query: Query
+    decoder: RequestDecoder
     send_answer: Callable[[Query, Answer], None]
 
     def deliver(self, receiver: Receiver) -> None:
         try:
-            request = self.decoder.decode(self.question.payload, self.question.encoding)
+            request = self.decoder.decode(self.query.payload, self.query.encoding)
         except WireError as error:
-            self.send_answer(self.question, receiver.on_undecodable(error))
+            self.send_answer(self.query, receiver.on_undecodable(error))
         else:
-            receiver.on_request(request, lambda answer: self.send_answer(self.question, answer))
+            receiver.on_request(request, lambda answer: self.send_answer(self.query, answer))
 
 
 class Inbox:
@@ -150,27 +153,16 @@ class Inbox:
         self._lanes: Mailbox[QueuedInput] = Mailbox(LIMITS)
         self.dropped = 0
 
-        command_decoder = Decoder(JointCommand)
-        done_decoder = Decoder(Done)
-        session.on_urgent_arrival(
-            keys.JOINT_COMMAND, lambda arrival: self._put_sample(CommandArrival(arrival, command_decoder))
-        )
-        session.on_urgent_arrival(keys.DONE_ALL, lambda arrival: self._put_sample(_Done(arrival, done_decoder)))
+        self._command_decoder = Decoder(JointCommand)
+        self._done_decoder = Decoder(Done)
+        self._send_answer = send_answer
 
-        estop_decoder = Decoder(EstopRequest)
-        session.on_query(
-            keys.ESTOP,
-            lambda question: self._lanes.put(_Query(question, estop_decoder, send_answer), STOPS),
-        )
-        for key, decoder in (
-            (keys.LEASE, Decoder(LeaseRequest)),
-            (keys.LIFECYCLE, Decoder(LifecycleRequest)),
-            (keys.SIMULATOR, Decoder(SimulatorRequest)),
-        ):
-            session.on_query(
-                key,
-                lambda question, decoder=decoder: self._put_request(_Query(question, decoder, send_answer)),
-            )
+        session.on_urgent_arrival(keys.JOINT_COMMAND, self._put_command)
+        session.on_urgent_arrival(keys.DONE_ALL, self._put_done)
+        session.on_query(keys.ESTOP, partial(self._put_stop, Decoder(EstopRequest)))
+        session.on_query(keys.LEASE, partial(self._put_request, Decoder(LeaseRequest)))
+        session.on_query(keys.LIFECYCLE, partial(self._put_request, Decoder(LifecycleRequest)))
+        session.on_query(keys.SIMULATOR, partial(self._put_request, Decoder(SimulatorRequest)))
         session.on_alive(self._put_presence)
 
     def waiting(self) -> int:
@@ -215,13 +207,22 @@ class Inbox:
 
     # --- in Zenoh's threads ----------------------------------------------------------------------------------
 
-    def _put_request(self, item: QueuedInput) -> None:
-        self.dropped += self._lanes.full(REQUESTS)  # the requester gets no answer, and may ask again
-        self._lanes.put(item, REQUESTS)
+    def _put_command(self, arrival: Arrival) -> None:
+        self._put_sample(CommandArrival(arrival, self._command_decoder))
+
+    def _put_done(self, arrival: Arrival) -> None:
+        self._put_sample(_Done(arrival, self._done_decoder))
 
     def _put_sample(self, item: QueuedInput) -> None:
         self.dropped += self._lanes.full(SAMPLES)
         self._lanes.put(item, SAMPLES)
+
+    def _put_stop(self, decoder: Decoder[EstopRequest], query: Query) -> None:
+        self._lanes.put(_RemoteRequest(query, decoder, self._send_answer), STOPS)
+
+    def _put_request(self, decoder: RequestDecoder, query: Query) -> None:
+        self.dropped += self._lanes.full(REQUESTS)  # the requester gets no answer, and may ask again
+        self._lanes.put(_RemoteRequest(query, decoder, self._send_answer), REQUESTS)
 
     def _put_presence(self, key: str, present: bool) -> None:
         service = keys.parse_service(key)
