@@ -61,27 +61,27 @@ compiled: .venv/.compiled
 
 # Robots in real time stumble on a busy machine, an emulated one most of all. What failed is tried once more: here, alone.
 again = --last-failed --last-failed-no-failures none
-here = $(bin)/python -m pytest --ignore tests/vcan $(if $(QUICK),-m "not slow") $(ARGS)
-on_vcan = $(bin)/python -m pytest -o cache_dir=build/pytest-vcan tests/vcan tests/contract $(if $(QUICK),-m "not slow") --timeout 900 $(ARGS)
+here = $(bin)/python -m pytest --ignore tests/system/can $(if $(QUICK),-m "not slow") $(ARGS)
+on_vcan = $(bin)/python -m pytest -o cache_dir=build/pytest-vcan tests/system/can tests/contract $(if $(QUICK),-m "not slow") --timeout 900 $(ARGS)
 
 faults: $(stamp) ## Measure the fault table and write docs/faults.md (ARGS="--rows NAME --trials 3")
-	$(bin)/python -m tests.faults --write $(ARGS)
+	$(bin)/python -m verification.faults --write $(ARGS)
 
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
-	$(bin)/python -m tests.mutation --workers $(WORKERS) $(ARGS)
+	$(bin)/python -m verification.mutation --workers $(WORKERS) $(ARGS)
 
 fuzz: $(stamp) ## Bad payloads into every decoder, then over the network of a robot that runs (PAYLOADS=1000000)
-	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) $(ARGS)
-	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) --network $(ARGS)
+	$(bin)/python -m verification.fuzz --payloads $(PAYLOADS) $(ARGS)
+	$(bin)/python -m verification.fuzz --payloads $(PAYLOADS) --network $(ARGS)
 
 attack: $(stamp) ## Every attack of a stranger on the network, in full (ARGS="-k a4"); make test has the quick form
-	SNAKESIM_ATTACK=full $(bin)/python -m pytest tests/attack --timeout 900 $(ARGS)
+	SNAKESIM_ATTACK=full $(bin)/python -m pytest verification/attack --timeout 900 $(ARGS)
 
 kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear and end (TRIALS=300, ARGS="--seed 2")
-	$(bin)/python -m tests.soak.kills --trials $(TRIALS) $(ARGS)
+	$(bin)/python -m verification.soak.kills --trials $(TRIALS) $(ARGS)
 
 soak: $(stamp) ## A long run with faults at random, and an operator who recovers (MINUTES=30, ARGS="--backend can --seed 2")
-	$(bin)/python -m tests.soak --minutes $(MINUTES) $(ARGS)
+	$(bin)/python -m verification.soak --minutes $(MINUTES) $(ARGS)
 
 check: $(stamp) ## Lint, format, types and import rules, without changing anything
 	$(bin)/ruff check
@@ -100,17 +100,17 @@ bench-peers: $(stamp) ## Measure the loop beside raw Zenoh, dora-rs and rospy (i
 	$(bin)/python -m benchmarks.peers $(ARGS)
 
 links: $(stamp) ## Measure bad links between a robot and its controller, and write docs/lab-links.md (root; ARGS="--trials 4")
-	$(bin)/python -m tests.links --write $(ARGS)
+	$(bin)/python -m verification.links --write $(ARGS)
 
 bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link beside raw Zenoh (root)
 	$(bin)/python -m benchmarks.paths $(ARGS)
 
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
-	$(bin)/python -m tests.golden
+	$(bin)/python -m verification.golden
 
 schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
 	$(bin)/snakesim schemas --write schemas
-	$(bin)/python -m tests.kinds_table
+	$(bin)/python -m docs.site.kinds_table
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

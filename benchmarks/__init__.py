@@ -6,3 +6,5 @@
 from snakesim_hal.base.arithmetic import pin
 
 pin()  # before NumPy: so that a run in this process stays in it, where it can be measured
+
+import snakesim_testing.isolation  # noqa: E402, F401 - latched stops and lists of robots stay apart from the user's

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.whole import run
 from snakesim_can_backend.bus.load import MAX_LOAD, ReportSchedule, bus_load
 from snakesim_can_backend.protocol.definitions import Opcode, parse_opcode
-from tests.unit.can_backend.emulator.rig import run_at
+from snakesim_testing.can.module_rig import run_at
 
 WARM_UP = 100  # cycles
 RATE_HZ = 100

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import zenoh
 
 from snakesim_hal.base.process import child_environment, python_command
-from tests.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 BLOCK = zenoh.CongestionControl.BLOCK

@@ -10,8 +10,8 @@ from snakesim_can_backend.protocol.definitions import Frame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily, DrivesOfModules
 from snakesim_testing.contract.bench import Bench
-from tests.contract.drives import DrivesOfAnyFamily, DrivesOfModules
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
 IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs the other clauses, too

@@ -18,7 +18,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
-from tests.unit.can_backend.frames import health, heartbeat
+from snakesim_testing.can.frames import health, heartbeat
 
 TRIPLET = load_scenario("triplet").config
 

@@ -7,7 +7,7 @@ from snakesim_gnc.control.hold import Hold
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
 from snakesim_gnc.control.path_following import PathFollowing
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 TAIL_S_M = 0.3
 TORQUE_NM = 2.0  # that every joint is said to have: what the propulsion joint pushes with

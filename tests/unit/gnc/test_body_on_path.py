@@ -10,7 +10,7 @@ from snakesim_gnc.geometry.body_on_path import BodyOnPath, chain_nodes, compute_
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.route import lay_chain
-from tests.unit.gnc.stage import PERIOD_S, make_robot, make_route, make_stage, nodes_of
+from snakesim_testing.gnc.stage import PERIOD_S, make_robot, make_route, make_stage, nodes_of
 
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]
 ROUTE = make_route()

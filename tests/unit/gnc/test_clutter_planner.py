@@ -16,7 +16,7 @@ from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, find_start_pose, load, parse_set, place_obstacles
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
-from tests.unit.gnc.stage import make_world
+from snakesim_testing.gnc.stage import make_world
 
 TURN_S = 0.08  # a plan takes some of them
 SECOND = 10**9

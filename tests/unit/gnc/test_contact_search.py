@@ -16,7 +16,7 @@ from snakesim_gnc.control.policy import POLICIES
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.stage import Stage, make_contact, make_stage
+from snakesim_testing.gnc.stage import Stage, make_contact, make_stage
 
 TAIL_S_M = 0.3
 SEARCHES = "in search of contacts"

@@ -7,7 +7,7 @@ from snakesim_gnc.control.gaits import RaisedHead, Rolling, Sidewinding
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import Result, simulate
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 
 def on_flat_ground(*sets: str) -> Result:

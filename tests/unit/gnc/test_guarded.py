@@ -12,7 +12,7 @@ from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.wire.messages import Description, Mode
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 STAGE = make_stage(3)
 VIEW = STAGE.view(0, 0.3)

@@ -2,7 +2,7 @@
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.joint_check import JointCheck
-from tests.unit.hal.rig import description, state
+from snakesim_testing.hal.small_robots import description, state
 
 PERIOD_S = 0.01
 ROBOT = description()

@@ -9,7 +9,7 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, SettingsRequest
-from tests.unit.hal.rig import description
+from snakesim_testing.hal.small_robots import description
 
 CLOCK = Clock(
     tick=7,

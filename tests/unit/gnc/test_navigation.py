@@ -8,7 +8,7 @@ from snakesim_gnc.navigation.intents import LONGEST_NS, DesiredMotion, Intents
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
-from tests.unit.gnc.stage import make_world
+from snakesim_testing.gnc.stage import make_world
 
 MISSION_M_S = 0.2
 MISSION = DesiredMotion(MISSION_M_S)

@@ -1,11 +1,11 @@
-"""`obstacle_aided` between torque and position mode; what it does to a body is in tests/physics."""
+"""`obstacle_aided` between torque and position mode; what it does to a body is in tests/system/physics."""
 
 import numpy as np
 import pytest
 
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 HELD_NM = 0.6  # that every joint is measured with
 

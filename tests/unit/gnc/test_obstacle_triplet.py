@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, TripletSettings
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import PERIOD_S, known, make_contact, make_stage
+from snakesim_testing.gnc.stage import PERIOD_S, known, make_contact, make_stage
 
 TAIL_S_M = 0.3
 

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.control.path_following import PathFollowing
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage, nodes_of
+from snakesim_testing.gnc.stage import make_stage, nodes_of
 
 TAIL_S_M = 0.3
 

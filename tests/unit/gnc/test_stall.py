@@ -6,7 +6,7 @@ import pytest
 from snakesim_gnc.control.contact_forces import MeasuredContacts, NetContactForce
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
 from snakesim_hal.wire.messages import World
-from tests.unit.gnc.stage import known, make_contact, make_world
+from snakesim_testing.gnc.stage import known, make_contact, make_world
 
 
 def watch() -> StallWatch:

@@ -10,7 +10,7 @@ import pytest
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
 from snakesim_gnc.control.undulation import CompliantUndulation, HeadSteeredUndulation, LateralUndulation
 from snakesim_hal.model.route import Route
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 TAIL_S_M = 0.3
 BY_SHAPE = {"shape_nm_per_rad": 0.0}  # in position mode, whose targets show the push

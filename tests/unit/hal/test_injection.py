@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from docs.site.kinds_table import PAGE, with_table
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import (
     KINDS,
@@ -19,8 +20,7 @@ from snakesim_hal.model.fault_kinds import (
 )
 from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, parse_planned
 from snakesim_hal.wire import keys
-from tests.kinds_table import PAGE, with_table
-from tests.unit.hal.rig import run_config
+from snakesim_testing.hal.small_robots import run_config
 
 TARGETS = {
     "process": ["control", "host"],

@@ -7,7 +7,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.model import build
 from snakesim_sim_backend.settings import SimSettings
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 RESPONSE_S = 0.01
 NOTHING = 1e-12  # N·m

@@ -7,7 +7,7 @@ import pytest
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Mode
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 
 def test_a_runaway_names_tick_joint_and_value_and_the_last_good_state_stays():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from tests.unit.sim_backend.rig import Run, make_config, open_sim
+from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
 
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])

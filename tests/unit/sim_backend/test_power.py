@@ -10,7 +10,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 WITH = {"sensors!": {"joints": {}, "power": {"rate_hz": 5.0}}}
 

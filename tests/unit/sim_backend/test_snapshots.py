@@ -13,7 +13,7 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 HEAD = keys.depth_key("head")
 CAMERA = {"name": "head", "width": 40, "height": 30, "rate_hz": 20.0}

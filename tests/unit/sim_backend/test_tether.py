@@ -4,7 +4,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.sim_backend.rig import Run, make_config, open_sim
+from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
 
 ICE = {"ground": {"friction": 0.0}}
 BACKWARD = {"link": 0, "point_m": 0.0, "direction_w": [-1.0, 0.0]}

@@ -37,9 +37,9 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
-from tests.unit.can_backend.emulator.rig import chain
-from tests.unit.can_backend.frames import heartbeat, read
-from tests.unit.can_backend.loop import config
+from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.frames import heartbeat, read
+from snakesim_testing.can.module_rig import chain
 
 NAMES = [f"joint_{i}" for i in range(1, 5)]
 Spoil = Callable[[Frame], list[Frame]]

@@ -6,7 +6,7 @@ import pytest
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import parse_injection
-from tests.unit.can_backend.loop import cleared_and_armed_again, loop
+from snakesim_testing.can.driver_loop import cleared_and_armed_again, loop
 
 START_TICK = 60
 AT_REST_RAD_S = 0.05

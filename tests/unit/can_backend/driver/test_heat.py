@@ -16,9 +16,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.can.driver_loop import chain_of
 from snakesim_testing.contract.rig import Rig
-from tests.unit.can_backend.loop import chain_of
-from tests.unit.hal.rig import run_config
+from snakesim_testing.hal.small_robots import run_config
 
 RATED_NM = 4.0
 STEP_NM = 0.003  # of the bus, and what a joint at its stop still sways by

@@ -5,7 +5,7 @@ import pytest
 from snakesim_can_backend.driver.reports import MAX_LATE_SYNCS, ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode
-from tests.unit.can_backend.frames import answer, begin, contact, joint_state, syncs
+from snakesim_testing.can.frames import answer, begin, contact, joint_state, syncs
 
 JOINTS = 3
 

@@ -13,7 +13,8 @@ from snakesim_can_backend.driver.module_monitor import (
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
-from tests.unit.can_backend.driver.watch_rig import (
+from snakesim_testing.can.frames import begin, corrupted, heartbeat, joint_state
+from snakesim_testing.can.monitor_rig import (
     HOT,
     HOT_AND_WET,
     PERIOD_S,
@@ -25,7 +26,6 @@ from tests.unit.can_backend.driver.watch_rig import (
     reporting,
     said,
 )
-from tests.unit.can_backend.frames import begin, corrupted, heartbeat, joint_state
 
 # --- what one module can do wrong --------------------------------------------------------------------------
 

@@ -8,8 +8,8 @@ from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode, frame_id
-from tests.unit.can_backend.driver.watch_rig import Bench, answering, quiet, said
-from tests.unit.can_backend.frames import answer, joint_state
+from snakesim_testing.can.frames import answer, joint_state
+from snakesim_testing.can.monitor_rig import Bench, answering, quiet, said
 
 # --- the bus -----------------------------------------------------------------------------------------------
 

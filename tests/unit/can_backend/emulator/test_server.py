@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Modu
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.can_backend.emulator.rig import chain, only, setpoint
+from snakesim_testing.can.module_rig import chain, only, setpoint
 
 Wall = tuple[VirtualWire, EmulatorServer, Callable[[float], list[Frame]]]
 JOINTS = 4

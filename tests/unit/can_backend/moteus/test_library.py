@@ -17,8 +17,8 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.can_backend.loop import config
-from tests.unit.hal.drive_rig import drives_of
+from snakesim_testing.can.driver_loop import config
+from snakesim_testing.drivers.drive_rig import drives_of
 
 TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
 JOINTS = 4

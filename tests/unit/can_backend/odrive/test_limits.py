@@ -16,8 +16,8 @@ from snakesim_can_backend.odrive.protocol import MessageId, decode_setting_answe
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
-from tests.unit.hal.drive_rig import DriveRig, drives_of
-from tests.unit.hal.rig import run_config
+from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
+from snakesim_testing.hal.small_robots import run_config
 
 JOINTS = 3
 TORQUE_NM, CONSTANT = 7.0, 0.03

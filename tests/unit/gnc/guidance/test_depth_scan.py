@@ -11,7 +11,7 @@ from snakesim_gnc.guidance.depth_scan import DepthScanner, decode_depth_m
 from snakesim_gnc.guidance.ground import fit_plane_under, refine_plane
 from snakesim_gnc.guidance.scan import Noise, Scan, make_scan
 from snakesim_hal.model.outlines import outline_distance_m
-from tests.unit.gnc.guidance.rendered import INTRINSICS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
+from snakesim_testing.gnc.rendered import INTRINSICS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
 
 EYE_M = 0.06  # height of the camera
 SCENE = [cylinder("near", 0.6, 0.1, 0.04), cylinder("far", 1.2, -0.3, 0.06), box("block", 0.8, 0.4, (0.12, 0.08), 0.5)]

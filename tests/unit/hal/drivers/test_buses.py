@@ -11,10 +11,10 @@ from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import ClockMode, Mode
-from tests.contract.drives import DrivesOfAnyFamily
-from tests.harness.wait import wait_until
-from tests.unit.hal.drive_rig import DriveRig, drives_of
-from tests.unit.hal.rig import run_config
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily
+from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
+from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.harness.wait import wait_until
 
 AXES, SERVOS = [0, 1], [2, 3]  # joints
 HEAD = {"driver": "odrive"}, {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}}

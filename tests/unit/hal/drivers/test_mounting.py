@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.wire.messages import Mode
-from tests.unit.hal.rig import robot_file
+from snakesim_testing.hal.small_robots import robot_file
 
 MIXED = {
     "joint_1": {"sign": -1, "zero_rad": 3.0, "gear": 9.0, "angle_min_rad": -0.4},

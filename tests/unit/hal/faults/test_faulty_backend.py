@@ -12,8 +12,8 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import Injection, parse_injection
 from snakesim_hal.wire.messages import Description, JointState, Mode
-from tests.unit.hal.local_network import LagBackend
-from tests.unit.hal.rig import PERIOD_NS, run_config
+from snakesim_testing.hal.local_network import LagBackend
+from snakesim_testing.hal.small_robots import PERIOD_NS, run_config
 
 
 class Emulated(LagBackend):

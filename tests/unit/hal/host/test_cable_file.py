@@ -14,8 +14,8 @@ from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import Description
-from tests.harness.wait import wait_until
-from tests.unit.hal.rig import state
+from snakesim_testing.hal.small_robots import state
+from snakesim_testing.harness.wait import wait_until
 
 DECLARED = "2026-11-25T02:40:12+00:00"
 NOW_S = datetime(2026, 11, 25, 2, 50, tzinfo=UTC).timestamp()

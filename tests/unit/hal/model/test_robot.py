@@ -13,7 +13,7 @@ from snakesim_hal.model.robot import RobotFile, describe_robot, layout_hash
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Description, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, description, robot_file
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, ROBOT, description, robot_file
 
 SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 

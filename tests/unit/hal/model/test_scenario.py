@@ -32,7 +32,7 @@ from snakesim_hal.model.scenario import (
     write_config,
 )
 from snakesim_hal.model.scene import make_route
-from tests.unit.hal.rig import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
+from snakesim_testing.hal.small_robots import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
 
 
 def with_flags(path: str, *flags: str) -> Loaded:

@@ -22,7 +22,7 @@ from snakesim_hal.model.scene import (
     place_scene,
 )
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.hal.rig import SCENE
+from snakesim_testing.hal.small_robots import SCENE
 
 SINE = {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}
 FIELD: dict[str, Any] = {

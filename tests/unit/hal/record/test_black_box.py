@@ -14,7 +14,7 @@ from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_
 from snakesim_hal.safety.authority import TickDecision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Mode
-from tests.unit.hal.rig import contact, description, pose, state
+from snakesim_testing.hal.small_robots import contact, description, pose, state
 
 ROBOT = description()
 

@@ -11,8 +11,8 @@ from snakesim_hal.safety.authority import Authority
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import Fault, LeaseRequest, Mode
-from tests.unit.hal.rig import LEASE_NS, command
-from tests.unit.hal.safety.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, ROBOT, Rig, armed, commanded, modes
+from snakesim_testing.hal.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, ROBOT, Rig, armed, commanded, modes
+from snakesim_testing.hal.small_robots import LEASE_NS, command
 
 # --- arming ----------------------------------------------------------------------------------------------------
 

@@ -6,8 +6,8 @@ import pytest
 
 from snakesim_hal.safety.authority import COMMANDS_KEPT
 from snakesim_hal.wire.messages import LeaseRequest, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS
-from tests.unit.hal.safety.authority_rig import CLEAR, ESTOP, JOINTS, Rig, armed, modes
+from snakesim_testing.hal.authority_rig import CLEAR, ESTOP, JOINTS, Rig, armed, modes
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
 
 # --- lockstep: what counts is told by ticks --------------------------------------------------------------------
 

@@ -19,8 +19,7 @@ from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, power, state
-from tests.unit.hal.safety.authority_model import (
+from snakesim_testing.hal.authority_model import (
     ALL,
     ANGLE,
     DERATE_FROM,
@@ -37,6 +36,7 @@ from tests.unit.hal.safety.authority_model import (
     Model,
     within,
 )
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, command, description, power, state
 
 SEQUENCES = int(os.environ.get("SNAKESIM_SEQUENCES", "200"))
 PER_TEST = 200

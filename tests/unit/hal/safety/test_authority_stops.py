@@ -8,8 +8,8 @@ from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointCommand, LifecycleState, Mode, SensorDescription
-from tests.unit.hal.rig import PERIOD_NS, command, state
-from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JOINTS, Rig, armed, modes, receive
+from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JOINTS, Rig, armed, modes, receive
+from snakesim_testing.hal.small_robots import PERIOD_NS, command, state
 
 # --- stops -----------------------------------------------------------------------------------------------------
 

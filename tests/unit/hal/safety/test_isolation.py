@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire.messages import Fault, Mode
-from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
+from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
 

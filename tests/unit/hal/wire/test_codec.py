@@ -21,7 +21,7 @@ from snakesim_hal.wire.messages import (
     Message,
     Mode,
 )
-from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
+from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 ALL = list(VERSIONS)
 DECODERS: dict[type[Message], Decoder[Any]] = {message: Decoder(message) for message in ALL}

@@ -9,7 +9,7 @@ from msgspec import inspect
 
 from snakesim_hal.wire import keys, messages
 from snakesim_hal.wire.messages import VERSIONS, Message, Mode
-from tests.unit.hal.strategies import places, plain_example
+from snakesim_testing.hal.strategies import places, plain_example
 
 each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
 

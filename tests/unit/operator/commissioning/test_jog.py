@@ -4,7 +4,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.commissioning.jog import KEY_HOLD_S, MAX_LEAD_RAD, JogRequest, JogTarget
-from tests.unit.hal.rig import description
+from snakesim_testing.hal.small_robots import description
 
 PERIOD_S = 0.01
 JOINT = description().joints[0]

@@ -12,7 +12,7 @@ from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obs
 from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import LONGEST_M, M_PER_N, draw
-from tests.unit.hal.rig import description, state
+from snakesim_testing.hal.small_robots import description, state
 
 ROBOT = description()
 COUNT = len(ROBOT.joints)

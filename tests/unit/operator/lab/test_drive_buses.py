@@ -14,7 +14,7 @@ from snakesim_hal.programs.arguments import add_host, add_service, load_scenario
 from snakesim_operator.features.lab.check import Findings, check_what_moves
 from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
 from snakesim_operator.features.lab.render import rendered
-from tests.unit.hal.rig import description
+from snakesim_testing.hal.small_robots import description
 
 BY_ID = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT4-if00-port0"
 ROBOTS = {

@@ -33,9 +33,9 @@ from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
-from tests.unit.hal.rig import description
-from tests.unit.hal.rig import state as joint_state
-from tests.whole.command import run_to_summary
+from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import state as joint_state
+from snakesim_testing.runs.in_process_command import run_to_summary
 
 ROBOT = "/planar13_camera"
 LAYOUT = Path(__file__).parents[4] / "docs" / "foxglove-layout.json"

@@ -28,7 +28,7 @@ from snakesim_operator.results.compare.table import table
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.results.recorded import Reader, triplet
+from snakesim_testing.operator.recorded_triplet import Reader, triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST

@@ -10,7 +10,7 @@ from snakesim_operator.results.report import page
 from snakesim_operator.results.report.pushing import pushing
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
-from tests.unit.operator.results.recorded import Reader, changed
+from snakesim_testing.operator.recorded_triplet import Reader, changed
 
 SECONDS = 1.5
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")

@@ -17,7 +17,7 @@ from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import Marker, Transform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
-from tests.unit.hal.strategies import messages_of
+from snakesim_testing.hal.strategies import messages_of
 from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)

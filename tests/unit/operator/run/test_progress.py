@@ -4,7 +4,7 @@ import pytest
 
 from snakesim_hal.wire.messages import LifecycleState, Status
 from snakesim_operator.run.progress import Progress
-from tests.unit.hal.rig import run_config, status
+from snakesim_testing.hal.small_robots import run_config, status
 
 
 def at(tick: int, lifecycle: LifecycleState = "armed") -> Status:

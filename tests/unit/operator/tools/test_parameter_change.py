@@ -10,7 +10,7 @@ from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState
 from snakesim_operator.robot_commands import parameters
-from tests.unit.hal.rig import description
+from snakesim_testing.hal.small_robots import description
 
 CLOCK = Clock(
     tick=7,

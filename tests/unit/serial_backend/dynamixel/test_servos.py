@@ -1,6 +1,6 @@
 """The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
 
-Hardware errors, restarts and lost joints are in `tests/unit/can_backend/can_drives/test_every_driver_type.py`.
+Hardware errors, restarts and lost joints are in `tests/contract/test_can_driver_types.py`.
 """
 
 import math
@@ -17,8 +17,8 @@ from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from tests.unit.hal.drive_rig import DriveRig, drives_of
-from tests.unit.hal.rig import run_config
+from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
+from snakesim_testing.hal.small_robots import run_config
 
 JOINTS = 4
 NOTICED = 10  # ticks in which a fault shows: each servo says its health every fourth

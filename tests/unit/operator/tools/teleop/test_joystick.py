@@ -1,4 +1,4 @@
-"""A joystick, at the event layer: a pipe is the device. tests/vcan/test_joystick.py has one of the kernel."""
+"""A joystick, at the event layer: a pipe is the device. tests/system/can/test_joystick.py has one of the kernel."""
 
 import os
 from collections.abc import Iterator

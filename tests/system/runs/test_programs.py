@@ -1,0 +1,109 @@
+"""Host, services and router as programs of their own, as on the machines of a lab: any order, and again at will."""
+
+import contextlib
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.model.files import ROUTER
+from snakesim_hal.network.session_file import read_session
+from snakesim_operator.results.record import RunRecord
+from snakesim_testing.runs.command import SNAKESIM, Ended, environment
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs import in_process_command as command
+
+pytestmark = pytest.mark.e2e
+
+SERVICES = ("guidance", "navigation", "control")
+SCENARIO = ("triplet", "--duration", "1")
+
+
+class Lab:
+    """Programs that share a router, and a session file each."""
+
+    def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
+        self.folder, self._stack = folder, stack
+        endpoint = free_endpoint()
+        quiet = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
+        self.router_file, self.session = folder / "router.json5", folder / "session.json5"
+        self.router_file.write_text(ROUTER.read_text().replace("tcp/127.0.0.1:7447", endpoint))
+        self.session.write_text(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {quiet}}}')
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        """One of them."""
+        log = self._stack.enter_context((self.folder / f"{arguments[0]}-{Path(arguments[1]).stem}.log").open("a"))
+        process = subprocess.Popen(
+            [*SNAKESIM, *arguments],
+            cwd=self.folder,
+            env=environment(self.folder),
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._stack.callback(process.wait, 10)
+        self._stack.callback(process.kill)
+        return process
+
+    def host(self, out: str, *arguments: str) -> subprocess.Popen[str]:
+        """A HAL host."""
+        return self.start("host", *SCENARIO, "--once", *arguments, "--session", str(self.session), "--out", out)
+
+    def service(self, name: str, *arguments: str) -> subprocess.Popen[str]:
+        """A service."""
+        return self.start("service", name, *SCENARIO, *arguments, "--session", str(self.session))
+
+    def tell(self, *arguments: str) -> Ended:
+        """An operator's command, on another machine."""
+        return command.snakesim(*arguments, "--session", str(self.session), cwd=self.folder)
+
+    def until_armed(self) -> None:
+        """As a person does it: until the answer is yes."""
+        wait_until(lambda: self.tell("arm", "planar13", "sim").code == 0, "armed", 60.0)
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    with contextlib.ExitStack() as stack:
+        yield Lab(tmp_path, stack)
+
+
+def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_host(lab: Lab) -> None:
+    for name in SERVICES[:2]:
+        lab.service(name)
+    other_goal = lab.service("control", "--set", "mission.speed_m_s=0.3")
+    first = lab.host("never-armed")
+    waited = lab.folder / "service-control.log"
+    wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
+    router = lab.start("router", str(lab.router_file))
+    wait_until(lambda: "DIFFERS: `mission` is " in lab.tell("status").out, "the difference")
+    refused = lab.tell("arm", "planar13", "sim").err
+    assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
+    other_goal.kill()
+    lab.service("control")
+    wait_until(lambda: "next: `snakesim arm planar13 sim --session " in lab.tell("status").out, "ready to arm")
+    said = lab.tell("status").out
+    assert all(f"  process {name}: " in said for name in ("host", *SERVICES)) and "DIFFERS" not in said, said
+    first.send_signal(signal.SIGKILL)  # at tick 0, where the next host begins as well
+    first.wait()
+    second = lab.host("second")
+    lab.until_armed()
+    assert second.wait(60) == 0, (lab.folder / "host-triplet.log").read_text()
+    _, alone = command.run_to_summary(lab.folder / "alone", *SCENARIO)
+    assert RunRecord.load(lab.folder / "second").host.command_digest == alone.command_digest
+    router.send_signal(signal.SIGINT)
+    assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
+
+
+def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    (endpoint,) = read_session(lab.session).endpoints
+    monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
+    for ended in (lab.tell("disarm"), command.snakesim("disarm", cwd=lab.folder)):
+        assert ended.code == 1 and f"no robot on {endpoint}" in ended.err
+    elsewhere = command.snakesim("disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
+    assert elsewhere.code == 1 and endpoint not in elsewhere.err
+    ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")
+    assert ended.code == 2 and "--router and --session" in ended.err, ended.err
