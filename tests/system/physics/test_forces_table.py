@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.solved_and_measured import STEP_S, causes, measured
+from snakesim_testing.runs.solved_and_measured import STEP_S, causes, measured
 
 
 def test_forces_of_every_physics_step_are_those_that_the_contact_sensor_averages():

@@ -14,7 +14,7 @@ from snakesim_hal.base.process import child_environment, python_command
 ROOT = Path(__file__).parents[3]
 FOLDERS = (
     "snakesim",
-    *sorted(path.name for path in ROOT.glob("snakesim_*")),
+    *sorted(path.name for path in ROOT.glob("snakesim_*") if path.name != "snakesim_testing"),
     "benchmarks",
     "deploy",
     "docs",
