@@ -30,7 +30,8 @@ LOOKS_AHEAD = (
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
-WITHOUT_THE_DRIVER = "test_drives_"  # moteus does it otherwise; for buses in threads see tests/unit/hal/drivers
+# moteus does it otherwise; for buses in threads see tests/system/drives/test_buses.py
+WITHOUT_THE_DRIVER = "test_drives_"
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 HEAD_OF_SERVOS = (
     'robot.drive.driver="odrive"',

@@ -1,7 +1,7 @@
 """Files of settings from anywhere: what is none, or is too much, is one clear line, in bounded time and memory."""
 
 import os
-import socket
+import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,17 +23,15 @@ def sparse(path: Path) -> None:
         file.truncate(50 * 1024**3)
 
 
-def listening(path: Path) -> None:
-    os.chdir(path.parent)  # a socket's name is short
-    with socket.socket(socket.AF_UNIX) as end:
-        end.bind(path.name)
+def make_socket(path: Path) -> None:
+    os.mknod(path, stat.S_IFSOCK | 0o600)
 
 
 ODD: dict[str, tuple[Callable[[Path], object], str]] = {
     "pipe": (os.mkfifo, "is a pipe, not a file"),
     "device that never ends": (lambda path: path.symlink_to("/dev/zero"), "is a device, not a file"),
     "terminal": (lambda path: path.symlink_to("/dev/tty"), "is a device, not a file"),
-    "socket": (listening, "is a socket, not a file"),
+    "socket": (make_socket, "is a socket, not a file"),
     "folder": (Path.mkdir, "is a folder, not a file"),
     "50 GB of nothing": (sparse, "is larger than 8 MB"),
     "10 MB": (lambda path: path.write_text("a = 1\n" * 1_700_000), "is larger than 8 MB"),
