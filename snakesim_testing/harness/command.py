@@ -19,7 +19,7 @@ from snakesim_testing.harness.wait import LIMIT_S, wait_until
 SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
 WITH_TESTS = ["setpriv", "--pdeathsig", "KILL"]  # ends when the tests are killed, too
 TOO_LONG = 124  # as timeout(1) has it: no exit code of ours
-HANDED_DOWN = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS", "QUICK"}
+HANDED_DOWN = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS"}
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ IN_REAL_TIME: Any = InRealTime
 @pytest.hookimpl(optionalhook=True)
 def pytest_snakesim_benches() -> list[Bench]:
     """Simulator, also with a camera; CAN on a bus inside the process, or on the kernel's with modules as processes."""
-    if os.environ.get(VCAN):  # `make test-vcan`
+    if os.environ.get(VCAN):  # `make test-can`
         return [Bench("can-vcan", "can", sets=ON_VCAN, mute=cut_off)]
     return [
         Bench("sim", "sim"),
@@ -78,7 +78,7 @@ def pytest_snakesim_benches() -> list[Bench]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make test-all`."""
+    """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make verify`."""
     for item in items:
         is_special = WITHOUT_THE_DRIVER in item.name and "[moteus" in item.name
         if any(f"[{bench}" in item.name for bench in AS_ANOTHER) and not is_special:

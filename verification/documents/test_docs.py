@@ -1,6 +1,6 @@
 """What tutorials, the guide to evaluations and the README ask a reader to type is typed here, as printed.
 
-Of docs/hil.md only what needs no CAN; `make test-vcan` runs the rest of it with commands of its own.
+Of docs/hil.md only what needs no CAN; `make test-can` runs the rest of it with commands of its own.
 """
 
 import os
@@ -98,7 +98,7 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
     subprocess.run([*git, "clone", "-q", str(origin), str(clone)], check=True)
     printed = documents.script(section)
     assert "\nmake demo" in printed and "\nmake test" in printed
-    script = printed.replace("\nmake test", "\nmake test-here WORKERS=0 ARGS='--collect-only -q'")
+    script = printed.replace("\nmake test", "\nmake test-unit WORKERS=0 ARGS='--collect-only -q'")
     said = typed(script, clone, [])
     assert "report:" in said and (clone / "runs" / "demo" / "report.html").is_file()
     assert "tests collected" in said
