@@ -11,12 +11,12 @@ import psutil
 import pytest
 from websockets.exceptions import InvalidStatus
 
+from snakesim_testing.harness.page import CAMERA, STOP, Page, ask, flood
 from snakesim_testing.harness.processes import processes_of
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import address
 from verification.attack.effort import Record, effort
 from verification.attack.means.floods import half_sent
-from verification.attack.means.page import CAMERA, STOP, Page, ask, flood
 from verification.attack.robot import Robot, Victim
 
 STOP_S = 60.0  # from a click to the stop; far above what it takes

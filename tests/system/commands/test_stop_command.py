@@ -11,8 +11,8 @@ from snakesim_hal.wire.messages import Answer
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.robot_commands import command, stop
 from snakesim_testing.hal.local_network import Follower, following, running
+from snakesim_testing.hal.small_robots import run_config
 from snakesim_testing.runs.command import snakesim
-from tests.system.network.test_client_host import run_config
 
 
 def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:

@@ -9,46 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import decode, read_part
-from snakesim_hal.model.robot import RobotFile
-from snakesim_testing.benches.workbench import text_of_the_example
-from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.bench import host, lab_folder
+from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.hand_turned_robot import BACKEND, JOINTS, make_hand_turned_folder, robot, seen
 from snakesim_testing.runs.in_process_command import snakesim
 
-JOINTS = 4
-BACKEND = "./held.py:Held"
 SIGN, ZERO_RAD = np.array([1.0, -1.0, 1.0, 1.0]), np.array([0.3, -0.2, 0.0, 0.1])  # as it is really mounted
 
-HELD = '''
 
-import json
-from pathlib import Path
-
-from snakesim_drivers.mounting import Mounting
-
-
-class Held(Workbench):
-    """Drives that somebody turns by hand: their angles stand in a file."""
-
-    def sample(self, tick, timestamp_ns):
-        drives = np.array(json.loads(Path("drives.json").read_text()))
-        self.angle = Mounting(self.robot.joint_table).joint_angle_rad(drives)
-        return super().sample(tick, timestamp_ns)
-'''
-SCENARIO = """
-robot = "./snake.toml"
-scene = "flat"
-controller = "hold"
-clock_mode = "realtime"
-rate_hz = 50
-
-[start]
-on_route = false
-
-[services.control]
-"""
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    return make_hand_turned_folder(tmp_path)
 
 
 def hold(home: Path, joints_rad: Sequence[float]) -> None:
@@ -56,17 +27,6 @@ def hold(home: Path, joints_rad: Sequence[float]) -> None:
     drives = ZERO_RAD + SIGN * np.array(joints_rad)
     (home / "new.json").write_text(json.dumps(drives.tolist()))
     (home / "new.json").replace(home / "drives.json")
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
-    """A lab's folder: robot file with a comment, scenario, backend."""
-    return lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": text_of_the_example() + HELD})
-
-
-def robot(home: Path) -> RobotFile:
-    """The robot file as it stands."""
-    return decode(read_part(str(home / "snake.toml"), "robots"), RobotFile)
 
 
 def told(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
@@ -86,16 +46,6 @@ def enter(process: subprocess.Popen[str]) -> str:
     process.stdin.write("\n")
     process.stdin.flush()
     return process.communicate(timeout=30)[0]
-
-
-def seen(home: Path, endpoint: str, angle_rad: float) -> None:
-    """Wait until the host publishes an angle of joint_1."""
-
-    def published() -> bool:
-        said = snakesim("echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
-        return abs(json.loads(said)["message"]["angle_rad"][0] - angle_rad) < 1e-3
-
-    wait_until(published, f"joint_1 at {angle_rad} rad")
 
 
 def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:

@@ -1,6 +1,5 @@
 """`snakesim joints jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
 
-import json
 import os
 import pty
 import subprocess
@@ -8,46 +7,24 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from snakesim_testing.benches.workbench import text_of_the_example
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.bench import host, lab_folder
+from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.command import background
 from snakesim_testing.runs.in_process_command import snakesim
-from tests.system.commissioning.test_by_hand import JOINTS, SCENARIO
+from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, stopped, told
 
 REPEAT_S = 0.03  # of a key
 TRIES = 4
 HELD_BACK = 270  # keys that come at once, as after a stall of some seconds
-BACKEND = "./told.py:Told"
 UP = b"\x1b[A"
-TOLD = """
-
-import json
-from pathlib import Path
-
-
-class Told(Workbench):
-    \"\"\"What it is told stands in a file.\"\"\"
-
-    ticks = 0
-
-    def enact(self, setpoints, lifecycle):
-        super().enact(setpoints, lifecycle)
-        self.ticks += 1
-        told = {"tick": self.ticks, "lifecycle": lifecycle, "mode": setpoints.mode, "target": setpoints.target}
-        Path("new.json").write_text(json.dumps({**told, "limit_nm": setpoints.torque_limit_nm}))
-        Path("new.json").replace("told.json")
-"""
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    real = text_of_the_example().replace("emulated=True", "emulated=False")
-    return lab_folder(tmp_path, JOINTS, SCENARIO, {"told.py": real + TOLD})
+    return make_jogged_folder(tmp_path)
 
 
 @contextmanager
@@ -62,10 +39,6 @@ def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], 
     finally:
         os.close(ours)
         os.close(theirs)
-
-
-def told(home: Path) -> dict[str, Any]:
-    return json.loads((home / "told.json").read_text())
 
 
 def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
@@ -125,7 +98,3 @@ def stopped_when_killed(home: Path, endpoint: str) -> bool:
         process.kill()
         wait_until(lambda: told(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
         return True
-
-
-def stopped(home: Path) -> bool:
-    return told(home)["lifecycle"] == "fault"

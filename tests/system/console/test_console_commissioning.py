@@ -8,22 +8,30 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.harness.stalling_relay import StallingRelay
+from snakesim_testing.operator.console_wait import LIMIT_S, until
 from snakesim_testing.operator.viewer import Viewer, viewing
 from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.checked_robot import make_checked_folder
 from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.hand_turned_robot import robot
 from snakesim_testing.runs.in_process_command import snakesim
-from tests.system.commissioning.test_by_hand import robot
-from tests.system.commissioning.test_checked import home
-from tests.system.commissioning.test_jog import BACKEND, stopped, told
-from tests.system.commissioning.test_jog import home as bench
-from tests.system.console.test_console_keys import LIMIT_S, until
+from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, stopped, told
 
 pytestmark = pytest.mark.e2e
 REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
 RUN = (*REAL, "--stay", "--duration", "36000", "--console", "--no-record")
 FORWARDS, HOLD_HZ = "Hold: forwards (+)", 20.0
 HELD_IN_STALL, LIFTED_S = 40, 0.6  # messages, and more than a held button may be old
-__all__ = ["bench", "home"]
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    return make_checked_folder(tmp_path)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    return make_jogged_folder(tmp_path)
 
 
 def test_a_robot_that_nobody_checked_is_armed_by_the_page_by_an_explicit_word(home: Path) -> None:

@@ -3,19 +3,17 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Intent, Status, Trajectory
+from snakesim_testing.operator.console_wait import LIMIT_S, until
 from snakesim_testing.operator.viewer import Viewer, viewing
 from snakesim_testing.runs.command import running
 
 pytestmark = pytest.mark.e2e
-LIMIT_S = 60.0
-T = TypeVar("T")
 REPEAT_S = 0.04  # of a held key
 RUN = ("peg_row", "--clock-mode", "realtime", "--duration", "600", "--stay", "--console", "--no-record")
 
@@ -69,11 +67,3 @@ async def hold(viewer: Viewer, key: str, done: Callable[[], bool], what: str = "
         assert asyncio.get_running_loop().time() < deadline, f"not in time: {what} of {key!r}"
         await viewer.trigger(key)
         await asyncio.sleep(REPEAT_S)
-
-
-async def until(condition: Callable[[], T | None], what: str) -> T:
-    deadline = asyncio.get_running_loop().time() + LIMIT_S
-    while not (found := condition()):
-        assert asyncio.get_running_loop().time() < deadline, f"not in time: {what}"
-        await asyncio.sleep(0.02)
-    return found

@@ -12,9 +12,9 @@ from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, MessageAge, PageAction
 from snakesim_operator.features.console.web.server import serve_pages
+from snakesim_testing.harness.page import Page
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
-from verification.attack.means.page import Page
 
 HZ = 10.0
 VIEWER = 3

@@ -9,7 +9,7 @@ from snakesim_operator.features.console.scene.drawing import M_PER_N, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
 from snakesim_operator.features.console.web.server import serve_pages
 from snakesim_testing.hal.small_robots import description
-from tests.unit.operator.console.test_drawing import contact, joints, pushing, world
+from snakesim_testing.operator.drawn_samples import contact, joints, pushing, world
 
 
 def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_testing.harness.bad_plugins import BAD
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import Machine
-from verification.attack.test_plugins import BAD
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace: needs root")]
 pytest.importorskip("msgpack", reason="python-can's UDP bus needs it")

@@ -8,8 +8,8 @@ import pytest
 
 from snakesim_testing.benches.workbench import text_of_the_example
 from snakesim_testing.runs.bench import host, lab_folder
+from snakesim_testing.runs.hand_turned_robot import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
 from snakesim_testing.runs.in_process_command import snakesim
-from tests.system.commissioning.test_by_hand import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
 
 pytestmark = pytest.mark.e2e
 TURN = 2 * math.pi

@@ -20,8 +20,8 @@ from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.certificates import Issuer, issue, make_authority
 from snakesim_operator.features.lab.identities import Identity
 from snakesim_testing.harness.endpoint import free_port
+from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER, OWN, SmallLab, opened
-from tests.system.lab.test_matrix import eventually, settle
 
 COMMAND = f"{OWN}/actuator/joints"
 

@@ -6,7 +6,6 @@ The witness holds a router's certificate: everything that the router lets pass r
 on its side, so that only the rules of the other side decide.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -15,6 +14,7 @@ import pytest
 import zenoh
 
 from snakesim_hal.wire.roles import OWN_NAME_ONLY, TABLE, Role
+from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER, OWN, SmallLab
 
 # One key of each line; a gnc has only its own services' names, and `hal` is none of them.
@@ -91,14 +91,6 @@ def seen_by(lab: SmallLab, name: str) -> Seen:
         & set(PLACES)  # other tests have asked for more
         for kind, all_words in REFUSED.items()
     }
-
-
-def eventually(what: Callable[[], Any], wanted: Any) -> None:
-    """The log is read a moment after it is written."""
-    deadline = time.monotonic() + 30.0
-    while (found := what()) != wanted and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert found == wanted
 
 
 @pytest.mark.parametrize("role", [Role.VIEWER, Role.OPERATOR, Role.GNC])
@@ -212,10 +204,3 @@ def answer(query: zenoh.Query) -> None:
 
 def relative(key: object) -> str:
     return str(key).removeprefix(f"{OWN}/")
-
-
-def settle(*sessions: zenoh.Session) -> None:
-    """Until the router has handled what these have sent, and they what it lets pass."""
-    for session in (*sessions, *sessions):
-        list(session.liveliness().get("nobody/is/here", timeout=1.0))  # there and back
-        time.sleep(0.02)

@@ -31,15 +31,14 @@ from snakesim_hal.wire.messages import (
     World,
 )
 from snakesim_hal.wire.quantities import Quaternion
+from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
 from snakesim_testing.hal.local_network import LagBackend, meeting
-from snakesim_testing.hal.small_robots import clock, contact, description, pose, power, run_config, state
+from snakesim_testing.hal.small_robots import contact, pose, power, run_config, state
 from snakesim_testing.hal.strategies import plain_example
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
-ROBOT = description()  # three joints, four links
 X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-CLOCK = clock(3, clock_mode="realtime")
 
 
 def contacts(link: int) -> Contacts:

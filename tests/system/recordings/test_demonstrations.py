@@ -11,7 +11,7 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import SNAKESIM, Running, armed_run, call, environment
 from snakesim_testing.runs.documents import REPOSITORY, UV, needs_uv
 from snakesim_testing.runs.in_process_command import snakesim
-from tests.system.commands.test_teleop import UP, at_the_keyboard
+from snakesim_testing.runs.keyboard import UP, at_the_keyboard
 
 pytestmark = pytest.mark.e2e
 RUN = ("clutter", "--clock-mode", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")

@@ -29,15 +29,11 @@ from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.tap import Tap
-from snakesim_testing.hal import small_robots as rig
 from snakesim_testing.hal.small_robots import PERIOD_NS, description
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.file_size import max_file_size
 from snakesim_testing.harness.wait import wait_until
-
-
-def clock(tick: int) -> Arrival:
-    return Arrival(keys.CLOCK, encode(rig.clock(tick)), format_encoding(Clock), time.monotonic_ns())
+from snakesim_testing.operator.clock_samples import clock
 
 
 class Whisker(OwnSample, frozen=True, kw_only=True):
@@ -95,7 +91,7 @@ from pathlib import Path
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_testing.harness.file_size import max_file_size
-from tests.system.recordings.test_recording import clock
+from snakesim_testing.operator.clock_samples import clock
 recording = Recording(Path(sys.argv[1]))
 for tick in range(10**9):
     recording.write_arrival(clock(tick))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from verification.attack.test_plugins import BAD
+from snakesim_testing.harness.bad_plugins import BAD
 from snakesim_testing.runs.command import run_to_summary, running
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command

@@ -12,7 +12,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState
 from snakesim_operator.results.record import RunRecord
-from tests.system.runs.test_programs import Lab, lab
+from snakesim_testing.runs.lab_programs import Lab
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
 
@@ -21,7 +21,6 @@ pytestmark = pytest.mark.e2e
 # One namespace is a prefix of the other, and the other robot has another number of joints.
 ROBOTS = {"lab": ("planar13", "lateral_undulation", 13), "lab/second": ("mamba", "hold", 18)}
 SECONDS = {"quick": 2, "a million messages": 1000}
-__all__ = ["lab"]
 SCENE = 'name = "plain"\n[ground]\nfriction = 0.5\n'
 SCENARIO = """
 robot = "{robot}"

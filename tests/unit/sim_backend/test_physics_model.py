@@ -16,8 +16,8 @@ from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, Tether
 from snakesim_sim_backend.tether import WINCH_N_S_PER_M
+from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import G, Run, make_config
-from tests.unit.sim_backend.test_start import CURVE, HILLS
 
 ICE = {"ground": {"friction": 0.0}}
 FOUR = {"chain": {"modules": 4}}

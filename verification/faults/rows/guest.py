@@ -19,9 +19,7 @@ from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opc
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.programs import host_program as host_process
-from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
-from snakesim_testing.hal.small_robots import write_files
-from tests.system.can.test_killed import (
+from snakesim_testing.can.listened_bus import (
     JOINTS,
     NODES,
     RATE_HZ,
@@ -33,6 +31,8 @@ from tests.system.can.test_killed import (
     passed_for_module_ms,
     stop_commands,
 )
+from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
+from snakesim_testing.hal.small_robots import write_files
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import START_LIMIT_S, Robot, robot
 from verification.faults.row import Request, Trial

@@ -7,22 +7,10 @@ from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_testing.can.driver_loop import cleared_and_armed_again, loop
+from snakesim_testing.can.module_faults import MODULE_FAULTS
 
 START_TICK = 60
 AT_REST_RAD_S = 0.05
-MODULE_FAULTS = [
-    # asked for, what the driver calls it, seen within so many periods
-    ("mute", "module_silent", 4),
-    ("freeze", "module_frozen", 5),
-    ("reboot", "module_restarted", 14),
-    ("counter", "wrong_counter", 4),
-    ("checksum", "bad_checksum", 4),
-    ("duplicate", "duplicate_node", 4),
-    ("overheat", "module_overheat", 3),
-    ("leak", "module_leak", 3),
-    ("undervoltage", "module_voltage", 3),
-    ("babble", "module_babbling", 3),
-]
 
 
 @pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])

@@ -19,8 +19,8 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from snakesim_testing.can.driver_loop import JOINTS, chain_of, config
+from snakesim_testing.can.module_faults import MODULE_FAULTS
 from snakesim_testing.contract.rig import Rig
-from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
 
 FAILS = 2  # joint_3
 OTHERS = [i for i in range(JOINTS) if i != FAILS]

@@ -20,7 +20,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_testing.can.frames import accelerometer, begin, contact, gyro, health, heartbeat, joint_state, syncs
-from tests.unit.can_backend.driver.test_reading import JOINTS, angles, reading
+from snakesim_testing.can.readings import JOINTS, angles, reading
 
 # --- forces, IMUs, health ----------------------------------------------------------------------------------
 

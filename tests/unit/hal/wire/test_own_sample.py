@@ -1,37 +1,16 @@
 """Messages of sensors of one's own: their schema says what their class does, and what cannot be one is refused."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import pytest
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, WireError
-from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import OwnSample
 from snakesim_hal.wire.own_sample import make_message_schema, parse_custom_message
-
-
-class Skin(OwnSample, frozen=True, kw_only=True):
-    """One of each kind of field."""
-
-    pressed_n: Annotated[list[q.Force | None], Meta(max_length=3)]
-    flow_m_s: q.VelocityVector
-    wet: bool
-    count: Annotated[int, Meta(ge=0, le=9)]
-    state: Literal["cold", "warm"]
-    note: Annotated[str, Meta(max_length=9)] | None = None
-
-
-PLACE: dict[str, Any] = {
-    "tick": 3,
-    "timestamp_ns": 2,
-    "link": 1,
-    "position_l": (0.0, 0.1, 0.0),
-    "orientation_l_wxyz": (1.0, 0.0, 0.0, 0.0),
-}
-GOOD: dict[str, Any] = {"pressed_n": [1.5, None], "flow_m_s": (1.0, 2.0, 3.0), "wet": True, "count": 4, "state": "warm"}
+from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
 
 
 def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_reads_where_and_when() -> None:

@@ -17,8 +17,8 @@ from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import Marker, Transform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
+from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
 from snakesim_testing.hal.strategies import messages_of
-from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 12_345_678_901
