@@ -13,7 +13,7 @@ from snakesim_gnc.control.controller import Controller
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
-from snakesim_hal.model.field_docs import make_schema
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client

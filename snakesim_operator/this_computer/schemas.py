@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.field_docs import make_schema
 from snakesim_hal.model.files import SCHEMAS
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS, find_plugin, list_installed
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
