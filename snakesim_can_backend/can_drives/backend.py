@@ -28,10 +28,16 @@ from snakesim_hal.model.scenario import RunConfig
 class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
     """Settings that every driver type on CAN has."""
 
-    # Buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: emulated drives, here.
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
+    """CAN buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can; empty: emulated drives in this
+    process.
+    """
+
     bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
-    log: str = ""  # candump file of all frames; empty: none
+    """Bit rate of the buses, for which loads are computed and to which adapters are set."""
+
+    log: str = ""
+    """Candump file of all frames; empty: no file is written."""
 
     @property
     def fd_rate(self) -> int | None:

@@ -24,18 +24,30 @@ MIN_LEASE_ROUNDS = 1.5  # readings of a bus in a lease: its joint states have to
 class BodySettings(FileStruct, frozen=True, kw_only=True):
     """Settings that concern a robot as a whole, whatever its drives."""
 
-    pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None  # of motion capture: HOST:PORT
-    physics_model: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.physics_models`
+    pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None
+    """UDP address HOST:PORT at which the pose from motion capture arrives; none: there is no motion capture."""
+
+    physics_model: str = "mujoco"
+    """Body that emulated drives move: `mujoco`, `inertia`, or another installed physics model."""
+
     physics_model_settings: dict[str, Any] = {}
-    mounted: Mapping[str, Mounted] = {}  # of emulated drives: joint -> how it is mounted in truth
+    """Settings of the physics model, which checks them."""
+
+    mounted: Mapping[str, Mounted] = {}
+    """For joints of emulated drives, how each is really mounted, to see what a wrong robot file does."""
 
 
 class DriveSettings(BodySettings, frozen=True, kw_only=True):
     """Settings that every driver type has; a driver type adds its ports."""
 
-    watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1  # of the drives
+    watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1
+    """Time without a setpoint after which a drive stops by itself."""
+
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    decimation: Annotated[int, Meta(ge=1, le=100)] = 1  # control cycles from one reading of a bus to the next
+    """Time limit for finding and configuring all drives at the start."""
+
+    decimation: Annotated[int, Meta(ge=1, le=100)] = 1
+    """Control cycles from one reading of a bus to the next."""
 
 
 def make_body(config: RunConfig, settings: BodySettings, backend: str, pose_address: str | None) -> EmulatedBody:

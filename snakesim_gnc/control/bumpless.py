@@ -16,12 +16,12 @@ import numpy as np
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, JointState
-from snakesim_hal.wire.quantities import about, above
+from snakesim_hal.wire.quantities import above
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 MIN_STIFFNESS_NM_PER_RAD = 1e-9  # avoids a division by zero for joints without a position loop
 
-Blend = Annotated[float, above(10, "s"), about("time over which the command changes smoothly to a new reference")]
+Blend = Annotated[float, above(10, "s")]
 
 
 class HandOver:

@@ -15,7 +15,7 @@ from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, above, bounded, from_zero
+from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 Swing = Annotated[float, bounded(-2, 2, "rad")]
 Lag = Annotated[float, bounded(-3.2, 3.2, "rad")]
@@ -90,13 +90,20 @@ class Sidewinding(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Two waves, a quarter of a period apart; a negative `pitch_rad` travels to the other side."""
 
-        yaw_rad: Annotated[Swing, about("amplitude of the joints that turn left and right")] = 0.6
-        pitch_rad: Annotated[
-            Swing, about("amplitude of the joints that turn up and down; negative: to the other side")
-        ] = 0.2
-        lag_rad: Annotated[Lag, about("phase of a joint behind the one ahead of it")] = 0.45
-        period_s: Annotated[Seconds, about("period of the wave")] = 2.0
-        blend_s: Annotated[Seconds, about("time over which the command changes smoothly to a new reference")] = 1.0
+        yaw_rad: Swing = 0.6
+        """Amplitude of the joints that turn left and right."""
+
+        pitch_rad: Swing = 0.2
+        """Amplitude of the joints that turn up and down; negative: the robot travels to the other side."""
+
+        lag_rad: Lag = 0.45
+        """Phase of a joint behind the one ahead of it."""
+
+        period_s: Seconds = 2.0
+        """Period of the wave."""
+
+        blend_s: Seconds = 1.0
+        """Time over which the command changes smoothly to a new reference."""
 
     def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
         lag_rad = self._set.lag_rad
@@ -113,9 +120,14 @@ class Rolling(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The arc; a negative `bend_rad` of the pitch joints rolls to the other side."""
 
-        bend_rad: Annotated[Swing, about("bend of every joint; negative: to the other side")] = 0.25
-        period_s: Annotated[Seconds, about("period of a turn")] = 2.0
-        blend_s: Annotated[Seconds, about("time over which the command changes smoothly to a new reference")] = 1.0
+        bend_rad: Swing = 0.25
+        """Bend of every joint; negative: the robot rolls to the other side."""
+
+        period_s: Seconds = 2.0
+        """Time of one revolution."""
+
+        blend_s: Seconds = 1.0
+        """Time over which the command changes smoothly to a new reference."""
 
     def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
         reference_rad[self._yaw] = abs(self._set.bend_rad) * math.sin(phase_rad)
@@ -133,12 +145,23 @@ class RaisedHead(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """How high, and how far to each side."""
 
-        lift_rad: Annotated[float, from_zero(1.5, "rad"), about("angle of the joint that lifts the head")] = 0.6
-        look_rad: Annotated[Swing, about("how far the foremost yaw joint looks to each side")] = 0.4
-        stance_rad: Annotated[Swing, about("amplitude of the wave in which the body behind lies")] = 0.5
-        lag_rad: Annotated[Lag, about("phase of that wave from joint to joint")] = 0.6
-        period_s: Annotated[Seconds, about("period of looking to both sides")] = 6.0
-        blend_s: Annotated[Seconds, about("time over which the command changes smoothly to a new reference")] = 2.0
+        lift_rad: Annotated[float, from_zero(1.5, "rad")] = 0.6
+        """Angle of the joint that lifts the head."""
+
+        look_rad: Swing = 0.4
+        """Angle by which the foremost yaw joint looks to each side."""
+
+        stance_rad: Swing = 0.5
+        """Amplitude of the wave in which the body behind lies."""
+
+        lag_rad: Lag = 0.6
+        """Phase of that wave from joint to joint."""
+
+        period_s: Seconds = 6.0
+        """Time for looking to both sides."""
+
+        blend_s: Seconds = 2.0
+        """Time over which the command changes smoothly to a new reference."""
 
     def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
         # Positive pitch bends the head down. With one pitch joint only, nothing keeps the head level.

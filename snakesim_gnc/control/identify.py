@@ -14,7 +14,7 @@ from typing import Annotated
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, bounded
+from snakesim_hal.wire.quantities import bounded
 
 MARGIN_RAD = 0.02  # between a target and the joint's limit
 SPEED_RATIO = 0.8  # of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself
@@ -49,16 +49,23 @@ class Identify:
     class Settings(FileStruct, frozen=True):
         """How far and how fast."""
 
-        swing_rad: Annotated[float, bounded(0.01, 0.5, "rad"), about("slow motion to either side")] = 0.25
-        swing_s: Annotated[
-            float, bounded(0.5, 60.0, "s"), about("period of the fastest slow motion, there and back")
-        ] = 2.0
-        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad"), about("maximum of the sum of all tones")] = 0.05
-        shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz"), about("highest tone; the lowest is a tenth")] = 6.0
-        shake_after_s: Annotated[
-            float, bounded(0.0, 600.0, "s"), about("time with the slow motion alone, before the shaking")
-        ] = 6.0
-        fade_s: Annotated[float, bounded(0.1, 10.0, "s"), about("time until each motion reaches its full size")] = 0.5
+        swing_rad: Annotated[float, bounded(0.01, 0.5, "rad")] = 0.25
+        """Amplitude of the slow motion."""
+
+        swing_s: Annotated[float, bounded(0.5, 60.0, "s")] = 2.0
+        """Period of the fastest slow motion, there and back."""
+
+        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad")] = 0.05
+        """Maximum of the sum of all tones."""
+
+        shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz")] = 6.0
+        """Frequency of the highest tone; that of the lowest is a tenth of it."""
+
+        shake_after_s: Annotated[float, bounded(0.0, 600.0, "s")] = 6.0
+        """Time with the slow motion alone, before the shaking."""
+
+        fade_s: Annotated[float, bounded(0.1, 10.0, "s")] = 0.5
+        """Time until each motion reaches its full size."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot

@@ -10,7 +10,7 @@ from typing import Annotated
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, bounded
+from snakesim_hal.wire.quantities import bounded
 
 MARGIN_RAD = 0.02  # between a target and the joint's limit
 
@@ -31,16 +31,17 @@ class JointCheck:
     class Settings(FileStruct, frozen=True):
         """How far, how fast, and when to give up."""
 
-        move_rad: Annotated[float, bounded(0.01, 0.2, "rad"), about("how far each joint moves to either side")] = 0.06
-        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("speed of a target")] = 0.3
-        give_up_rad: Annotated[
-            float,
-            bounded(0.02, 0.5, "rad"),
-            about("a joint that has not moved when its target is so far away is left, and the next one follows"),
-        ] = 0.15
-        rest_s: Annotated[
-            float, bounded(0.02, 5.0, "s"), about("rest before each of its two motions, and after them")
-        ] = 0.15
+        move_rad: Annotated[float, bounded(0.01, 0.2, "rad")] = 0.06
+        """Angle by which each joint moves to either side."""
+
+        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s")] = 0.3
+        """Speed of a joint's target."""
+
+        give_up_rad: Annotated[float, bounded(0.02, 0.5, "rad")] = 0.15
+        """Distance of the target at which a joint that has not moved is given up, and the next one follows."""
+
+        rest_s: Annotated[float, bounded(0.02, 5.0, "s")] = 0.15
+        """Rest before each of a joint's two motions, and after them."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot

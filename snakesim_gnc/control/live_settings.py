@@ -13,6 +13,7 @@ from snakesim_gnc.control.controller import Controller
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
@@ -143,6 +144,6 @@ def _to_json(settings: Any) -> str:
 def _make_schema(settings_type: type[msgspec.Struct]) -> str:
     """Return the JSON Schema of settings. For a type that has none it is empty, which allows anything."""
     try:
-        return msgspec.json.encode(msgspec.json.schema(settings_type)).decode()
+        return msgspec.json.encode(make_schema(settings_type)).decode()
     except (TypeError, ValueError):
         return "{}"

@@ -42,7 +42,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, Mode, World, WorldContact
-from snakesim_hal.wire.quantities import about, above, from_zero
+from snakesim_hal.wire.quantities import above, from_zero
 
 OTHER_SHAPE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
 SLOPE_STEP_M = 0.02  # step of the finite difference for theta'
@@ -80,72 +80,71 @@ class ObstacleAided:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Parameters; the bound of the look-ahead limits how hard the shape pushes."""
 
-        speed_kp_s: Annotated[
-            float, from_zero(5, "s"), about("look-ahead of the shape for each m/s that the speed is too low")
-        ] = 0.2
-        integral_per_s: Annotated[
-            float, from_zero(50, "1/s"), about("how fast the look-ahead grows while the speed stays too low")
-        ] = 0.4
-        max_look_ahead_m: Annotated[
-            float, from_zero(1, "m"), about("bound of the look-ahead: how far ahead on its path the shape is at most")
-        ] = 0.05
-        fresh_look_ahead_m: Annotated[
-            float, from_zero(1, "m"), about("look-ahead with which it begins on a new path")
-        ] = 0.01
-        push_scale: Annotated[
-            float, Meta(ge=-1, le=1), about("factor of both pushing terms, for control experiments; below 0: backward")
-        ] = 1.0
-        push_sign_s: Annotated[
-            float,
-            from_zero(100, "s"),
-            about("for control experiments: after each such time the sign of the push is drawn at random; 0: never"),
-        ] = 0.0
-        speed_kp_n_s_per_m: Annotated[
-            float, from_zero(1000, "N*s/m"), about("push on obstacles for each m/s that the speed is too low")
-        ] = 25.0
-        lag_kp_n_per_m: Annotated[
-            float, from_zero(1000, "N/m"), about("push on obstacles for each metre that the body has fallen behind")
-        ] = 60.0
-        max_push_n: Annotated[float, from_zero(1000, "N"), about("bound of the push along the path")] = 60.0
-        max_torque_nm: Annotated[
-            float,
-            from_zero(1000, "N*m"),
-            about("bound of a joint's torque for pushing"),
-        ] = 5.0
-        max_contact_n: Annotated[float, above(1000, "N"), about("bound of the desired force on one contact")] = 60.0
-        reach_m: Annotated[float, above(1, "m"), about("an obstacle so near to the body is pushed")] = 0.03
-        contact_gap_scale_m: Annotated[
-            float, above(1, "m"), about("gap to an obstacle at which a contact counts half")
-        ] = 0.005
-        push_filter_s: Annotated[
-            float, above(5, "s"), about("time constant of the filter of how the push is shared among contacts")
-        ] = 0.05
-        torque_filter_s: Annotated[
-            float, above(5, "s"), about("time constant of the filter of the pushing torques")
-        ] = 0.03
-        search_after_s: Annotated[
-            float,
-            from_zero(1000, "s"),
-            about("after so long with less than 2 cm of advance the body searches for contacts by a wave; 0: never"),
-        ] = 1.2
-        search_s: Annotated[
-            float, above(1000, "s"), about("duration of a search, after which the body tries its path again")
-        ] = 30.0
+        speed_kp_s: Annotated[float, from_zero(5, "s")] = 0.2
+        """Look-ahead of the shape for each m/s that the speed is too low."""
+
+        integral_per_s: Annotated[float, from_zero(50, "1/s")] = 0.4
+        """Rate at which the look-ahead grows while the speed stays too low."""
+
+        max_look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.05
+        """Maximum look-ahead of the shape along its path; it limits how hard the shape pushes."""
+
+        fresh_look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.01
+        """Look-ahead at the start of a new path."""
+
+        push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0
+        """Factor of both pushing terms, for control experiments; negative: backward."""
+
+        push_sign_s: Annotated[float, from_zero(100, "s")] = 0.0
+        """Time after which the sign of the push is drawn at random again, for control experiments; 0: never."""
+
+        speed_kp_n_s_per_m: Annotated[float, from_zero(1000, "N·s/m")] = 25.0
+        """Push on obstacles for each m/s that the speed is too low."""
+
+        lag_kp_n_per_m: Annotated[float, from_zero(1000, "N/m")] = 60.0
+        """Push on obstacles for each meter that the body has fallen behind."""
+
+        max_push_n: Annotated[float, from_zero(1000, "N")] = 60.0
+        """Maximum push along the path."""
+
+        max_torque_nm: Annotated[float, from_zero(1000, "N·m")] = 5.0
+        """Maximum torque of a joint for pushing."""
+
+        max_contact_n: Annotated[float, above(1000, "N")] = 60.0
+        """Maximum desired force on one contact."""
+
+        reach_m: Annotated[float, above(1, "m")] = 0.03
+        """Maximum gap between the body and an obstacle that is pushed."""
+
+        contact_gap_scale_m: Annotated[float, above(1, "m")] = 0.005
+        """Gap to an obstacle at which a contact counts half."""
+
+        push_filter_s: Annotated[float, above(5, "s")] = 0.05
+        """Time constant of the filter of how the push is shared among contacts."""
+
+        torque_filter_s: Annotated[float, above(5, "s")] = 0.03
+        """Time constant of the filter of the pushing torques."""
+
+        search_after_s: Annotated[float, from_zero(1000, "s")] = 1.2
+        """Time with less than 2 cm of advance after which the body searches for contacts by a wave; 0: never."""
+
+        search_s: Annotated[float, above(1000, "s")] = 30.0
+        """Duration of a search, after which the body tries its path again."""
+
         blend_s: Blend = 0.3
+        """Time over which the command changes smoothly to a new reference."""
+
         speed_filter_s: SpeedFilter = 0.05
-        no_contact_cost: Annotated[
-            float,
-            from_zero(1000, "1"),
-            about("added cost of a force on an obstacle without measured contact; 0: it costs as much as on others"),
-        ] = 10.0
-        shape_nm_per_rad: Annotated[
-            float,
-            from_zero(1000, "N*m/rad"),
-            about("stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are"),
-        ] = 1.5
-        shape_nm_s_per_rad: Annotated[
-            float, from_zero(1000, "N*m*s/rad"), about("damping of the shape in torque mode")
-        ] = 0.1
+        """Time constant of the filter of the speed along the path; 0: no filter."""
+
+        no_contact_cost: Annotated[float, from_zero(1000, "1")] = 10.0
+        """Additional cost of a force on an obstacle without measured contact; 0: it costs as much as on others."""
+
+        shape_nm_per_rad: Annotated[float, from_zero(1000, "N·m/rad")] = 1.5
+        """Stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are."""
+
+        shape_nm_s_per_rad: Annotated[float, from_zero(1000, "N·m·s/rad")] = 0.1
+        """Damping of the shape in torque mode."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot

@@ -18,7 +18,7 @@ from snakesim_gnc.control.progress import PathProgress, SpeedFilter
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, from_zero
+from snakesim_hal.wire.quantities import from_zero
 
 
 class PathFollowing:
@@ -27,13 +27,14 @@ class PathFollowing:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
 
-        look_ahead_m: Annotated[
-            float,
-            from_zero(1, "m"),
-            about("how far ahead on its path the shape is at most"),
-        ] = 0.03
+        look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.03
+        """Maximum look-ahead of the shape along its path."""
+
         blend_s: Blend = 0.3
+        """Time over which the command changes smoothly to a new reference."""
+
         speed_filter_s: SpeedFilter = 0.03
+        """Time constant of the filter of the speed along the path; 0: no filter."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._set = settings

@@ -20,7 +20,6 @@ from snakesim_hal.model.files import SHIPPED, FileStruct, expand_home
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_hal.wire.quantities import about
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 RUNTIME: Any = None
@@ -106,7 +105,8 @@ class Policy:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The model."""
 
-        model: Annotated[str, Meta(min_length=1, max_length=1024), about("shipped name, or path of an ONNX file")]
+        model: Annotated[str, Meta(min_length=1, max_length=1024)]
+        """Name of a shipped model, or path of an ONNX file."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         """Load the model. Raises ConfigError if it does not fit the robot."""

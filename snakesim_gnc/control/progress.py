@@ -15,11 +15,9 @@ from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_ins
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Trajectory, World
-from snakesim_hal.wire.quantities import about, from_zero
+from snakesim_hal.wire.quantities import from_zero
 
-SpeedFilter = Annotated[
-    float, from_zero(1, "s"), about("time constant of the filter of the speed along the path; 0: none")
-]
+SpeedFilter = Annotated[float, from_zero(1, "s")]
 RELOCALIZE_STEPS = 8  # iterations for a body that may have slid while its position was unknown
 
 

@@ -18,16 +18,12 @@ from snakesim_gnc.control.standstill import Standstill
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, above, bounded, from_zero
+from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 AIM_DISTANCE_M = 1.0  # how far ahead on the path the head steers for
 JAMMED_M = 0.02  # a body that moves less than this within `jam_after_s` is jammed
 
-Steering = Annotated[
-    float,
-    from_zero(2, "1"),
-    about("bend of all joints for each radian that the path leads aside; 0: no steering"),
-]
+Steering = Annotated[float, from_zero(2, "1")]
 
 
 def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float:
@@ -53,15 +49,20 @@ class LateralUndulation:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Parameters of the wave, and how much it bends towards the path."""
 
-        amplitude_rad: Annotated[float, from_zero(2, "rad"), about("swing of every joint to each side")] = 0.5
-        period_s: Annotated[float, above(100, "s"), about("period of the wave")] = 2.0
-        lag_rad: Annotated[
-            float,
-            bounded(-3.2, 3.2, "rad"),
-            about("phase of a joint behind the one ahead of it; below 0 the wave travels to the head"),
-        ] = 0.9
+        amplitude_rad: Annotated[float, from_zero(2, "rad")] = 0.5
+        """Amplitude of every joint."""
+
+        period_s: Annotated[float, above(100, "s")] = 2.0
+        """Period of the wave."""
+
+        lag_rad: Annotated[float, bounded(-3.2, 3.2, "rad")] = 0.9
+        """Phase of a joint behind the one ahead of it; negative: the wave travels to the head."""
+
         steering: Steering = 0.0
+        """Bend of all joints for each radian that the path leads aside; 0: no steering."""
+
         blend_s: Blend = 1.0
+        """Time over which the command changes smoothly to a new reference."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
@@ -128,6 +129,7 @@ class HeadSteeredUndulation(LateralUndulation):
         """Parameters of lateral undulation, with steering."""
 
         steering: Steering = 0.8
+        """Bend of all joints for each radian that the path leads aside; 0: no steering."""
 
 
 class CompliantUndulation(HeadSteeredUndulation):
@@ -144,18 +146,17 @@ class CompliantUndulation(HeadSteeredUndulation):
     class Settings(HeadSteeredUndulation.Settings, frozen=True, kw_only=True):
         """Parameters of head-steered undulation, with a softness."""
 
-        softness_rad_per_nm: Annotated[
-            float,
-            from_zero(10, "rad/(N*m)"),
-            about("how far the amplitude yields to the torque that obstacles put on the wave"),
-        ] = 0.05
-        yield_s: Annotated[float, above(10, "s"), about("time constant with which the amplitude yields")] = 0.2
-        jam_after_s: Annotated[
-            float,
-            from_zero(1000, "s"),
-            about("after so long with less than 2 cm of advance the wave travels the other way; 0: never"),
-        ] = 0.0
-        back_s: Annotated[float, above(1000, "s"), about("how long the wave then travels the other way")] = 1.0
+        softness_rad_per_nm: Annotated[float, from_zero(10, "rad/(N·m)")] = 0.05
+        """Change of the amplitude for the torque that obstacles put on the wave."""
+
+        yield_s: Annotated[float, above(10, "s")] = 0.2
+        """Time constant with which the amplitude yields."""
+
+        jam_after_s: Annotated[float, from_zero(1000, "s")] = 0.0
+        """Time with less than 2 cm of advance after which the wave travels the other way; 0: never."""
+
+        back_s: Annotated[float, above(1000, "s")] = 1.0
+        """Time for which the wave then travels the other way."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         super().__init__(robot, settings)

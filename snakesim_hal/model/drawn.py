@@ -15,9 +15,14 @@ from snakesim_hal.model.scenario import Override
 class Draw(FileStruct, frozen=True, kw_only=True):
     """A uniform distribution of one value, which all keys in `set` get; the number of a random scene decides it."""
 
-    set: Annotated[list[str], Meta(min_length=1)]  # dotted keys
+    set: Annotated[list[str], Meta(min_length=1)]
+    """Dotted keys that all get the same random value, such as `scene.ground.friction`."""
+
     low: float
+    """Lower bound of the value, in the unit of the keys."""
+
     high: float
+    """Upper bound of the value, in the unit of the keys."""
 
     def __post_init__(self) -> None:
         """Check the bounds. Raises ValueError, for the file reader."""

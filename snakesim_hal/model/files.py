@@ -7,7 +7,7 @@ value, the file or flag that it came from.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -25,6 +25,9 @@ MAX_SHOWN_TEXT = 40  # characters of a damaged text in an error
 
 class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """Base of everything that is read from a file: an unknown field is an error, so that typos are not ignored."""
+
+    # Sections for all to which this one contains exceptions: it has their fields, and None means the value for all.
+    exceptions_to: ClassVar[tuple[type[msgspec.Struct], ...]] = ()
 
 
 @dataclass

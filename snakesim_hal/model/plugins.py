@@ -25,6 +25,7 @@ from snakesim_hal.model.textfiles import read_bytes
 BACKENDS = "snakesim.backends"
 COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
+FILES = "snakesim.files"  # Structs of the kinds of files that only a feature reads, such as suites
 FILMS = "snakesim.films"
 PHYSICS_MODELS = "snakesim.physics_models"
 SENSORS = "snakesim.sensors"

@@ -23,23 +23,38 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
+    """Seed of the positions, sizes and leans; the same seed gives the same obstacles."""
 
-    # Corners of the rectangle that contains the centers of all obstacles.
     min_corner_m: Point
+    """Corner with the smallest coordinates of the rectangle that contains the centers of all obstacles, as [x, y]."""
+
     max_corner_m: Point
+    """Corner with the largest coordinates of that rectangle, as [x, y]."""
+
     density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
+    """Number of obstacles for each square meter of the rectangle."""
 
     # Sizes: minimum and maximum.
-    radius_m: tuple[Size, Size]  # of a peg
-    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0  # mean fraction of blocks; the other obstacles are pegs
-    box_size_m: tuple[Size, Size] = (0.06, 0.18)  # length and width of a block
+    radius_m: tuple[Size, Size]
+    """Minimum and maximum of the radius of a peg."""
 
-    clearance_m: Clearance  # minimum gap between the surfaces of two obstacles
-    route_clearance_m: Clearance | None = None  # minimum gap between the route and a surface; none: no such gap
+    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    """Mean fraction of blocks among the obstacles; the others are pegs."""
+
+    box_size_m: tuple[Size, Size] = (0.06, 0.18)
+    """Minimum and maximum of the length and of the width of a block."""
+
+    clearance_m: Clearance
+    """Minimum gap between the surfaces of two obstacles."""
+
+    route_clearance_m: Clearance | None = None
+    """Minimum gap between the route and the surface of an obstacle; none: no such gap."""
+
     height_m: Size = 0.2
+    """Height of every obstacle."""
 
-    # Each obstacle leans by a random angle of at most this, in a random direction.
     lean_up_to_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
+    """Maximum angle by which an obstacle leans, in a random direction; 0: all are upright."""
 
     @property
     def wanted(self) -> int:

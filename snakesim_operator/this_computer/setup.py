@@ -17,6 +17,7 @@ def add_files(commands: Any) -> None:
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     add_scenario(config)
+    config.add_argument("--explain", metavar="KEY", help="show what one key or table means, and what it may be")
     add_json(config)
     config.set_defaults(act=_config)
 
@@ -45,6 +46,11 @@ def _scenarios(arguments: argparse.Namespace) -> int:
 
 
 def _config(arguments: argparse.Namespace) -> int:
+    if arguments.explain is not None:
+        from snakesim_operator.this_computer.explain import explain_key
+
+        return explain_key(load_scenario(arguments), arguments.explain, as_json=arguments.json)
+
     from snakesim_operator.this_computer.scenario_files import show_config
 
     return show_config(load_scenario(arguments), as_json=arguments.json)

@@ -29,6 +29,7 @@ class RecordedDepth:
         """The recording."""
 
         file: Annotated[str, Meta(min_length=1)]
+        """File of the recording, with lines as `snakesim echo sensor/depth/NAME` prints them."""
 
     message = DepthImage
 

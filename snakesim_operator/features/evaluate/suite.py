@@ -53,26 +53,62 @@ class SuiteRow(FileStruct, frozen=True, kw_only=True):
     """A setting with a name: `[[row]]`."""
 
     name: Annotated[str, Meta(min_length=1, max_length=80)]
+    """Name of the row in the table of results."""
+
     set: dict[str, Any] = {}
+    """Values that this row sets, as with `--set`, over those of the suite."""
+
     unset: list[str] = []
+    """Optional keys that this row removes, such as `robot.sensors.pose`."""
+
     without: list[str] = []
+    """Keys that no [[draw]] of the suite sets in this row."""
 
 
 class Suite(FileStruct, frozen=True, kw_only=True):
     """A whole suite file."""
 
     title: str = ""
+    """Description in one line, which lists of suites show."""
+
     scenario: Annotated[str, Meta(min_length=1)]
+    """Scenario that all cases begin with: the name of a shipped one, or a path."""
+
     fields: Count = 20
+    """Number of fields for each row and controller, unless `--fields` gives another; a field is the seed of a run and
+    of its random scene.
+    """
+
     controllers: list[str] = []
+    """Controllers to try, unless `--controllers` gives others; empty: that of the scenario."""
+
     give_up_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 12.0
+    """Robot time without 3 cm of advance after which a run is ended as stuck."""
+
     limit_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 1800.0
+    """Wall time of one run after which it is stopped, and counts as an error."""
+
     set: dict[str, Any] = {}
+    """Values that every row sets, as with `--set`."""
+
     unset: list[str] = []
+    """Optional keys that every row removes."""
+
     vary: dict[str, list[Any] | str] = {}
+    """For each key its values, as a list or as "LOW:HIGH:COUNT"; every combination of the values is a row."""
+
     row: list[SuiteRow] = []
+    """Rows with a name, each an entry `[[row]]`, combined with every combination of `vary`; empty: only these
+    combinations.
+    """
+
     draw: list[Draw] = []
-    fresh: bool = False  # new fields are drawn for every evaluation, unless --seed gives the first one
+    """Random values, each an entry `[[draw]]`; a value is the same for every row and controller of one field."""
+
+    fresh: bool = False
+    """True: every evaluation has new fields, unless `--seed` gives the first one; false: fields begin at the same
+    number.
+    """
 
 
 @dataclass(frozen=True)

@@ -28,39 +28,71 @@ Days = Annotated[float, Meta(gt=0, le=825, extra_json_schema={"unit": "days"})]
 class Machine(FileStruct, frozen=True, kw_only=True):
     """A computer of the lab."""
 
-    address: Address | None = None  # that others reach it at; a router's machine needs one
-    folder: Folder = "/etc/snakesim"  # where its rendered files are installed
-    user: Name = "snakesim"  # whom the services run as
+    address: Address | None = None
+    """Address at which other machines reach this one; a router's machine needs one."""
+
+    folder: Folder = "/etc/snakesim"
+    """Folder in which its rendered files are installed."""
+
+    user: Name = "snakesim"
+    """User account that runs the services."""
+
     program: Folder = "/opt/snakesim/bin/snakesim"
-    device_groups: list[Name] = msgspec.field(default_factory=lambda: ["dialout"])  # that may open its serial ports
+    """Path of the `snakesim` command on this machine."""
+
+    device_groups: list[Name] = msgspec.field(default_factory=lambda: ["dialout"])
+    """Groups of the system that may open its serial ports."""
 
 
 class Router(FileStruct, frozen=True, kw_only=True):
     """A Zenoh router."""
 
     machine: Name
+    """Machine that the router runs on."""
+
     port: PortNumber = 7447
+    """TCP port at which the router listens."""
 
 
 class Grant(FileStruct, frozen=True, kw_only=True):
     """What a machine is to a robot: one certificate, one session file."""
 
     machine: Name
+    """Machine that gets the role, with one certificate and one session file."""
+
     role: Literal["gnc", "operator", "viewer", "recorder", "administrator"]
-    robot: Name  # or `all`
-    services: list[Name] = msgspec.field(default_factory=lambda: list(GNC_SERVICES))  # of a gnc
+    """Role of the machine: what it may publish, read and ask, see schemas/roles.md."""
+
+    robot: Name
+    """Robot that the role is for, or `all`; a gnc has one robot."""
+
+    services: list[Name] = msgspec.field(default_factory=lambda: list(GNC_SERVICES))
+    """Services that a gnc runs; other roles ignore it."""
 
 
 class LabFile(FileStruct, frozen=True, kw_only=True):
     """A whole lab file."""
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9 _.-]+$")]
-    certificate_days: Days = 30  # of the certificates; short, because nothing revokes them
+    """Name of the lab, which its certificates contain."""
+
+    certificate_days: Days = 30
+    """Lifetime of a machine's certificate; short, because certificates are not revoked."""
+
     authority_days: Annotated[float, from_zero(7300, "days")] = 1825
+    """Lifetime of the lab's certificate authority."""
+
     machines: dict[Name, Machine]
+    """Computers by name, as sections such as `[machines.bench]`."""
+
     routers: dict[Name, Router]
+    """Zenoh routers by name, as sections such as `[routers.main]`; a lab has at least one."""
+
     robots: dict[Name, LabRobot]
+    """Robots by name, as sections such as `[robots.snake]`."""
+
     roles: list[Grant] = []
+    """Roles of the machines, each an entry `[[roles]]`."""
 
 
 @dataclass(frozen=True)
