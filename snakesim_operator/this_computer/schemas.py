@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.controller import load_controller
 from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_plugin, list_installed
 from snakesim_hal.model.robot import RobotFile
@@ -61,11 +62,18 @@ def contract() -> Iterator[tuple[str, str]]:
     yield "files/scene.json", _schema(SceneFile)
     yield "files/run.json", _schema(RunConfig)
     yield "files/summary.json", _schema(RunSummary)
-    for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control")):
-        for name in list_installed(group):
-            plugin = find_plugin(group, name)
-            if plugin.__module__.startswith("snakesim_"):
-                yield f"files/{section}.{name}.json", _schema(plugin.Settings)
+    for name in list_installed(BACKENDS):
+        backend = find_plugin(BACKENDS, name)
+        if _is_shipped(backend):
+            yield f"files/backends.{name}.json", _schema(backend.Settings)
+    for name in list_installed(CONTROLLERS):
+        controller = load_controller(name)
+        if _is_shipped(controller):
+            yield f"files/control.{name}.json", _schema(controller.Parameters)
+
+
+def _is_shipped(plugin: type) -> bool:
+    return plugin.__module__.startswith("snakesim_")
 
 
 def _schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -> str:

@@ -23,7 +23,7 @@ from tests.harness.wait import wait_until
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[2] / "examples" / "steer.py"
 UP, LEFT = b"\x1b[A", b"\x1b[D"
-NOTHING = Intent(timestamp_ns=0, who="nobody")
+NOTHING = Intent(timestamp_ns=0, requester="nobody")
 
 
 class Terminal:
