@@ -2,26 +2,30 @@
 
 import time
 
-from snakesim_gnc.control.controller import Action, View
 from snakesim_gnc.control.hold import Hold
+from snakesim_hal.controller import Controller, ControllerCommand, NoParameters, Observation
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 
 
-class Stamped:
+class StampedParameters(FileStruct, frozen=True, kw_only=True):
+    """The file to write to."""
+
+    path: str
+
+
+class Stamped(Controller[StampedParameters]):
     """`--controller benchmarks/stamped.py:Stamped --set control.path=FILE`."""
 
-    class Settings(FileStruct, frozen=True, kw_only=True):
-        """Where to write to."""
+    Parameters = StampedParameters
 
-        path: str
+    def __init__(self, robot: Description, parameters: StampedParameters) -> None:
+        super().__init__(robot, parameters)
+        self._hold = Hold(robot, NoParameters())
+        self._file = open(parameters.path, "w", buffering=1, encoding="ascii")  # noqa: PTH123, SIM115 - open until the end
 
-    def __init__(self, robot: Description, settings: Settings) -> None:
-        self._hold = Hold(robot, Hold.Settings())
-        self._file = open(settings.path, "w", buffering=1, encoding="ascii")  # noqa: PTH123, SIM115 - open until the end
-
-    def update(self, view: View) -> Action:
-        """The pose of the start, for ever."""
-        action = self._hold.update(view)
+    def update(self, observation: Observation) -> ControllerCommand:
+        """Return setpoints that hold the first pose, and write down the time."""
+        command = self._hold.update(observation)
         self._file.write(f"{time.time():.6f}\n")
-        return action
+        return command

@@ -5,9 +5,9 @@
     result = snakesim.run("triplet", duration=8, set={"control.propulsion_n": 35})
     result["angle_rad"], result.metrics["path_distance_m"], result.plot("torque_nm")
 
-`run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running. `View`, `Action`,
-`Report`, `positions` and `Settings` are for controllers. `docs/python.md` is the reference. Nothing of SnakeSIM imports
-this package.
+`run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running.
+`Controller` is the base class of controllers; `Observation`, `ControllerCommand`, `Telemetry`, `Parameters` and
+`positions` go with it. `docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
 
 Names are loaded when they are first used. A program that imports this package before NumPy computes as `snakesim run`
 does, so that one seed gives one digest; one that has imported NumPy already gets its runs from a child process.
@@ -30,33 +30,35 @@ if TYPE_CHECKING:
     from snakesim.result import Result
     from snakesim.robot import Robot
     from snakesim.runs import run
-    from snakesim_gnc.control.controller import Action, Report, View, positions
-    from snakesim_hal.model.files import FileStruct as Settings
+    from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
+    from snakesim_hal.model.files import FileStruct as Parameters
 
 __all__ = [
-    "Action",
     "ConfigError",
+    "Controller",
+    "ControllerCommand",
     "ControllerError",
     "NotConnectedError",
+    "Observation",
+    "Parameters",
     "RefusedError",
-    "Report",
     "Result",
     "Robot",
-    "Settings",
     "SnakesimError",
     "StalledError",
-    "View",
+    "Telemetry",
     "positions",
     "run",
 ]
-CONTROLLER = "snakesim_gnc.control.controller"
+CONTROLLER = "snakesim_hal.controller"
 LAZY = {
-    "Action": (CONTROLLER, "Action"),
-    "Report": (CONTROLLER, "Report"),
+    "Controller": (CONTROLLER, "Controller"),
+    "ControllerCommand": (CONTROLLER, "ControllerCommand"),
+    "Observation": (CONTROLLER, "Observation"),
+    "Parameters": ("snakesim_hal.model.files", "FileStruct"),
     "Result": ("snakesim.result", "Result"),
     "Robot": ("snakesim.robot", "Robot"),
-    "Settings": ("snakesim_hal.model.files", "FileStruct"),
-    "View": (CONTROLLER, "View"),
+    "Telemetry": (CONTROLLER, "Telemetry"),
     "positions": (CONTROLLER, "positions"),
     "run": ("snakesim.runs", "run"),
 }

@@ -15,9 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from snakesim_gnc.control.controller import positions
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, suggest_word
 from snakesim_hal.base.process import get_user_name
+from snakesim_hal.controller import positions
 from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import find_mismatch
@@ -42,7 +42,12 @@ from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots
 from snakesim_operator.recording.process import record_to_file
 from snakesim_operator.robot_commands.command import request_while_driving
-from snakesim_operator.robot_commands.parameters import Parameter, change_parameters, read_parameters, read_settings
+from snakesim_operator.robot_commands.parameters import (
+    Parameter,
+    change_parameters,
+    read_parameters,
+    read_parameters_in_force,
+)
 from snakesim_operator.robot_commands.stop import estop
 
 CONNECT_TIMEOUT_S = 5.0  # a robot may be starting
@@ -225,7 +230,9 @@ class Robot:
         clock = self._control.wait()
         if self._armed and clock.lifecycle != "armed":
             self._armed = False
-            raise RefusedError(f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.why}")
+            raise RefusedError(
+                f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}"
+            )
         return clock.timestamp_ns * 1e-9
 
     def command(self, angles_rad: Sequence[float] | RequestedSetpoints) -> None:
@@ -259,14 +266,14 @@ class Robot:
         control = self._start_commanding()
 
         def explain_not_armed() -> str:
-            return f"not armed: {self.status.why}"
+            return f"not armed: {self.status.reason}"
 
         control.turn_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
         previous_session = self._clock.arm_session
         self._send_request(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
         control.turn_until(lambda: self._clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed)
         if self._clock.lifecycle != "armed":
-            raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")
+            raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.reason}")
         self._armed = True
 
     def disarm(self) -> None:
@@ -275,7 +282,7 @@ class Robot:
         Raises:
             RefusedError: The robot refuses, or does not confirm.
         """
-        self._send_request(LifecycleRequest(action="disarm", who=get_user_name()), "disarmed")
+        self._send_request(LifecycleRequest(action="disarm", requester=get_user_name()), "disarmed")
         self._armed = False
 
     def reset_fault(self) -> None:
@@ -284,7 +291,7 @@ class Robot:
         Raises:
             RefusedError: The cause is still present, or the robot does not confirm.
         """
-        self._send_request(LifecycleRequest(action="clear", who=get_user_name()), "cleared")
+        self._send_request(LifecycleRequest(action="clear", requester=get_user_name()), "cleared")
 
     def estop(self) -> None:
         """Trigger the emergency stop, over the stop port and over the network.
@@ -306,7 +313,7 @@ class Robot:
         Raises:
             NotConnectedError: No controller is running.
         """
-        parameters = read_parameters(read_settings(self._session))
+        parameters = read_parameters(read_parameters_in_force(self._session))
         return {f"control.{parameter.name}": parameter for parameter in parameters}
 
     def set(self, changes: Mapping[str, Any]) -> None:

@@ -20,9 +20,9 @@ import numpy as np
 from snakesim_drivers.emulation.emulated_body import EmulatedBody, SharedPhysics, make_physics_model
 from snakesim_drivers.emulation.mounted import Mounted
 from snakesim_drivers.kit.drive_settings import BodySettings
-from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.identify import Identify
+from snakesim_gnc.control.identify import Identify, IdentifyParameters
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import Observation
 from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
@@ -234,7 +234,7 @@ def _shaken(
     robot = describe_robot(
         config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
     )
-    controller = Identify(robot, msgspec.convert(config.control_settings, Identify.Settings))
+    controller = Identify(robot, msgspec.convert(config.controller_parameters, IdentifyParameters))
     noise = np.random.default_rng(config.seed).standard_normal
     sensor = config.robot.sensors.joints
     sigma = np.array([sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm])
@@ -268,7 +268,7 @@ def _shaken(
             valid=[True] * len(joints),
             age_ns=[0] * len(joints),
         )
-        view = View(tick, tick * period_s, period_s, joint_state, None, None)
+        view = Observation(tick, tick * period_s, period_s, joint_state, None, None)
         target = list(controller.update(view).setpoints.target)
         for name, values in zip(rows, (angle, velocity, torque, target), strict=True):
             rows[name].append(values)

@@ -86,7 +86,7 @@ def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> N
             channel.send_request(make_arm_request(robot, "paths"))
             asked = True
         if time.monotonic() > deadline:
-            raise TimeoutError(f"not done: {status and status.why}")
+            raise TimeoutError(f"not done: {status and status.reason}")
         time.sleep(0.02)
     channel.close()
 

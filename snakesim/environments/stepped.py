@@ -86,7 +86,7 @@ class SteppedRobot:
         return self._cycle.safety.state
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Why the robot is in this state."""
         return self._cycle.safety.reason
 

@@ -13,9 +13,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.observations import ObservationPart, Observer, make_parts, select_parts
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.model.files import SHIPPED, FileStruct, expand_home
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes
@@ -97,24 +97,28 @@ def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts:
             raise metadata.make_error(OBSERVATIONS, ",".join(parts), allowed)
 
 
-class Policy:
+class PolicyParameters(FileStruct, frozen=True, kw_only=True):
+    """The model."""
+
+    model: Annotated[str, Meta(min_length=1, max_length=1024)]
+    """Name of a shipped model, or path of an ONNX file."""
+
+
+class Policy(Controller[PolicyParameters]):
     """Runs the model every `snakesim.frame_skip` ticks, and repeats its targets in between."""
 
-    NEEDS, SENSES = "joints", True
+    needs_world = False
+    uses_sensors = True
 
-    class Settings(FileStruct, frozen=True, kw_only=True):
-        """The model."""
+    Parameters = PolicyParameters
 
-        model: Annotated[str, Meta(min_length=1, max_length=1024)]
-        """Name of a shipped model, or path of an ONNX file."""
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
+    def __init__(self, robot: Description, parameters: PolicyParameters) -> None:
         """Load the model. Raises ConfigError if it does not fit the robot."""
-        self._robot = robot
+        super().__init__(robot, parameters)
         self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
 
         # The model.
-        self._model = Model(robot, settings.model)
+        self._model = Model(robot, parameters.model)
         self._observer = Observer(robot, self._model.parts)
         self._mode = MODES[self._model.action]
 
@@ -125,43 +129,43 @@ class Policy:
         # Setpoints that hold the pose while a sensor is late; None while all sensors are fresh.
         self._hold_setpoints: RequestedSetpoints | None = None
 
-    @staticmethod
-    def check(robot: Description, settings: Settings) -> None:
+    @classmethod
+    def check(cls, robot: Description, parameters: PolicyParameters) -> None:
         """Check before a run that the model fits the robot. Raises ConfigError."""
-        Model(robot, settings.model)
+        Model(robot, parameters.model)
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Return the model's targets, or setpoints that hold the pose while a sensor that the model needs is late.
 
         The command limiter limits the targets.
         """
-        why_late = self._describe_late_sensors(view)
+        why_late = self._describe_late_sensors(observation)
         if why_late:
-            return self._hold(view, why_late)
+            return self._hold(observation, why_late)
         self._hold_setpoints = None
-        if self._target is None or view.tick - self._target_tick >= self._model.frame_skip:
-            self._target = self._model(self._observer.update(view))
-            self._target_tick = view.tick
+        if self._target is None or observation.tick - self._target_tick >= self._model.frame_skip:
+            self._target = self._model(self._observer.update(observation))
+            self._target_tick = observation.tick
         modes = [self._mode] * len(self._target)
         setpoints = RequestedSetpoints(modes, list(self._target), list(self._torque_limit_nm))
         reference: Sequence[float] = ()
         if self._mode is Mode.POSITION:
             reference = self._target
-        return Action(setpoints, Report(why="a policy moves the joints", reference_rad=reference))
+        return ControllerCommand(setpoints, Telemetry(reason="a policy moves the joints", reference_rad=reference))
 
-    def _describe_late_sensors(self, view: View) -> str:
+    def _describe_late_sensors(self, observation: Observation) -> str:
         """Return why samples that the model needs must not be used; empty when all are fresh."""
-        if view.senses is None:
+        if observation.sensor_samples is None:
             return ""
-        late = view.senses.late
+        late = observation.sensor_samples.late
         return "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys()))
 
-    def _hold(self, view: View, why: str) -> Action:
+    def _hold(self, observation: Observation, why: str) -> ControllerCommand:
         """Hold the pose that the robot had when the sensor became late."""
         if self._hold_setpoints is None:
-            self._hold_setpoints = positions(self._robot, view.joints.angle_rad)
+            self._hold_setpoints = positions(self.robot, observation.joints.angle_rad)
         self._target = None
-        return Action(self._hold_setpoints, Report(why=why))
+        return ControllerCommand(self._hold_setpoints, Telemetry(reason=why))
 
 
 class _Metadata:

@@ -214,9 +214,9 @@ class Host:
         """End the run as if all its time had passed."""
         self._state.ending.request("complete")
 
-    def request_estop(self, who: str, reply: Callable[[str], None]) -> None:
+    def request_estop(self, requester: str, reply: Callable[[str], None]) -> None:
         """Request an emergency stop, as the stop port does; from any thread."""
-        request = EstopRequest(who=who[:64] or "an unnamed client")
+        request = EstopRequest(requester=requester[:64] or "an unnamed client")
         self.submit_request(request, lambda answer: reply(answer.reason))
 
     def submit_request(self, request: Request, reply: Reply) -> None:
@@ -532,7 +532,7 @@ class Host:
         """Begin in `estop` if an earlier host of this robot was stopped and the stop was not cleared."""
         latched = self._latch.left_by_earlier_host
         if latched is not None:
-            request = EstopRequest(who=f"{latched.who[:40]}, before this host")
+            request = EstopRequest(requester=f"{latched.requester[:40]}, before this host")
             self.authority.on_estop(request, max(latched.tick, 0))
 
     def _on_backend_failure(self, error: BackendError) -> None:
@@ -580,7 +580,7 @@ class Host:
         """Make the joints safe, and release what the host has opened."""
         self._state.ending.request("failed", "by an internal error; see host.log")
         self._ended_ns = time.monotonic_ns()
-        finish = LifecycleRequest(action="finish", who="the host")
+        finish = LifecycleRequest(action="finish", requester="the host")
         self.authority.on_lifecycle(finish, self._state.clock.safety_ns())
         with contextlib.suppress(BackendError):
             self._cycle.enact(self.authority.decide())

@@ -97,7 +97,7 @@ class StatusReporter:
             real_time_factor=simulated.real_time_factor,
             # The lifecycle.
             lifecycle=authority.state,
-            why=why,
+            reason=why,
             ready_to_arm=not refusals and not missing and not differing,
             unchecked=authority.unchecked[:500],
             derated=authority.derated_joints,

@@ -262,7 +262,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return f"controllers.{_section_name(self.controller)}"
 
     @property
-    def control_settings(self) -> dict[str, Any]:
+    def controller_parameters(self) -> dict[str, Any]:
         """Return the parameters of the chosen controller."""
         return self.controllers.get(_section_name(self.controller), {})
 
@@ -297,7 +297,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         if not self.has_own_control:
             return "external"
         if self.controller == POLICY_CONTROLLER:
-            model = self.control_settings.get("model")
+            model = self.controller_parameters.get("model")
             if model:
                 return f"{POLICY}{model}"
         return self.controller

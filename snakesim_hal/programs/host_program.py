@@ -184,7 +184,7 @@ def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") ->
         faults=list(authority.faults_since_start.kept),
         faults_left_out=authority.faults_since_start.left_out,
         lifecycle=authority.state,
-        why=authority.reason,
+        reason=authority.reason,
         ended=host.ended,
         ended_why=host.ended_why,
         lost_ticks=lost_ticks,

@@ -1,4 +1,4 @@
-"""Checks before a run that all plugins of its configuration are installed, and that their settings are valid."""
+"""Checks before a run that all plugins of its configuration are installed, and that their sections are valid."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
+from snakesim_hal.controller import Controller, decode_parameters, require_controller
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
@@ -35,8 +36,9 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
     config = with_backend_modes(config, find(BACKENDS, config.backend))
-    controller = find(CONTROLLERS, config.controller)
-    if controller is not None:
+    plugin = find(CONTROLLERS, config.controller)
+    if plugin is not None:
+        controller = require_controller(plugin, config.controller)
         config = _check_controller(config, controller, source, table)
     for service in config.own_services:
         find_service(config, service, find)
@@ -45,16 +47,17 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     return check_backend(config, table, run_files=run_files)
 
 
-def _check_controller(config: RunConfig, controller: Any, source: str, table: Table | None) -> RunConfig:
-    """Check a controller's settings and what it needs of the robot. Returns the configuration that it runs in."""
+def _check_controller(
+    config: RunConfig, controller: type[Controller[Any]], source: str, table: Table | None
+) -> RunConfig:
+    """Check a controller's parameters and what it needs of the robot. Returns the configuration that it runs in."""
     origin = table.origin if table is not None else None
-    settings = plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+    parameters = decode_parameters(controller, config.controller_parameters, source, config.control_section, origin)
     config = _without_pose_services(config, controller)
     problem = describe_missing_capability(describe_joints(config.robot), controller, config.controller)
     if problem is not None:
         raise ConfigError(f"robot {config.robot.name!r}: {problem}")
-    if hasattr(controller, "check"):
-        controller.check(describe_run_robot(config), settings)
+    controller.check(describe_run_robot(config), parameters)
     return config
 
 
@@ -100,19 +103,21 @@ def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] =
     return service
 
 
-def describe_missing_capability(joints: Sequence[JointDescription], controller: Any, name: str) -> str | None:
+def describe_missing_capability(
+    joints: Sequence[JointDescription], controller: type[Controller[Any]], name: str
+) -> str | None:
     """Return the first joint, with the capability, that a controller needs and the robot does not have.
 
     Args:
         joints: of the robot.
-        controller: its class; `MODES` and `MEASURES` name what it needs of every joint.
+        controller: its class; `required_modes` and `required_measurements` name what it needs of every joint.
         name: of the controller, for the message.
 
     Returns:
         A message, or None if the robot has everything.
     """
     for joint in joints:
-        for mode in getattr(controller, "MODES", ()):
+        for mode in controller.required_modes:
             if not joint.supports_mode(mode):
                 available = [mode.name.lower() for mode in joint.modes if mode is not Mode.PASSIVE]
                 return (
@@ -120,7 +125,7 @@ def describe_missing_capability(joints: Sequence[JointDescription], controller: 
                     f"{', '.join(available)}. Choose another controller; or correct `modes` in [drive] or "
                     f"[joints.{joint.name}] of the robot file"
                 )
-        for measured in getattr(controller, "MEASURES", ()):
+        for measured in controller.required_measurements:
             if measured not in joint.measures:
                 return (
                     f"controller {name!r} needs the measured {measured} of every joint, and {joint.name} does not "
@@ -130,7 +135,7 @@ def describe_missing_capability(joints: Sequence[JointDescription], controller: 
     return None
 
 
-def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
+def _without_pose_services(config: RunConfig, controller: type[Controller[Any]]) -> RunConfig:
     """Leave guidance and navigation out for a controller of joints, if the robot has no pose sensor.
 
     They stay if the scenario asks for dead reckoning itself, or has further services.
@@ -142,7 +147,7 @@ def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
     services = config.own_services.keys()
     if GUIDANCE not in services or not services <= {*POSE_SERVICES, CONTROL}:
         return config
-    if getattr(controller, "NEEDS", "world") != "joints":
+    if controller.needs_world:
         return config
     remaining = {name: service for name, service in config.services.items() if name not in POSE_SERVICES}
     return msgspec.structs.replace(config, services=remaining)

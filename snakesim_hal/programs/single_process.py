@@ -151,7 +151,7 @@ class InProcessRun:
                 if not self.host.authority.arm_session and not self.failed:
                     status = self.host.status()
                     if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
-                        raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.why}")
+                        raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.reason}")
                     if status.ready_to_arm:
                         self.host.submit_request(make_arm_request(self.host.description, WHO), lambda _answer: None)
                 if not before_services:

@@ -229,14 +229,14 @@ class Authority:
                 return self._clear(request)
             case "finish":
                 if self.state == "armed":
-                    self._transition("disarm", f"finished by {request.who}")
+                    self._transition("disarm", f"finished by {request.requester}")
                 return self._answer(None)
 
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
         """Stop now, for any requester."""
-        latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
+        latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.requester}")
         self._record(latch_fault, stops=self.state != "estop")
-        self._transition("estop", f"emergency stop by {request.who}; clear it to go on")
+        self._transition("estop", f"emergency stop by {request.requester}; clear it to go on")
         return self._answer(None)
 
     # --- inputs: faults --------------------------------------------------------------------------------------
@@ -389,7 +389,7 @@ class Authority:
             refusals = {condition.refusal for condition in unmet}
             return self._answer(reasons, min(refusals, key=lifecycle.REFUSAL_ORDER.index))
         as_it_is = ", unchecked" if self.unchecked else ""
-        self._transition("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
+        self._transition("arm", f"armed by {request.requester}{as_it_is}, commanded by {self.lease.holder}")
         self.arm_session += 1
         self._armed_tick = self._state_tick
         self._command = None
@@ -399,12 +399,12 @@ class Authority:
         return self._answer(None)
 
     def _disarm(self, request: LifecycleRequest) -> Answer:
-        if not self._transition("disarm", f"disarmed by {request.who}"):
+        if not self._transition("disarm", f"disarmed by {request.requester}"):
             return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
         return self._answer(None)
 
     def _clear(self, request: LifecycleRequest) -> Answer:
-        if not self._transition("clear", f"cleared by {request.who}; arm to move again"):
+        if not self._transition("clear", f"cleared by {request.requester}; arm to move again"):
             hint = ""
             if self.isolated_joints:
                 hint = f"; disarm first, then a clear ends the isolation of {', '.join(self.isolated_joints)}"

@@ -3,7 +3,7 @@
 The services are those of a run, on a network within this process; the recording stands in for the host. They get the
 recorded bytes, tick by tick, and a lease of the recorded number. From a run in lockstep the commands come out the same
 to the bit. With a changed setting they differ, but the robot moves as it did: it shows what another gain would have
-commanded in the situations of the recording, not where that would have led. Settings that somebody changed during the
+commanded in the situations of the recording, not where that would have led. Parameters that somebody changed during the
 run are changed in the same tick again.
 """
 
@@ -31,10 +31,10 @@ from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
     Configuration,
-    ControlSettings,
+    ControlParameters,
     Description,
     JointCommand,
-    SettingsRequest,
+    ParametersRequest,
 )
 from snakesim_operator.playback.play import in_robot_order
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
@@ -47,7 +47,7 @@ from snakesim_operator.results.recording_contents import Contents, read_recordin
 SERVICE_OUTPUTS = {
     "guidance": (keys.WORLD,),
     "navigation": (keys.TRAJECTORY,),
-    "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE, keys.SETTINGS_IN_FORCE),
+    "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE, keys.PARAMETERS_IN_FORCE),
 }
 """The keys at which the replayed services publish. Recorded messages at these keys are not replayed."""
 
@@ -198,13 +198,13 @@ class Replay:
         self._applied_decoder = Decoder(AppliedCommand)
 
         # Parameters of the controller.
-        self._settings_decoder = Decoder(ControlSettings)
-        self._overridden_settings = {
+        self._parameters_decoder = Decoder(ControlParameters)
+        self._overridden_parameters = {
             override.key.removeprefix(CHOSEN[0]): override.value
             for override in overrides
             if override.key.startswith(CHOSEN[0])
         }
-        self._pending_changes: list[tuple[ControlSettings, LocalQuery]] = []  # without an answer yet
+        self._pending_changes: list[tuple[ControlParameters, LocalQuery]] = []  # without an answer yet
 
     def run(self) -> Comparison:
         """Replay the whole recording. Raises SnakesimError if a service fails."""
@@ -253,8 +253,8 @@ class Replay:
             command = self._command_decoder.decode(recorded.payload, recorded.encoding)
             self.comparison.recorded[command.tick] = command
             self._recorded_by_sequence[command.sequence] = command
-        if recorded.key == keys.SETTINGS_IN_FORCE and recorded.key in self._output_keys:
-            self._change_settings(self._settings_decoder.decode(recorded.payload, recorded.encoding))
+        if recorded.key == keys.PARAMETERS_IN_FORCE and recorded.key in self._output_keys:
+            self._change_parameters(self._parameters_decoder.decode(recorded.payload, recorded.encoding))
         if recorded.key in self._output_keys or recorded.key in (keys.CONFIG, keys.DESCRIPTION):
             return
         payload = recorded.payload
@@ -282,23 +282,23 @@ class Replay:
                 continue
             self._pending_changes.remove((change, query))
             if not answer.ok:
-                raise ConfigError(f"{self._path}: what {change.who} set at tick {change.tick}: {answer.reason}")
+                raise ConfigError(f"{self._path}: what {change.requester} set at tick {change.tick}: {answer.reason}")
 
-    def _change_settings(self, recorded: ControlSettings) -> None:
+    def _change_parameters(self, recorded: ControlParameters) -> None:
         """Change the parameters of the controller as in the recording, where they come before their tick's clock.
 
         Parameters that the command line sets stay.
         """
-        if recorded.who is None or recorded.controller != self.config.controller[-64:]:
+        if recorded.requester is None or recorded.controller != self.config.controller[-64:]:
             return
-        values = msgspec.json.decode(recorded.settings, type=dict[str, Any])
-        values |= self._overridden_settings
-        request = SettingsRequest(
-            who=recorded.who,
+        values = msgspec.json.decode(recorded.parameters, type=dict[str, Any])
+        values |= self._overridden_parameters
+        request = ParametersRequest(
+            requester=recorded.requester,
             controller=recorded.controller,
-            settings=msgspec.json.encode(values).decode(),
+            parameters=msgspec.json.encode(values).decode(),
         )
-        self._pending_changes.append((recorded, self._session.send_query(keys.SETTINGS, request)))
+        self._pending_changes.append((recorded, self._session.send_query(keys.PARAMETERS, request)))
 
     def _applied_payload(self, recorded: RecordedMessage) -> bytes:
         """Return the setpoints that the host would have applied.

@@ -18,7 +18,7 @@ from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import ControlSettings, Status
+from snakesim_hal.wire.messages import ControlParameters, Status
 from snakesim_operator.recording.losses import LossGap
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
@@ -47,11 +47,11 @@ class KeyInfo:
         return int((np.round(steps / np.median(steps)) - 1).clip(0).sum())
 
 
-class SettingsChange(msgspec.Struct, kw_only=True):
+class ParameterChange(msgspec.Struct, kw_only=True):
     """Parameters that an operator changed while the controller ran."""
 
     time_s: float
-    who: str
+    requester: str
     changed: dict[str, tuple[Any, Any]]  # name -> before, then
 
 
@@ -74,7 +74,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     command_digest: str | None
     own_arithmetic: list[str]  # what rounds otherwise than on most computers with the lock's NumPy
     lifecycle: str | None
-    settings: list[SettingsChange]
+    parameter_changes: list[ParameterChange]
     dropped: dict[str, int]
     keys: dict[str, dict[str, float]]
 
@@ -92,17 +92,17 @@ def inspect_recording(path: Path) -> RecordingInfo:
     reader = RecordingReader(path)
     contents = Contents(path)
     by_key: dict[str, KeyInfo] = {}
-    settings_in_force: list[ControlSettings] = []
-    settings_decoder = Decoder(ControlSettings)
+    parameters_in_force: list[ControlParameters] = []
+    parameters_decoder = Decoder(ControlParameters)
     for recorded in reader.read_messages():
         key_info = by_key.setdefault(recorded.key, KeyInfo())
         key_info.time_ns.append(recorded.time_ns)
         key_info.bytes += len(recorded.payload)
         if recorded.key in ALL:
             contents.add(recorded)
-        if recorded.key == keys.SETTINGS_IN_FORCE:
+        if recorded.key == keys.PARAMETERS_IN_FORCE:
             with contextlib.suppress(WireError):
-                settings_in_force.append(settings_decoder.decode(recorded.payload, recorded.encoding))
+                parameters_in_force.append(parameters_decoder.decode(recorded.payload, recorded.encoding))
 
     robot = contents.description
     status = contents.status
@@ -139,7 +139,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         command_digest=None if host is None or not host.ticks else host.command_digest,
         own_arithmetic=[] if robot is None else find_differing_parts(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_lifecycle_reason(status)}",
-        settings=_settings_changes(settings_in_force),
+        parameter_changes=_find_parameter_changes(parameters_in_force),
         dropped=reader.losses.dropped,
         keys=numbers_by_key,
     )
@@ -157,14 +157,14 @@ def _duration_s(by_key: dict[str, KeyInfo]) -> float:
     return (ended_ns - began_ns) * 1e-9
 
 
-def _settings_changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
+def _find_parameter_changes(in_force: Sequence[ControlParameters]) -> list[ParameterChange]:
     """Return the changes that an operator made, in order of time."""
-    changes: list[SettingsChange] = []
+    changes: list[ParameterChange] = []
     for before, now in pairwise(in_force):
-        if now.who is None or now.changes == before.changes:
+        if now.requester is None or now.changes == before.changes:
             continue
         changed = {PREFIX + new.name: (old.value, new.value) for old, new in find_changed_parameters(before, now)}
-        changes.append(SettingsChange(time_s=now.timestamp_ns * 1e-9, who=now.who, changed=changed))
+        changes.append(ParameterChange(time_s=now.timestamp_ns * 1e-9, requester=now.requester, changed=changed))
     return changes
 
 
@@ -174,8 +174,8 @@ def _lifecycle_reason(status: Status) -> str:
     While disarmed, the status appends what prevents arming; that part is left out.
     """
     if status.lifecycle == "disarmed":
-        return status.why.partition("; ")[0]
-    return status.why
+        return status.reason.partition("; ")[0]
+    return status.reason
 
 
 def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
@@ -202,9 +202,9 @@ def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
     digest = format_digest(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
     of_what = " of these ticks alone" if info.lacks else ""
     say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
-    for change in info.settings:
+    for change in info.parameter_changes:
         said = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
-        say(f"  set       at {change.time_s:.2f} s by {change.who}: {said}")
+        say(f"  set       at {change.time_s:.2f} s by {change.requester}: {said}")
     say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]

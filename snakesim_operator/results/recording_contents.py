@@ -245,7 +245,7 @@ class Contents:
             faults=status.faults,
             faults_left_out=status.faults_left_out,
             lifecycle=status.lifecycle,
-            why=status.why,
+            reason=status.reason,
             ended="finished",
             ended_why="as far as it was recorded",
             isolated=status.isolated,

@@ -28,7 +28,7 @@ def ended(record: RunRecord) -> str:
         return f"{UNKNOWN}the recording breaks off {done}"
     if host.lifecycle == "armed":
         return f"{UNKNOWN}the recording was ended {done}, with the robot armed"
-    return f"{host.lifecycle} ({host.why}) {done}"
+    return f"{host.lifecycle} ({host.reason}) {done}"
 
 
 def ended_early(host: HostRecord, config: RunConfig) -> str:

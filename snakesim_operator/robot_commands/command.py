@@ -58,7 +58,7 @@ def arm(
 
 def disarm(where: RobotSelection, say: PrintLine = print_line) -> int:
     """Make the joints passive; later commands do not move them."""
-    request = LifecycleRequest(action="disarm", who=get_user_name())
+    request = LifecycleRequest(action="disarm", requester=get_user_name())
     return _request_from_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
 
 
@@ -80,14 +80,14 @@ def clear(where: RobotSelection, say: PrintLine = print_line) -> int:
             )
         return 0
     return _request_from_robot(
-        link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=get_user_name()), "cleared", say
+        link, keys.LIFECYCLE, LifecycleRequest(action="clear", requester=get_user_name()), "cleared", say
     )
 
 
 def simulator(order: SimulatorOrder, where: RobotSelection, say: PrintLine = print_line) -> int:
     """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses."""
     request = SimulatorRequest(
-        action=order.action, who=order.who or get_user_name(), ticks=order.ticks, speed=order.speed
+        action=order.action, requester=order.requester or get_user_name(), ticks=order.ticks, speed=order.speed
     )
     return _request_from_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
 
@@ -113,7 +113,7 @@ def request_from_host(
             "robot moves, `snakesim estop`"
         )
     if doubt is not None:
-        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
+        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.reason}"
         raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
     if not answers[0].ok:
         raise RefusedError(f"{name}: not {done}: {answers[0].reason}")

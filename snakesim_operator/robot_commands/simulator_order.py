@@ -19,7 +19,7 @@ class SimulatorOrder:
     action: Any  # one of ACTIONS
     ticks: int = 1
     speed: float = 1.0
-    who: str | None = None  # None: this user
+    requester: str | None = None  # None: this user
 
     def __str__(self) -> str:
         match self.action:

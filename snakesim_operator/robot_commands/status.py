@@ -174,7 +174,7 @@ def _describe_robot(robot: _Robot) -> list[str]:
     link = robot.link
     status = robot.status
     return [
-        f"{link.namespace}: {status.lifecycle} - {status.why}",
+        f"{link.namespace}: {status.lifecycle} - {status.reason}",
         f"  {describe_what_moves(robot.description)}",
         f"  robot {status.robot}, backend {status.backend}, {status.clock_mode} at {status.rate_hz:g} Hz, "
         f"tick {status.tick}, on {link.endpoint}",

@@ -127,7 +127,7 @@ class RunMonitor:
     def _describe_timeout(self, give_up_s: float) -> str | None:
         """Return why the run stops waiting to arm the robot; None while it waits."""
         now = time.monotonic()
-        reason = self._status.why if self._status else "no status"
+        reason = self._status.reason if self._status else "no status"
         if self._startup_timeout.ends(self._status, now):
             limit_s = self._startup_timeout.limit_s
             return f"not ready to arm within {limit_s:g} s (start_limit_s) with every service there: {reason}"
@@ -241,7 +241,7 @@ class RunMonitor:
         if status.lifecycle not in ("fault", "estop"):
             self._last_latched = None
             return
-        latched = f"{status.lifecycle}: {status.why}"
+        latched = f"{status.lifecycle}: {status.reason}"
         if latched != self._last_latched:
             self._say(latched)
             self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
@@ -266,7 +266,7 @@ class RunMonitor:
         if self._trajectory is None or not self._armed or host is None:
             return
         if self._trajectory.newest(lambda trajectory: trajectory.finished) is not None:
-            host.send_request(LifecycleRequest(action="finish", who=AT_GOAL))
+            host.send_request(LifecycleRequest(action="finish", requester=AT_GOAL))
             self._trajectory = None
 
     def _waits_for_recorder(self) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.controller import load_controller
 from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS, find_plugin, list_installed
@@ -63,17 +64,25 @@ def contract() -> Iterator[tuple[str, str]]:
     yield "files/summary.json", _schema(RunSummary)
     for name, struct in _shipped_plugins(FILES):
         yield f"files/{name}.json", _schema(struct)
-    for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control"), (PHYSICS_MODELS, "physics_models")):
+    for group, section in ((BACKENDS, "backends"), (PHYSICS_MODELS, "physics_models")):
         for name, plugin in _shipped_plugins(group):
             yield f"files/{section}.{name}.json", _schema(plugin.Settings)
+    for name in list_installed(CONTROLLERS):
+        controller = load_controller(name)
+        if _is_shipped(controller):
+            yield f"files/control.{name}.json", _schema(controller.Parameters)
 
 
 def _shipped_plugins(group: str) -> Iterator[tuple[str, Any]]:
     """Yield name and object of the plugins of this project."""
     for name in list_installed(group):
         plugin = find_plugin(group, name)
-        if plugin.__module__.startswith("snakesim_"):
+        if _is_shipped(plugin):
             yield name, plugin
+
+
+def _is_shipped(plugin: Any) -> bool:
+    return plugin.__module__.startswith("snakesim_")
 
 
 def _schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -> str:

@@ -257,7 +257,7 @@ class Rig:
 
     def estop(self) -> None:
         """Emergency stop."""
-        self.authority.on_estop(EstopRequest(who="bench"), self.tick)
+        self.authority.on_estop(EstopRequest(requester="bench"), self.tick)
 
     def fault(self) -> None:
         """A fault that the backend has not reported."""

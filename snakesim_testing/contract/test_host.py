@@ -148,7 +148,9 @@ def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted)
     """In a pause no tick passes and no lease expires; whatever cannot stand still says so."""
     hosted.arm(stay)
     hosted.passes(t.ARMING_PERIODS)
-    answer = hosted.session.request(keys.SIMULATOR, SimulatorRequest(action="pause", who="contract"), timeout_s=10.0)
+    answer = hosted.session.request(
+        keys.SIMULATOR, SimulatorRequest(action="pause", requester="contract"), timeout_s=10.0
+    )
     if not hosted.robot.simulated_time:
         assert answer.refusal == "not_simulated", answer
         hosted.passes(t.ARMING_PERIODS)

@@ -6,9 +6,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from snakesim_gnc.control.controller import Action, View
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import SnakesimError
+from snakesim_hal.controller import ControllerCommand, Observation
 from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link, Reader, open_session
@@ -27,13 +27,13 @@ POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of t
 class Showing(Hold):
     """Holds, unless it is to answer otherwise."""
 
-    views: list[View]
-    answers: list[Callable[["Showing", View], Any]]  # its only entry is how it answers
+    observations: list[Observation]
+    answers: list[Callable[["Showing", Observation], Any]]  # its only entry is how it answers
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Keeps what it was given."""
-        self.views.append(view)
-        return self.answers[0](self, view) if self.answers else super().update(view)
+        self.observations.append(observation)
+        return self.answers[0](self, observation) if self.answers else super().update(observation)
 
 
 class Serving:
@@ -67,7 +67,7 @@ class Stage:
     run: Running
     services: dict[str, Serving]
     states: Reader[ControlState]
-    views: list[View]  # what the controller was given so far
+    observations: list[Observation]  # what the controller was given so far
     reported: list[ControlState] = field(default_factory=list[ControlState])
 
     def state(self) -> ControlState | None:
@@ -88,10 +88,10 @@ class Stage:
 
 @contextmanager
 def stage(**config: Any) -> Iterator[Stage]:
-    """The worm in real time, with guidance, navigation, and control with the controller that shows its views."""
+    """The worm in real time, with guidance, navigation, and control with the controller that shows its observations."""
     common = {"controller": "showing", "clock_mode": "realtime", "services": SCHEDULE, "rate_hz": 50.0}
     made = run_config(**{**common, "allow_fault_injection": True, **POSE, **config})
-    Showing.views, Showing.answers = [], []
+    Showing.observations, Showing.answers = [], []
     with (
         offer_plugin(CONTROLLERS, "showing", Showing),
         running(made) as run,
@@ -104,4 +104,4 @@ def stage(**config: Any) -> Iterator[Stage]:
             services[name] = Serving(name, made, run.link)
             stack.callback(services[name].stop)
         wait_until(lambda: set(SCHEDULE) <= set(run.status.alive), "all services")
-        yield Stage(run, services, states, Showing.views)
+        yield Stage(run, services, states, Showing.observations)

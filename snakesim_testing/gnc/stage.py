@@ -1,12 +1,12 @@
-"""A robot, a wavy path with pegs, and views of a body on it, without any physics."""
+"""A robot, a wavy path with pegs, and observations of a body on it, without any physics."""
 
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
-from snakesim_gnc.control.controller import View
 from snakesim_gnc.geometry.body_on_path import chain_nodes
+from snakesim_hal.controller import Observation
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
 from snakesim_hal.wire.messages import Axis, Description, Obstacle, Trajectory, World, WorldContact
@@ -92,7 +92,7 @@ def make_pegs(route: Route) -> list[Obstacle]:
 
 @dataclass
 class Stage:
-    """Makes views of a body that lies on the route, with whatever is to be different."""
+    """Makes observations of a body that lies on the route, with whatever is to be different."""
 
     robot: Description
     route: Route
@@ -101,7 +101,7 @@ class Stage:
     path_id: int = 0
     peg_friction: float = 0.0  # that the path was planned with
 
-    def view(
+    def observe(
         self,
         tick: int,
         tail_s_m: float,
@@ -113,7 +113,7 @@ class Stage:
         contacts: list[WorldContact] | None = None,
         pose_age_ticks: int | None = None,
         without: str = "",
-    ) -> View:
+    ) -> Observation:
         """turned: joint -> how far it is from where the route has it. without: `world` or `trajectory`, perhaps."""
         axes = [joint.axis for joint in self.robot.joints]
         segments = yaw_segments_m(axes, [link.length_m for link in self.robot.links])
@@ -143,7 +143,7 @@ class Stage:
             finished=False,
             peg_friction=self.peg_friction,
         )
-        return View(
+        return Observation(
             tick=tick,
             time_s=tick * PERIOD_S,
             period_s=PERIOD_S,

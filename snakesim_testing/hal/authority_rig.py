@@ -11,7 +11,7 @@ ROBOT = description()
 JOINTS = len(ROBOT.joints)
 ARM = LifecycleRequest(action="arm", robot="worm", backend="lag", config_hash=ROBOT.config_hash)
 DISARM, CLEAR, FINISH = (LifecycleRequest(action=action) for action in ("disarm", "clear", "finish"))
-ESTOP = EstopRequest(who="a person")
+ESTOP = EstopRequest(requester="a person")
 
 
 class Rig:

@@ -200,7 +200,7 @@ def status(**reported: Any) -> Status:
         "clock_mode": "realtime",
         "rate_hz": 100.0,
         "lifecycle": "armed",
-        "why": "armed",
+        "reason": "armed",
         "lease_holder": None,
         "lease_epoch": 0,
         "overruns": 0,

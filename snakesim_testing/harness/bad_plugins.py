@@ -27,11 +27,11 @@ DEEDS = {
 class Controller(Hold):
     calls = 0
 
-    def update(self, view):
+    def update(self, observation):
         Controller.calls += 1
         if Controller.calls == 30:
             DEEDS["%s"]()
-        return super().update(view)
+        return super().update(observation)
 
 
 class Backend(SimBackend):

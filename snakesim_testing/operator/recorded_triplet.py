@@ -51,7 +51,7 @@ def finished(ticks: int) -> HostRecord:
         limited_commands={"torque_rate": 41, "max_step": 7},
         faults=[],
         lifecycle="disarmed",
-        why="finished",
+        reason="finished",
     )
 
 

@@ -3,15 +3,15 @@
 import dataclasses
 import time
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offer_plugin
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, load_controller
+from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -22,7 +22,7 @@ class Run:
     """What happened, one row a tick."""
 
     record: RunRecord
-    reports: list[Report]
+    reports: list[Telemetry]
     update_us: list[float]  # how long the controller took
 
     @property
@@ -68,37 +68,28 @@ class Run:
         return found
 
 
-@dataclass
-class _Watch:
-    controller: type[Controller]
-    blind: Collection[int]
-    lost: Collection[int]
-    reports: list[Report] = field(default_factory=list[Report])
-    update_us: list[float] = field(default_factory=list[float])
+def _make_watched(
+    controller_class: type[Controller[Any]],
+    blind: Collection[int],
+    lost: Collection[int],
+    telemetry: list[Telemetry],
+    update_us: list[float],
+) -> type[Controller[Any]]:
+    """A controller that gets no world model in blind ticks, and no trajectory in lost ones; both lists are filled."""
 
-    @property
-    def Settings(self) -> type[msgspec.Struct]:  # noqa: N802 - as controllers call it
-        return self.controller.Settings
+    class Watched(controller_class):
+        def update(self, observation: Observation) -> ControllerCommand:
+            if observation.tick in blind:
+                observation = dataclasses.replace(observation, world=None)
+            if observation.tick in lost:
+                observation = dataclasses.replace(observation, trajectory=None)
+            began = time.perf_counter()
+            command = super().update(observation)  # pyright: ignore[reportAbstractUsage] - not abstract here
+            update_us.append((time.perf_counter() - began) * 1e6)
+            telemetry.append(command.telemetry)
+            return command
 
-    def __call__(self, robot: Any, settings: Any) -> "_Watched":
-        return _Watched(self, self.controller(robot, settings))
-
-
-class _Watched:
-    def __init__(self, watch: _Watch, controller: Controller) -> None:
-        self._watch, self._controller = watch, controller
-
-    def update(self, view: View) -> Action:
-        watch = self._watch
-        if view.tick in watch.blind:
-            view = dataclasses.replace(view, world=None)
-        if view.tick in watch.lost:
-            view = dataclasses.replace(view, trajectory=None)
-        began = time.perf_counter()
-        action = self._controller.update(view)
-        watch.update_us.append((time.perf_counter() - began) * 1e6)
-        watch.reports.append(action.report)
-        return action
+    return Watched
 
 
 def configure(scenario: str, *sets: str) -> RunConfig:
@@ -111,9 +102,11 @@ def run(
 ) -> Run:
     """Run a configuration. blind, lost: ticks at which the controller gets no world model, and no trajectory."""
     config = msgspec.structs.replace(config, duration_s=duration_s or config.duration_s)
-    watch = _Watch(find_plugin(CONTROLLERS, config.controller), blind, lost)
-    with offer_plugin(CONTROLLERS, config.controller, watch):
+    telemetry: list[Telemetry] = []
+    update_us: list[float] = []
+    watched = _make_watched(load_controller(config.controller), blind, lost, telemetry, update_us)
+    with offer_plugin(CONTROLLERS, config.controller, watched):
         result = simulate(config)
     assert result.summary.ended == "complete", result.summary.ended
-    assert len(watch.reports) == len(result.record.time_s)
-    return Run(result.record, watch.reports, watch.update_us)
+    assert len(telemetry) == len(result.record.time_s)
+    return Run(result.record, telemetry, update_us)

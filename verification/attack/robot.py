@@ -60,7 +60,7 @@ class Robot:
             for heard in self.operator.heard(key)
             if heard.at_s > began
         }
-        assert seen == {lifecycle}, f"{seen}: {self.operator.status()['why']}"
+        assert seen == {lifecycle}, f"{seen}: {self.operator.status()['reason']}"
 
 
 def joined(run: Run) -> Stranger:

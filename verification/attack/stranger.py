@@ -200,7 +200,7 @@ class Stranger:
 
     def request(self, action: str, **more: Any) -> dict[str, Any]:
         """Ask for another lifecycle; arming names what the description tells."""
-        request: dict[str, Any] = {"action": action, "who": "stranger", **more}
+        request: dict[str, Any] = {"action": action, "requester": "stranger", **more}
         if action == "arm":
             about = self.newest("hal/description")
             named = {name: about[name] for name in ("robot", "backend", "config_hash")}
@@ -241,7 +241,7 @@ class Stranger:
             elif status["ready_to_arm"]:
                 last = self.request("arm")
             time.sleep(0.05)
-        raise AssertionError(f"not armed within {limit_s:g} s: {self.status()['why']}; {last}")
+        raise AssertionError(f"not armed within {limit_s:g} s: {self.status()['reason']}; {last}")
 
     def stand_by(self, limit_s: float = LIMIT_S) -> None:
         """Have the robot disarmed and ready to arm; a busy machine may have stopped it meanwhile."""
@@ -252,7 +252,7 @@ class Stranger:
                 return
             if status["lifecycle"] != "disarmed":
                 self.request("disarm" if status["lifecycle"] == "armed" else "clear")
-        raise AssertionError(f"not ready to arm within {limit_s:g} s: {self.status()['why']}")
+        raise AssertionError(f"not ready to arm within {limit_s:g} s: {self.status()['reason']}")
 
     def follows(self, commands: int = 10, limit_s: float = 1.5) -> bool:
         """Whether commands of the robot's controller are applied, one after the other."""

@@ -48,7 +48,7 @@ def lives_on(robot: Robot) -> None:
     """The right controller is not blocked as a replayer: what it sends goes on being applied."""
     operator = robot.operator
     rejected = operator.next("hal/status")["commands_rejected"].get("replayed", 0)
-    assert operator.follows(), f"{operator.status()['why']}; {operator.status()['commands_rejected']}"
+    assert operator.follows(), f"{operator.status()['reason']}; {operator.status()['commands_rejected']}"
     now = operator.next("hal/status")
     assert now["lifecycle"] == "armed" and now["commands_rejected"].get("replayed", 0) == rejected, now
 

@@ -60,7 +60,7 @@ def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: f
 
 
 def intent(timestamp_ns: int, speed_m_s: float, valid_s: float | None = None) -> dict[str, Any]:
-    said: dict[str, Any] = {"timestamp_ns": timestamp_ns, "who": "stranger", "speed_m_s": speed_m_s, "go": True}
+    said: dict[str, Any] = {"timestamp_ns": timestamp_ns, "requester": "stranger", "speed_m_s": speed_m_s, "go": True}
     return said if valid_s is None else {**said, "valid_for_ns": round(valid_s * NS)}
 
 
@@ -175,7 +175,7 @@ def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
     operator = robot.operator
     operator.stand_by()
     armings = operator.next("hal/clock")["arm_session"]
-    forged = {**operator.status(), "lifecycle": lifecycle, "ready_to_arm": True, "why": "forged"}
+    forged = {**operator.status(), "lifecycle": lifecycle, "ready_to_arm": True, "reason": "forged"}
     with Stranger(robot.endpoint) as stranger, repeating(lambda: stranger.put("hal/status", forged), EVERY_S):
         time.sleep(FORGED_S)
         assert operator.next("hal/clock")["arm_session"] == armings

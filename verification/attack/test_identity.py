@@ -58,7 +58,7 @@ def test_a2_a_second_answer_is_an_impostor(
 ) -> None:
     operator = routed.operator
     if before == "estop":
-        operator.ask("hal/estop", {"who": "operator"})
+        operator.ask("hal/estop", {"requester": "operator"})
     elif before == "disarmed":
         operator.stand_by()
     operator.until(lambda: operator.lifecycle() == before, before)
@@ -79,7 +79,7 @@ def test_a2_nobody_disarms_by_a_forged_answer_and_a_forged_status(robot: Robot) 
     operator = robot.operator
     answer = lie("disarmed", "disarmed on request")
     with impostor(robot, "hal/lifecycle", answer) as stranger:
-        forged = {**operator.status(), "lifecycle": "disarmed", "why": "disarmed on request"}
+        forged = {**operator.status(), "lifecycle": "disarmed", "reason": "disarmed on request"}
         stranger.latch("hal/status", forged)
         ended = robot.run.tell("disarm")
     assert ended.code == 1 and "impostor" in ended.said, f"the robot is {operator.lifecycle()}: {ended.said}"

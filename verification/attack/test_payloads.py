@@ -35,12 +35,12 @@ def payloads() -> list[bytes]:
         dice.randbytes(1_100_000),
         dice.randbytes(5_000_000),
         wire.encode({str(i): [i] * 10 for i in range(10_000)}),
-        wire.encode({"action": "arm" * 100_000, "who": "x" * 100_000, "holder": "x" * 100_000}),
+        wire.encode({"action": "arm" * 100_000, "requester": "x" * 100_000, "holder": "x" * 100_000}),
         wire.encode({"action": "arm", "robot": "x" * 65}),
         wire.encode({"action": "acquire", "holder": "", "priority": 10**9}),
         wire.encode({"action": "acquire", "holder": "x", "epoch": -1}),
         wire.encode({"kind": "kill", "target": "../../etc", "for_s": -1.0}),
-        wire.encode({"who": b"\xff\xfe"}),
+        wire.encode({"requester": b"\xff\xfe"}),
         wire.encode([1, 2, 3]),
     ]
 
@@ -87,12 +87,12 @@ def printed_safely(robot: Robot, before: str) -> None:
 def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robot) -> None:
     said = robot.run.said()
     with Stranger(robot.endpoint) as stranger:
-        stranger.ask("hal/estop", {"who": EVIL})
+        stranger.ask("hal/estop", {"requester": EVIL})
     robot.operator.until(lambda: robot.operator.lifecycle() == "estop", "the stop")
     robot.run.wait_for("evil")
     assert "evil" in robot.run.tell("status").out
     echoed = robot.run.tell("echo", "hal/status", "--count", "1")
-    assert EVIL in json.loads(echoed.out)["message"]["why"] and not steering(echoed.said), echoed.said
+    assert EVIL in json.loads(echoed.out)["message"]["reason"] and not steering(echoed.said), echoed.said
     printed_safely(robot, said)
 
 
@@ -101,7 +101,7 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robo
     with Stranger(robot.endpoint) as stranger:
         stranger.ask("hal/lease", {"action": "acquire", "holder": EVIL, "priority": 255})
         for action in ("disarm", "clear", "arm"):
-            stranger.request(action, who=EVIL)
+            stranger.request(action, requester=EVIL)
         time.sleep(0.3)
         printed_safely(robot, said)
 
@@ -109,7 +109,7 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robo
 def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) -> None:
     said, operator = robot.run.said(), robot.operator
     fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "reach": "robot"}
-    status = {**operator.status(), "lifecycle": "fault", "why": EVIL, "faults": [fault], "injected": [EVIL]}
+    status = {**operator.status(), "lifecycle": "fault", "reason": EVIL, "faults": [fault], "injected": [EVIL]}
     status |= {"robot": EVIL, "backend": EVIL, "lease_holder": EVIL, "alive": [EVIL], "waiting_for": [EVIL]}
     status |= {"isolated": [EVIL], "derated": {EVIL: 0.5}, "realtime_warnings": [EVIL], "commands_rejected": {EVIL: 1}}
     clock = operator.next("hal/clock")
@@ -134,7 +134,7 @@ def test_control_characters_in_a_namespace_reach_no_terminal(robot: Robot) -> No
     with Stranger(robot.endpoint, "evil\x1b[2J\rplanar13: armed - all is well") as stranger:
         stranger.seem_alive("alive/hal")
         stranger.pretend("hal/estop", {"ok": True, "reason": EVIL, "epoch": 0, "lifecycle": "estop"})
-        stranger.latch("hal/status", {**robot.operator.status(), "why": EVIL})
+        stranger.latch("hal/status", {**robot.operator.status(), "reason": EVIL})
         printed_safely(robot, said)
 
 
@@ -225,10 +225,10 @@ def test_hosts_that_are_none_neither_stop_the_robot_nor_hide_a_stop(robot: Robot
         for i in range(effort(100, 2000)):
             stranger.seem_alive(f"hal/host/{i:04}{'x' * 60 if i % 2 else EVIL.replace('/', '')}")
         robot.stays("armed", 1.0)
-        stranger.ask("hal/estop", {"who": "mallory"})
+        stranger.ask("hal/estop", {"requester": "mallory"})
         operator.until(lambda: operator.lifecycle() == "estop", "estop")
         status = operator.next("hal/status")
-        assert "mallory" in status["why"], status["why"]
+        assert "mallory" in status["reason"], status["reason"]
         assert "estop" in [fault["what"] for fault in status["faults"]], "what stopped it is not among the faults"
         printed_safely(robot, "")
     robot.unharmed(before)

@@ -48,5 +48,5 @@ def test_a5_frozen_readers_do_not_stop_the_robot(
                 return
             last = operator.newest("hal/clock")
             after_s = (last["timestamp_ns"] - first["timestamp_ns"]) * 1e-9
-            why = operator.next("hal/status")["why"]
+            why = operator.next("hal/status")["reason"]
             pytest.fail(f"{readers} frozen readers stopped the robot after {after_s:.1f} s: {why}")

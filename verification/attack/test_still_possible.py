@@ -28,12 +28,12 @@ def test_anybody_may_listen_to_everything(robot: Robot) -> None:
 def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
     with Stranger(robot.endpoint) as stranger:
         stranger.receive("hal/clock")
-        assert stranger.ask("hal/estop", {"who": "mallory"})[0]["ok"]
+        assert stranger.ask("hal/estop", {"requester": "mallory"})[0]["ok"]
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "estop", "estop")
-        assert "mallory" in robot.operator.next("hal/status")["why"]
-        assert stranger.request("clear", who="mallory")["ok"]
+        assert "mallory" in robot.operator.next("hal/status")["reason"]
+        assert stranger.request("clear", requester="mallory")["ok"]
         robot.operator.recover()
-        assert stranger.request("disarm", who="mallory")["ok"]
+        assert stranger.request("disarm", requester="mallory")["ok"]
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "disarmed", "disarmed")
 
 
@@ -63,7 +63,7 @@ def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_li
         assert operator.next("hal/clock")["arm_session"] == armings
         with commanding(stranger, answer["epoch"], 1e4):
             operator.until(lambda: operator.status()["ready_to_arm"], "ready to arm")
-            assert stranger.request("arm", who="mallory")["ok"]
+            assert stranger.request("arm", requester="mallory")["ok"]
             time.sleep(0.5)
             # At some time: on a busy computer he may lose it again.
             assert "mallory" in {heard.message["lease_holder"] for heard in operator.heard("hal/status")}

@@ -82,7 +82,7 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
         end(readers)
         asked_s = time.monotonic()
         if by == "query":
-            operator.ask("hal/estop", {"who": "operator"}, 10.0)
+            operator.ask("hal/estop", {"requester": "operator"}, 10.0)
         else:
             assert datagrams.ask(robot.endpoint, datagrams.stop(), 10.0) is not None, "no answer"
         operator.stopped_at(asked_s, 10.0)
@@ -108,7 +108,7 @@ def test_a4_a_datagram_stops_the_robot_and_says_who_it_was(robot: Robot, record_
     took_s = robot.operator.stopped_at(asked_s, 2.0) - asked_s
     record_property("stopped after", f"{1000 * took_s:.0f} ms from the datagram")
     assert took_s < QUERY_S
-    assert "the bench's red button" in robot.operator.next("hal/status")["why"]
+    assert "the bench's red button" in robot.operator.next("hal/status")["reason"]
     assert len(answer) < 1024, "a datagram must not be answered by many times its size"
 
 
@@ -129,7 +129,7 @@ def test_a4_a_flood_of_wrong_datagrams_does_nothing_and_keeps_no_right_one_out(
     before = robot.health()
     with datagrams.flood(robot.endpoint) as sent:
         time.sleep(float(effort(2, 10)))
-        assert not robot.operator.status()["why"].startswith("emergency stop"), robot.operator.status()["why"]
+        assert not robot.operator.status()["reason"].startswith("emergency stop"), robot.operator.status()["reason"]
         asked_s = time.monotonic()
         answer = datagrams.ask(robot.endpoint, datagrams.stop(), 3.0)
         assert answer is not None, f"no answer after {sent[0]} wrong datagrams"

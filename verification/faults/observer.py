@@ -134,7 +134,7 @@ class Observer:
 
     def in_words(self) -> str:
         """What the robot said last."""
-        return "no status" if self.status is None else f"{self.status.lifecycle}: {self.status.why}"
+        return "no status" if self.status is None else f"{self.status.lifecycle}: {self.status.reason}"
 
     def state(self) -> str | None:
         """The lifecycle that was told last."""

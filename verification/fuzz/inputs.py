@@ -147,7 +147,7 @@ def stop_port() -> Iterator[Input]:
     count = 0
 
     def stop(who: str, reply: Callable[[str], None]) -> None:
-        assert Decoder(EstopRequest).decode(encode(EstopRequest(who=who[:64])), format_encoding(EstopRequest))
+        assert Decoder(EstopRequest).decode(encode(EstopRequest(requester=who[:64])), format_encoding(EstopRequest))
         heard.append(who)
         reply("stopped")
 
@@ -245,7 +245,7 @@ def written(folder: Path) -> list[Input]:
         Input("a scenario", shipped("scenarios"), file("x.toml", lambda p: scenario.load(str(p)))),
         Input("config.json", [config], file("x.json", lambda p: scenario.load(str(p)))),
         Input("router.json5", [files.ROUTER.read_bytes()], file("router.json5", router_settings)),
-        Input(ESTOP, [b'{"who":"a person","tick":7}'], file(ESTOP, latch)),
+        Input(ESTOP, [b'{"requester":"a person","tick":7}'], file(ESTOP, latch)),
         Input(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: recall())),
         Input("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),
     ]

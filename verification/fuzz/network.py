@@ -107,7 +107,7 @@ class Watcher:
                 stretch.seen.setdefault(name, []).append(now)
             status = self.status()
             if status is not None and status.lifecycle != "armed":
-                stretch.failure.append(f"the robot is in {status.lifecycle}: {status.why}")
+                stretch.failure.append(f"the robot is in {status.lifecycle}: {status.reason}")
             if stretch.failure:
                 break
         stretch.last = self._fresh()
@@ -203,7 +203,7 @@ def _differences(quiet: Stretch, fuzzed: Stretch, sent: Sent, payloads: int) -> 
     found: list[str] = []
     first, last = quiet.first, fuzzed.last
     if last.lifecycle != "armed":
-        found.append(f"lifecycle is {last.lifecycle}: {last.why}")
+        found.append(f"lifecycle is {last.lifecycle}: {last.reason}")
     if (last.lease_holder, last.lease_epoch) != (first.lease_holder, first.lease_epoch):
         found.append(f"the lease went from {first.lease_holder} {first.lease_epoch} to {last.lease_holder}")
     arrived = sum(sent.samples.values()) + sum(sent.queries.values())
@@ -243,7 +243,7 @@ def table(verdict: Verdict) -> str:
         f"  withheld  {counts(sent.withheld)}: valid and effective, so never sent",
         f"  answers   {counts(sent.answers)}; {sent.unanswered} queries to the HAL without one",
         f"refused   {counts(verdict.record.rejected_commands)}",
-        f"lifecycle {fuzzed.last.lifecycle}: {fuzzed.last.why}; lease of {fuzzed.last.lease_holder}, epoch "
+        f"lifecycle {fuzzed.last.lifecycle}: {fuzzed.last.reason}; lease of {fuzzed.last.lease_holder}, epoch "
         f"{fuzzed.last.lease_epoch} (before: {quiet.first.lease_holder}, {quiet.first.lease_epoch})",
         f"{'':10}{'quiet':>12}{'fuzzed':>12}",
         f"{'ticks':10}{quiet.counted('tick'):>12}{fuzzed.counted('tick'):>12}",

@@ -88,7 +88,7 @@ class Lab:
         while (status := self.status) is None or not condition(status):
             if time.monotonic() - began > limit_s:
                 logs = "\n".join(f"{log.name}: {log.read_text()[-500:]}" for log in self.folder.glob("*.log"))
-                raise AssertionError(f"not within {limit_s:g} s: {what}; {status and status.why}\n{logs}")
+                raise AssertionError(f"not within {limit_s:g} s: {what}; {status and status.reason}\n{logs}")
             time.sleep(0.001)
         return time.monotonic() - began
 
@@ -100,7 +100,7 @@ class Lab:
             self._ask("clear")
             self.until(lambda status: status.lifecycle == "disarmed", "cleared", limit_s)
         while (status := self.status) is None or status.lifecycle != "armed":
-            assert time.monotonic() - began < limit_s, f"not armed: {status and status.why}"
+            assert time.monotonic() - began < limit_s, f"not armed: {status and status.reason}"
             if status is not None and status.ready_to_arm:
                 self._ask("arm")
             time.sleep(0.02)
@@ -115,7 +115,7 @@ class Lab:
         robot = self.host.description
         assert robot is not None
         named = {"robot": robot.robot, "backend": robot.backend, "config_hash": robot.config_hash, "host": robot.host}
-        self.host.send_request(LifecycleRequest(action=action, who="links", **named))  # pyright: ignore[reportArgumentType]
+        self.host.send_request(LifecycleRequest(action=action, requester="links", **named))  # pyright: ignore[reportArgumentType]
 
 
 @contextmanager

@@ -73,6 +73,6 @@ def test_images_that_need_more_than_a_slow_link_has_stop_nothing(tmp_path: Path)
             return made.status is not None and made.status.lifecycle == "armed"
 
         # A busy computer may stop it once; a link that is too full would each time.
-        assert any(stays_armed() for _ in range(3)), made.status and made.status.why
+        assert any(stays_armed() for _ in range(3)), made.status and made.status.reason
         link = made.robot.run("tc", "-s", "qdisc", "show", "dev", "robot")
         assert re.search(r"overlimits [1-9]\d{2,}", link), f"it was not full: {link}"

@@ -121,7 +121,7 @@ class Operator:
         line.detected = latched is not None or restarted or any(status.lifecycle == "disarmed" for status in seen)
         if latched is not None:
             line.causes = [fault.cause for fault in latched.faults]
-            words = " ".join((latched.why, *line.causes, *(f"{fault.joint}" for fault in latched.faults)))
+            words = " ".join((latched.reason, *line.causes, *(f"{fault.joint}" for fault in latched.faults)))
             if not any(name in words for name in event.names):
                 line.violations.append(f"no cause names one of {', '.join(event.names)}: {words}")
         if event.follows == "stop" and not line.detected:

@@ -242,13 +242,13 @@ class KilledRun:
                 host, _, port = self._endpoint.removeprefix("tcp/").rpartition(":")
                 self._outcome.stop_answered = request_stop(host, int(port), "kills", 3.0) is not None
             elif self._session is not None:
-                answer = self._session.request(keys.ESTOP, EstopRequest(who="kills"), 3.0)
+                answer = self._session.request(keys.ESTOP, EstopRequest(requester="kills"), 3.0)
                 self._outcome.stop_answered = answer.ok
 
     def _ask_to_clear(self) -> None:
         if self._session is not None:
             with contextlib.suppress(NotConnectedError):
-                request = LifecycleRequest(action="clear", who="kills")
+                request = LifecycleRequest(action="clear", requester="kills")
                 self._outcome.clear_answered = self._session.request(keys.LIFECYCLE, request, 3.0).ok
 
     # --- after it ---------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def applied(tick: int, target: float) -> AppliedCommand:
 
 
 def stopped(why: str, *causes: str) -> Status:
-    return status(tick=1, lifecycle="fault", why=why, faults=[Fault(tick=1, what="hot", cause=c) for c in causes])
+    return status(tick=1, lifecycle="fault", reason=why, faults=[Fault(tick=1, what="hot", cause=c) for c in causes])
 
 
 @pytest.mark.parametrize(

@@ -63,15 +63,15 @@ class Watch(Observer):
 
     def _explained(self, status: Status) -> None:
         """A state that does not say why, or says something else."""
-        if not status.why:
+        if not status.reason:
             self._violated(f"{status.lifecycle} without a why")
         if status.lifecycle in ("fault", "estop") and not status.faults:
-            self._violated(f"{status.lifecycle} without a fault: {status.why}")
+            self._violated(f"{status.lifecycle} without a fault: {status.reason}")
         for fault in status.faults:
             if not fault.cause or not fault.what:
                 self._violated(f"a fault without a cause: {fault}")
-        if status.lifecycle == "fault" and not any(fault.cause in status.why for fault in status.faults):
-            self._violated(f"in fault because {status.why!r}, which none of its faults says")
+        if status.lifecycle == "fault" and not any(fault.cause in status.reason for fault in status.faults):
+            self._violated(f"in fault because {status.reason!r}, which none of its faults says")
         if status.ready_to_arm and (status.lifecycle != "disarmed" or status.waiting_for):
             self._violated(f"ready to arm in {status.lifecycle}, waiting for {status.waiting_for}")
 

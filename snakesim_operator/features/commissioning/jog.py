@@ -161,7 +161,7 @@ class _JogSession:
             self._follow_keys(keyboard)
         finally:
             if self._cycle().lifecycle == "armed":
-                disarm = LifecycleRequest(action="disarm", who=requester, host=self._robot.host)
+                disarm = LifecycleRequest(action="disarm", requester=requester, host=self._robot.host)
                 self._send_request(disarm, "disarmed")
 
     def _follow_keys(self, keyboard: Keyboard) -> None:
@@ -182,7 +182,7 @@ class _JogSession:
             clock = self._cycle()
             if clock.lifecycle != "armed":
                 self._read_status()
-                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.why}")
+                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.reason}")
             if moved and not target.moves:
                 print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
             moved = target.moves
@@ -230,7 +230,7 @@ class _JogSession:
         while not condition():
             self._cycle()
             if time.monotonic() > deadline_s or self._stop_requested:
-                raise RefusedError(f"not armed: {self._status.why}")
+                raise RefusedError(f"not armed: {self._status.reason}")
 
     def _send_request(self, request: LifecycleRequest, outcome: str) -> None:
         """Send a lifecycle request, and run cycles until it is answered. outcome: such as `armed`."""

@@ -71,7 +71,7 @@ def show_live(
                 if snapshot is not None:
                     changes.note(snapshot.status)
                     changes.note(snapshot.control)
-                    changes.note(snapshot.settings)
+                    changes.note(snapshot.parameters)
                     signals.add_snapshot(snapshot)
                 page.show_snapshot(snapshot)
 

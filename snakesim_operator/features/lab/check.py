@@ -201,7 +201,7 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
         found.failed(f"cannot be looked at as {watcher.common_name}: {error}")
         return
     if state.status is not None:
-        found.passed(f"{state.status.lifecycle} - {state.status.why}")
+        found.passed(f"{state.status.lifecycle} - {state.status.reason}")
         check_what_moves(lab.file.robots[robot], state.description, found)
     host = next((process for process in state.processes if process.name == HOST), None)
     for name, machine in _expected_processes(robot, lab, involved).items():

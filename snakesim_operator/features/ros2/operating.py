@@ -102,11 +102,11 @@ class _Operator:
 
     def disarm(self) -> str:
         """Disarm the robot."""
-        return self._request(LifecycleRequest(action="disarm", who=REQUESTER), "disarmed")
+        return self._request(LifecycleRequest(action="disarm", requester=REQUESTER), "disarmed")
 
     def clear(self) -> str:
         """Reset the robot's fault."""
-        return self._request(LifecycleRequest(action="clear", who=REQUESTER), "cleared")
+        return self._request(LifecycleRequest(action="clear", requester=REQUESTER), "cleared")
 
     def _request(self, request: LifecycleRequest, done: str) -> str:
         lines: list[str] = []

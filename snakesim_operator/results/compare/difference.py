@@ -210,8 +210,9 @@ def _check_comparable(a: RunRecord, b: RunRecord) -> None:
     for record in (a, b):
         if not len(record.time_s):
             raise ConfigError(
-                f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed ({record.host.why}); "
-                f"{record.folder / 'host.log'} may say more. Run it again, until the summary has a time"
+                f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed "
+                f"({record.host.reason}); {record.folder / 'host.log'} may say more. "
+                "Run it again, until the summary has a time"
             )
     if a.description.layout != b.description.layout:
         robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]

@@ -231,8 +231,8 @@ class Teleop:
         if worlds := self._worlds.drain():
             self._body_w_rad = yaw_from_rotation(rotation_from_quaternion(worlds[-1].base_orientation_wxyz))
         for intent in self._others.drain():
-            if intent.who != self._user:
-                self._other_user = intent.who
+            if intent.requester != self._user:
+                self._other_user = intent.requester
 
     def _send_intent(self) -> None:
         """Send an intent for each new robot time, once the operator has made an input.
@@ -266,7 +266,7 @@ class Teleop:
         if status is None:
             return f"{self._link.namespace}: no status yet"
         age = _describe_age(self._status_s)
-        return f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.why}"
+        return f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.reason}"
 
     def _describe_control(self) -> str:
         control = self._control

@@ -148,7 +148,7 @@ def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -
     ended = script(failing, waiting, tmp_path)
     assert ended.out == "armed\n" and "no idea" in ended.err
     with snakesim.Robot.connect(waiting.endpoint) as robot:
-        assert robot.status.lifecycle == "disarmed", robot.status.why
+        assert robot.status.lifecycle == "disarmed", robot.status.reason
 
 
 def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path) -> None:

@@ -227,10 +227,10 @@ from snakesim_gnc.control.hold import Hold
 
 
 class Deadly(Hold):
-    def update(self, view):
-        if view.tick > 20:
+    def update(self, observation):
+        if observation.tick > 20:
             os._exit(1)
-        return super().update(view)
+        return super().update(observation)
 """
 
 

@@ -20,7 +20,7 @@ from snakesim_testing.runs.keyboard import LEFT, UP, at_the_keyboard
 
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[3] / "examples" / "steer.py"
-NOTHING = Intent(timestamp_ns=0, who="nobody")
+NOTHING = Intent(timestamp_ns=0, requester="nobody")
 
 
 class Way:

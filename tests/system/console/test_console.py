@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.model.scenario import load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlSettings, JointState, Status
+from snakesim_hal.wire.messages import ControlParameters, JointState, Status
 from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page.page import Page
@@ -177,8 +177,10 @@ def change_settings(tab: Tab, run: Running) -> None:
     tab.type("amplitude_rad, rad", "0.4")
     tab.click("Apply")
     with open_session(Link(run.endpoint, "planar13")) as session:
-        in_force = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, 10.0, lambda one: one.who == "viewer 1")
-    assert in_force is not None and '"amplitude_rad":0.4' in in_force.settings
+        in_force = session.latest(
+            keys.PARAMETERS_IN_FORCE, ControlParameters, 10.0, lambda one: one.requester == "viewer 1"
+        )
+    assert in_force is not None and '"amplitude_rad":0.4' in in_force.parameters
 
 
 def stop_in(tab: Tab, run: Running) -> float:

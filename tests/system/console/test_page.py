@@ -77,7 +77,7 @@ def test_text_from_the_network_is_no_markup():
     evil = "<img src=x onerror=alert(1)>\x1b[2J"
     robot = description()
     named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
-    reported = status(lifecycle="fault", why=evil, commands_rejected={evil[:40]: 1}, **named)
+    reported = status(lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named)
     snapshot = RobotSnapshot(robot=robot, status=reported)
     shown = page_html.format_header(snapshot) + page_html.format_state_table(snapshot) + page_html.format_log([evil])
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown

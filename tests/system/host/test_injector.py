@@ -41,7 +41,7 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is
         answer = ask(run, "mute", "joint_2")
         assert answer.ok and answer.reason.startswith("mute of joint_2 has begun, at ") and answer.lifecycle == "armed"
         run.reaches("fault")
-        assert "joint_2" in run.status.why
+        assert "joint_2" in run.status.reason
         (on,) = run.status.injected
         assert on.startswith("mute:joint_2@")
         assert ask(run, "mute", "joint_2", end=True).ok

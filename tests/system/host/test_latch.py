@@ -34,7 +34,7 @@ def test_kept_found_and_released(tmp_path: Path) -> None:
     assert (tmp_path / ESTOP).is_file() and [path.name for path in tmp_path.iterdir()] == [ESTOP]
     second = EstopLatch(tmp_path)
     assert second.left_by_earlier_host is not None and (
-        second.left_by_earlier_host.who,
+        second.left_by_earlier_host.requester,
         second.left_by_earlier_host.tick,
     ) == ("anna", 7)
     assert asked(second, "engage") is None and asked(second, "release") is None
@@ -43,15 +43,15 @@ def test_kept_found_and_released(tmp_path: Path) -> None:
     assert asked(second, "engage") is None and EstopLatch(tmp_path).left_by_earlier_host is not None
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b'{"who":1}', b"\xff" * 100])
+@pytest.mark.parametrize("content", [b"", b"{", b'{"requester":1}', b"\xff" * 100])
 def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -> None:
     (tmp_path / ESTOP).write_bytes(content)
     latch = EstopLatch(tmp_path)
-    assert latch.left_by_earlier_host is not None and "cannot be read" in latch.left_by_earlier_host.who
+    assert latch.left_by_earlier_host is not None and "cannot be read" in latch.left_by_earlier_host.requester
     assert asked(latch, "engage") is None
     again = EstopLatch(tmp_path)
     assert (
-        again.left_by_earlier_host is not None and again.left_by_earlier_host.who == "anna"
+        again.left_by_earlier_host is not None and again.left_by_earlier_host.requester == "anna"
     )  # a good file in its place
     assert asked(latch, "release") is None and EstopLatch(tmp_path).left_by_earlier_host is None
 
@@ -98,7 +98,7 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
 def test_a_host_on_a_disk_that_hangs_stops_at_once_answers_and_ends(tmp_path: Path, hanging: Event) -> None:
     with running(run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
         began = time.monotonic()
-        answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))
+        answer = run.ask(keys.ESTOP, EstopRequest(requester="anna"))
         assert answer.ok and answer.lifecycle == "estop" and "not stored yet" in answer.reason
         assert time.monotonic() - began < 2.0
         run.reaches("estop")

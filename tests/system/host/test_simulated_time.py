@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
 def ask(run: Running, action: Any, **more: Any) -> str:
-    answer = run.ask(keys.SIMULATOR, SimulatorRequest(action=action, who="ada", **more))
+    answer = run.ask(keys.SIMULATOR, SimulatorRequest(action=action, requester="ada", **more))
     assert answer.ok, answer.reason
     return answer.reason
 
@@ -64,7 +64,7 @@ def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None
     with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, _):
         ask(run, "pause")
         tick = stands_at(run)
-        assert run.ask(keys.ESTOP, EstopRequest(who="bob")).lifecycle == "estop"
+        assert run.ask(keys.ESTOP, EstopRequest(requester="bob")).lifecycle == "estop"
         run.reaches("estop")
         assert run.backend.advanced == tick
         ask(run, "resume")
@@ -77,7 +77,7 @@ def test_speed_scales_real_time_and_a_reset_ends_the_host_disarmed() -> None:
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")
         assert run.status.speed == 0.2 and run.status.real_time_factor == pytest.approx(0.2, rel=0.3)
-        assert run.status.lifecycle == "armed", run.status.why
+        assert run.status.lifecycle == "armed", run.status.reason
         ask(run, "reset")
         wait_until(run.ended, "the host's end")
         assert run.host.ended == "reset" and run.host.authority.state == "disarmed"

@@ -161,7 +161,9 @@ def test_the_gate_is_inside_and_says_so() -> None:
 def test_a_robot_that_is_stopped_ends_the_episode_with_the_reason(action: str, fault: str, why: str) -> None:
     env = made(set={"faults": [fault]}, action=action)
     info = episode(env, action=lambda time_s: 0.1 * wave(time_s))
-    assert info["ended"] == "stopped" and info["lifecycle"] == "fault" and why in info["why"] and info["time_s"] < 0.4
+    assert (
+        info["ended"] == "stopped" and info["lifecycle"] == "fault" and why in info["reason"] and info["time_s"] < 0.4
+    )
     assert info["reward_terms"]["stopped"] == -1.0
 
 

@@ -62,23 +62,21 @@ def saved(
     return file
 
 
-class Same:
+class Same(snakesim.Controller):
     """The same in Python."""
 
-    NEEDS = "joints"
+    needs_world = False
 
-    class Settings(snakesim.Settings, frozen=True):
-        pass
+    def __init__(self, robot, parameters):
+        super().__init__(robot, parameters)
+        self.ticks = 0
 
-    def __init__(self, robot, settings):
-        self.robot, self.ticks = robot, 0
-
-    def update(self, view):
+    def update(self, observation):
         if self.ticks % FRAME_SKIP == 0:
-            bend = np.abs(np.float32(view.time_s) - SHIFT_S) * np.float32(0.25)
-            self.target = (bend + np.float32(view.joints.angle_rad) * np.float32(0.5)).tolist()
+            bend = np.abs(np.float32(observation.time_s) - SHIFT_S) * np.float32(0.25)
+            self.target = (bend + np.array(observation.joints.angle_rad, np.float32) * np.float32(0.5)).tolist()
         self.ticks += 1
-        return snakesim.Action(snakesim.positions(self.robot, self.target))
+        return snakesim.ControllerCommand(snakesim.positions(self.robot, self.target))
 
 
 def driven(model: Path, scenario: str = "triplet", duration: float = 0.1) -> snakesim.Result:

@@ -30,17 +30,15 @@ def wave(time_s, joints):
     return [0.2 * min(time_s, 1.0) * np.sin(3 * time_s - 0.9 * i) for i in range(len(joints.angle_rad))]
 
 
-class Nod:
-    NEEDS = "joints"
+class Nod(snakesim.Controller):
+    needs_world = False
 
-    class Settings(snakesim.Settings, frozen=True):
+    class Parameters(snakesim.Parameters, frozen=True):
         by_rad: float = 0.0
 
-    def __init__(self, robot, settings):
-        self.robot, self.by_rad = robot, settings.by_rad
-
-    def update(self, view):
-        return snakesim.Action(snakesim.positions(self.robot, [self.by_rad] * len(self.robot.joints)))
+    def update(self, observation):
+        angles_rad = [self.parameters.by_rad] * len(self.robot.joints)
+        return snakesim.ControllerCommand(snakesim.positions(self.robot, angles_rad))
 
 
 FAILING = """\
@@ -49,7 +47,7 @@ from snakesim_gnc.control.hold import Hold
 
 
 class Failing(Hold):
-    def update(self, view):
+    def update(self, observation):
         np.linalg.solve(np.zeros((2, 2)), np.ones(2))
 """
 
@@ -80,7 +78,7 @@ def test_a_function_is_a_controller() -> None:  # a lambda, too: tests/system/le
     assert np.ptp(found["target.joint_5"]) > 0.1
 
 
-def test_a_class_is_a_controller_and_takes_settings() -> None:
+def test_a_class_is_a_controller_and_takes_parameters() -> None:
     found = snakesim.run("triplet", controller=Nod, duration=1, set={"control.by_rad": np.float64(0.3)})
     assert found["target.joint_5"][-1] == 0.3
     with pytest.raises(snakesim.ConfigError, match=r"set=\{'control.by_rd': 1\}: .* did you mean `by_rad`"):
@@ -104,7 +102,11 @@ WRONG = [
     (("triplet",), {"backend": "simm"}, "no backend called 'simm' is installed; did you mean `sim`"),
     (("triplet",), {"controller": lambda time_s: 0}, r"is called as f\(time_s, joints\)"),
     (("triplet",), {"controller": 5}, "controller=5: give a shipped name"),
-    (("triplet",), {"controller": int}, r"controller=int: a controller class needs a method update\(view\)"),
+    (
+        ("triplet",),
+        {"controller": int},
+        r"controller 'program:int': class int in module builtins does not derive from Controller",
+    ),
     (("triplet",), {"controller": wave, "processes": True}, "controller=wave: processes .* save it in a file"),
     (("triplet",), {"set": {"clock_mode": "realtime"}}, "in one process the clock mode is lockstep"),
 ]

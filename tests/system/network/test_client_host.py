@@ -127,12 +127,12 @@ def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_cl
 
 def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
     with commanded(run_config(clock_mode="realtime")) as (run, _):
-        answer = run.ask(keys.ESTOP, EstopRequest(who="passer-by"))
+        answer = run.ask(keys.ESTOP, EstopRequest(requester="passer-by"))
         assert answer.ok and answer.lifecycle == "estop"
         at = len(run.backend.enacted)
         wait_until(lambda: len(run.backend.enacted) > at + 5, "five ticks more")
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
-        assert "passer-by" in run.status.why and run.status.faults[-1].what == "estop"
+        assert "passer-by" in run.status.reason and run.status.faults[-1].what == "estop"
         assert "must be disarmed" in run.lifecycle("arm").reason
         assert run.lifecycle("clear").lifecycle == "disarmed"
         run.arm()
@@ -165,7 +165,7 @@ def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is
 
 def test_arming_waits_for_everybody_and_says_for_whom_and_time_stands_still_until_then() -> None:
     with running(run_config()) as run:
-        assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.why
+        assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.reason
         answer = run.lifecycle("arm")
         assert not answer.ok and answer.reason == "waiting for control"
         with following(run.link, Follower()) as control:
@@ -249,7 +249,7 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
             publisher.put(command(host.description, sequence=sequence))
         wait_until(lambda: host._inbox.dropped >= 400, "a full inbox")
         answers: list[Any] = []
-        request = EstopRequest(who="a person")
+        request = EstopRequest(requester="a person")
         asking = threading.Thread(target=lambda: answers.append(stranger.request(keys.ESTOP, request, 10.0)))
         asking.start()
         wait_until(lambda: host._inbox.waiting() > limit, "the estop in the inbox")
@@ -287,7 +287,7 @@ def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold(
         run.backend.read_s = 0.03
         slow = "backend 'lag' takes 3"
         wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
-        assert "ms to read" in run.status.why and "of a tick of 20 ms; it would hold 2" in run.status.why
+        assert "ms to read" in run.status.reason and "of a tick of 20 ms; it would hold 2" in run.status.reason
         run.backend.read_s = 0.0
         wait_until(lambda: not run.status.realtime_warnings, "no warning")
 

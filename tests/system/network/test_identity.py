@@ -64,7 +64,7 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
         wait_until(lambda: starter.receive() or starter.answers, "an answer")
         assert starter.answers.pop().ok
         run.reaches("armed")
-        assert run.status.why.startswith("armed by the run")
+        assert run.status.reason.startswith("armed by the run")
         assert [text.split(": ", 1)[1] for text in run.host.requests][-1] == "arm by 'the run', done"
     starter.close()
 

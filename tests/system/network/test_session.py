@@ -141,7 +141,7 @@ def test_an_answer_to_somebody_who_has_gone_hurts_nobody() -> None:
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
         hal.on_query(keys.ESTOP, questions.append)
         with open_session(Link(endpoint, "worm")) as session, pytest.raises(NotConnectedError):
-            session.request(keys.ESTOP, EstopRequest(who="a person"), timeout_s=0.1)
+            session.request(keys.ESTOP, EstopRequest(requester="a person"), timeout_s=0.1)
         wait_until(lambda: questions, "the question")
         questions[0].reply(Answer(ok=True, reason=""))
 

@@ -92,7 +92,7 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (image(bytes(12), turned=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
         (trajectory((0.0, 0.0), (1.0, 0.0)), None),
         (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
-        (Intent(timestamp_ns=0, who="operator"), None),
+        (Intent(timestamp_ns=0, requester="operator"), None),
     ],
 )
 def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
@@ -124,7 +124,7 @@ def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out()
             lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(), "everybody heard"
         )
         for speed in (0.1, 0.2):
-            asked.put(Intent(timestamp_ns=5, who="operator", speed_m_s=speed))
+            asked.put(Intent(timestamp_ns=5, requester="operator", speed_m_s=speed))
         felt.put(state(ROBOT, 0.1, tick=3))
         felt.put(msgspec.structs.replace(state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
         ticks = client.ticks()

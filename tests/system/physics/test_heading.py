@@ -18,7 +18,9 @@ def _moved_to_the_left_m(heading_w_rad: float, seconds: int, seed: int) -> float
         places: list[float] = []
         for turn, _ in enumerate(run.iterate_ticks()):
             if turn % 20 == 0:
-                intents.put(Intent(timestamp_ns=run.host.status().timestamp_ns, who="ann", heading_w_rad=heading_w_rad))
+                intents.put(
+                    Intent(timestamp_ns=run.host.status().timestamp_ns, requester="ann", heading_w_rad=heading_w_rad)
+                )
             places += [world.center_w[1] for world in worlds.drain() if world.center_w is not None]
         session.close()
     return places[-1] - places[0]

@@ -13,7 +13,7 @@ from snakesim_gnc.control.hold import Hold
 
 
 class Endless(Hold):
-    def update(self, view):
+    def update(self, observation):
         while True:
             pass
 """

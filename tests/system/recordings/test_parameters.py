@@ -5,11 +5,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, list_installed
+from snakesim_hal.controller import load_controller
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlSettings, SettingsRequest
+from snakesim_hal.wire.messages import ControlParameters, ParametersRequest
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
@@ -27,12 +28,14 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
         session, recording = run.network.session(), Recording(path)
         for row in keys.SPACE:
             session.on_latched_arrival(row.key, recording.write_arrival)
-        request = SettingsRequest(
-            who="ada", controller=config.controller, settings='{"propulsion_n": 20, "damping_nm_s_per_rad": 0.9}'
+        request = ParametersRequest(
+            requester="ada",
+            controller=config.controller,
+            parameters='{"propulsion_n": 20, "damping_nm_s_per_rad": 0.9}',
         )
         for turn, _ in enumerate(run.iterate_ticks()):
             if turn == CHANGED_AT:
-                session.send_query(keys.SETTINGS, request)
+                session.send_query(keys.PARAMETERS, request)
         recording.close({})
     return path
 
@@ -61,16 +64,16 @@ MUST_BE_SET = {"policy": {"model": "a.onnx"}}
 
 @pytest.mark.parametrize("name", list_installed(CONTROLLERS))
 def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
-    settings = find_plugin(CONTROLLERS, name).Settings
-    in_force = ControlSettings(
+    parameters_type = load_controller(name).Parameters
+    in_force = ControlParameters(
         tick=0,
         timestamp_ns=0,
         controller=name,
-        settings=msgspec.json.encode(settings(**MUST_BE_SET.get(name, {}))).decode(),
-        schema=msgspec.json.encode(msgspec.json.schema(settings)).decode(),
+        parameters=msgspec.json.encode(parameters_type(**MUST_BE_SET.get(name, {}))).decode(),
+        schema=msgspec.json.encode(msgspec.json.schema(parameters_type)).decode(),
     )
     found = read_parameters(in_force)
-    assert len(found) == len(msgspec.structs.fields(settings))
+    assert len(found) == len(msgspec.structs.fields(parameters_type))
     for one in found:
         assert one.description and one.range and (one.unit or one.name in ("push_scale", "model", "slides")), one
 

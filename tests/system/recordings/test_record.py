@@ -237,7 +237,7 @@ def test_a_disk_that_hangs_delays_neither_ticks_nor_a_stop_nor_the_end(tmp_path:
             time.sleep(1.0)
             assert newest_status(session).tick - before >= 0.8 * RATE_HZ
             began = time.monotonic()
-            answer = session.request(keys.ESTOP, EstopRequest(who="anna"))
+            answer = session.request(keys.ESTOP, EstopRequest(requester="anna"))
             assert answer.ok and answer.lifecycle == "estop" and time.monotonic() - began < 3.0
             assert "not stored yet" in answer.reason or (tmp_path / "run" / ESTOP).exists()
             assert session.request(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok

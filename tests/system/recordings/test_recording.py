@@ -49,7 +49,7 @@ def done(tick: int, service: str = "control") -> Arrival:
 def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mcap")
     intent = Arrival(
-        keys.INTENT, encode(Intent(timestamp_ns=5, who="anna")), format_encoding(Intent), time.monotonic_ns()
+        keys.INTENT, encode(Intent(timestamp_ns=5, requester="anna")), format_encoding(Intent), time.monotonic_ns()
     )
     negative = msgspec.structs.replace(done(0), payload=msgspec.msgpack.encode({"tick": -1}))
     sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]

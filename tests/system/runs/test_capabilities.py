@@ -2,10 +2,10 @@
 
 import pytest
 
-from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import ControllerError
+from snakesim_hal.controller import NoParameters, Observation
 from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire.messages import Mode
@@ -25,15 +25,15 @@ def test_a_robot_of_position_servos_without_measurements_runs_what_needs_none() 
 
 def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_command() -> None:
     class Pushes(Hold):
-        def update(self, view):  # pyright: ignore
-            action = super().update(view)
-            action.setpoints.mode[1] = Mode.TORQUE
-            return action
+        def update(self, observation):  # pyright: ignore
+            command = super().update(observation)
+            command.setpoints.mode[1] = Mode.TORQUE
+            return command
 
     config = load("triplet", [parse_set(text) for text in SERVOS]).config
     robot = describe_robot(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
-    view = View(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
+    observation = Observation(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
     with pytest.raises(
         ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"
     ):
-        GuardedController("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]
+        GuardedController("pushes", Pushes, robot, NoParameters()).update(observation)  # pyright: ignore[reportArgumentType]

@@ -27,7 +27,7 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
             statuses = session.reader(keys.STATUS, Status)
             wait_until(lambda: bool(statuses.drain()), "a status")
             os.kill(run.part("control"), signal.SIGKILL)
-            wait_until(lambda: any("lease of control expired" in one.why for one in statuses.drain()), "the reason")
+            wait_until(lambda: any("lease of control expired" in one.reason for one in statuses.drain()), "the reason")
         assert run.end() == 1
     faults = {fault.what: fault for fault in summary_of(run.out).faults}  # a busy computer may see any of them first
     assert set(faults) == {"service_lost", "lease_expired"}
@@ -47,15 +47,15 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
 def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
-        "from snakesim_gnc.control.controller import Action, RequestedSetpoints\n"
+        "from snakesim_hal.controller import ControllerCommand, RequestedSetpoints\n"
         "from snakesim_gnc.control.hold import Hold\n"
         "from snakesim_hal.wire.messages import Mode\n\n\n"
         "class Wave(Hold):\n"
-        "    def update(self, view):\n"
-        "        if view.time_s < 0.5:\n"
-        "            return super().update(view)\n"
-        "        angles = list(view.joints.angle_rad)[:-1]\n"
-        "        return Action(RequestedSetpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
+        "    def update(self, observation):\n"
+        "        if observation.time_s < 0.5:\n"
+        "            return super().update(observation)\n"
+        "        angles = list(observation.joints.angle_rad)[:-1]\n"
+        "        return ControllerCommand(RequestedSetpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
     flags = ["--controller", "./wave.py:Wave", "--clock-mode", clock_mode, "--duration", "60"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
@@ -76,9 +76,9 @@ def test_a_controller_that_is_too_slow_is_named_as_the_cause_of_the_stop(tmp_pat
         "import time\n\n"
         "from snakesim_gnc.control.hold import Hold\n\n\n"
         "class Slow(Hold):\n"
-        "    def update(self, view):\n"
+        "    def update(self, observation):\n"
         "        time.sleep(0.1)\n"
-        "        return super().update(view)\n"
+        "        return super().update(observation)\n"
     )
     flags = ["--controller", "./slow.py:Slow", "--clock-mode", "realtime", "--duration", "10"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)

@@ -89,9 +89,9 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         "        super().advance()\n"
         "        tell('host')\n\n"
         "class Telling(Hold):\n"
-        "    def update(self, view):\n"
+        "    def update(self, observation):\n"
         "        tell('control')\n"
-        "        return super().update(view)\n"
+        "        return super().update(observation)\n"
     )
     arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
     arguments += ["--clock-mode", "realtime", "--unchecked"]

@@ -33,10 +33,10 @@ from snakesim_gnc.control.hold import Hold
 
 
 class Failing(Hold):
-    def update(self, view):
-        if view.tick == 20:
+    def update(self, observation):
+        if observation.tick == 20:
             raise ValueError("no idea")
-        return super().update(view)
+        return super().update(observation)
 """
 
 
@@ -63,18 +63,18 @@ from snakesim_gnc.control.hold import Hold
 
 
 class Endless(Hold):
-    def update(self, view):
-        while view.tick > 20:
+    def update(self, observation):
+        while observation.tick > 20:
             Path("begun").touch()
-        return super().update(view)
+        return super().update(observation)
 
 
 class Compiled(Hold):
-    def update(self, view):
-        if view.tick > 20:
+    def update(self, observation):
+        if observation.tick > 20:
             Path("begun").touch()
             sum(iter(int, 1))
-        return super().update(view)
+        return super().update(observation)
 """
 
 

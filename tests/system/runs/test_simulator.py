@@ -74,5 +74,5 @@ def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_
 def pause(session: Session) -> bool:
     """False while there is no host that answers."""
     with contextlib.suppress(NotConnectedError):
-        return session.request(keys.SIMULATOR, SimulatorRequest(action="pause", who="ada")).ok
+        return session.request(keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")).ok
     return False

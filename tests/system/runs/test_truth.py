@@ -15,11 +15,11 @@ from snakesim_operator.results.summary import summarise
 from snakesim_testing.runs.in_process_command import run_to_summary
 
 STILL = (
-    "from snakesim_gnc.control.controller import Action, positions\n"
+    "from snakesim_hal.controller import ControllerCommand, positions\n"
     "from snakesim_gnc.control.hold import Hold\n\n\n"
     "class Still(Hold):\n"
-    "    def update(self, view):\n"
-    "        return Action(super().update(view).setpoints)\n"
+    "    def update(self, observation):\n"
+    "        return ControllerCommand(super().update(observation).setpoints)\n"
 )
 
 

@@ -1,9 +1,12 @@
 """Gaits on flat ground, in the simulator: where they carry the body, and a robot that cannot do them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from snakesim_gnc.control.gaits import RaisedHead, Rolling, Sidewinding
+from snakesim_hal.controller import Controller
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import Result, simulate
@@ -51,10 +54,10 @@ def test_at_speed_zero_a_gait_stands() -> None:
 
 
 @pytest.mark.parametrize("gait", [Sidewinding, Rolling, RaisedHead])
-def test_a_bent_robot_that_cannot_do_it_stays_bent_and_says_why(gait: type[Sidewinding | Rolling | RaisedHead]) -> None:
+def test_a_bent_robot_that_cannot_do_it_stays_bent_and_says_why(gait: type[Controller[Any]]) -> None:
     stage = make_stage()
-    controller = gait(stage.robot, gait.Settings())
-    actions = [controller.update(stage.view(tick, 0.3)) for tick in range(200)]
-    targets = [action.setpoints.target for action in actions]
-    assert all("no joints that turn up and down" in action.report.why for action in actions)
+    controller = gait(stage.robot, gait.Parameters())
+    commands = [controller.update(stage.observe(tick, 0.3)) for tick in range(200)]
+    targets = [command.setpoints.target for command in commands]
+    assert all("no joints that turn up and down" in command.telemetry.reason for command in commands)
     assert np.abs(targets[0]).max() > 0.2 and np.abs(np.array(targets) - targets[0]).max() < 1e-9

@@ -4,68 +4,67 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_testing.gnc.stage import make_stage
 
 STAGE = make_stage(3)
-VIEW = STAGE.view(0, 0.3)
-GOOD = positions(STAGE.robot, VIEW.joints.angle_rad)
+OBSERVATION = STAGE.observe(0, 0.3)
+GOOD = positions(STAGE.robot, OBSERVATION.joints.angle_rad)
 WHO = r"^controller ./wave.py:Wave \(class Wave\): "
 
 
-class Wave:
+class Wave(Controller[Any]):
     """Answers whatever it is given."""
 
-    class Settings(msgspec.Struct):
-        """None."""
+    def __init__(self, robot: Description, parameters: Any) -> None:
+        super().__init__(robot, parameters)
+        self.answer = parameters
+        if isinstance(parameters, Exception):
+            raise parameters
 
-    def __init__(self, robot: Description, settings: Any) -> None:
-        self.answer = settings
-        if isinstance(settings, Exception):
-            raise settings
-
-    def update(self, view: View) -> Any:
+    def update(self, observation: Observation) -> Any:
         if isinstance(self.answer, type) and issubclass(self.answer, BaseException):
             raise self.answer("as planned")
         return self.answer
 
 
-def update(answer: Any) -> Action:
-    plugin: Any = Wave
-    return GuardedController("./wave.py:Wave", plugin, STAGE.robot, answer).update(VIEW)
+def update(answer: Any) -> ControllerCommand:
+    return GuardedController("./wave.py:Wave", Wave, STAGE.robot, answer).update(OBSERVATION)
 
 
-def points(**changes: Any) -> Action:
-    return Action(replace(GOOD, **changes))
+def points(**changes: Any) -> ControllerCommand:
+    return ControllerCommand(replace(GOOD, **changes))
 
 
-def reported(**report: Any) -> Action:
-    return Action(GOOD, Report(**report))
+def reported(**telemetry: Any) -> ControllerCommand:
+    return ControllerCommand(GOOD, Telemetry(**telemetry))
 
 
-def made_of(setpoints: Any, report: Any = None) -> Action:
-    return Action(setpoints, report or Report())
+def made_of(setpoints: Any, telemetry: Any = None) -> ControllerCommand:
+    return ControllerCommand(setpoints, telemetry or Telemetry())
 
 
 def test_a_good_answer_passes_as_it_is() -> None:
-    for answer in (Action(GOOD), points(target=[1, 0.5, -2]), points(mode=list(Mode)[:3])):
+    for answer in (ControllerCommand(GOOD), points(target=[1, 0.5, -2]), points(mode=list(Mode)[:3])):
         assert update(answer) is answer
 
 
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        (None, r"update\(\) returned None, must return an Action"),
-        (GOOD, r"update\(\) returned RequestedSetpoints\(.*\.\.\. \(RequestedSetpoints\), must return an Action"),
-        (made_of([0.0] * 3), r"Action.setpoints is \[0.0, 0.0, 0.0\] \(list\), must be RequestedSetpoints"),
-        (made_of(GOOD, "moving"), r"Action.report is 'moving', must be a Report"),
+        (None, r"update\(\) returned None, must return a ControllerCommand"),
+        (
+            GOOD,
+            r"update\(\) returned RequestedSetpoints\(.*\.\.\. \(RequestedSetpoints\), must return a ControllerCommand",
+        ),
+        (made_of([0.0] * 3), r"ControllerCommand.setpoints is \[0.0, 0.0, 0.0\] \(list\), must be RequestedSetpoints"),
+        (made_of(GOOD, "moving"), r"ControllerCommand.telemetry is 'moving', must be Telemetry"),
         (
             points(target=[0.0] * 2),
             r"RequestedSetpoints.target has 2 values, must have 3: one a joint, joint_1 to joint_3",
@@ -91,9 +90,9 @@ def test_a_good_answer_passes_as_it_is() -> None:
             r"RequestedSetpoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION",
         ),
         (points(mode=[Mode.POSITION, 7, "x"]), r"RequestedSetpoints.mode\[1\] \(joint_2\) is 7"),
-        (reported(why=None), "Report.why is None, must be a str"),
-        (reported(usable_push_points="3"), "Report.usable_push_points is '3'"),
-        (reported(propulsion_joint=3), "Report.propulsion_joint is 3, must be None or an int from 0 to 2"),
+        (reported(reason=None), "Telemetry.reason is None, must be a str"),
+        (reported(usable_push_points="3"), "Telemetry.usable_push_points is '3'"),
+        (reported(propulsion_joint=3), "Telemetry.propulsion_joint is 3, must be None or an int from 0 to 2"),
         (ZeroDivisionError, r"update\(\) raised ZeroDivisionError: as planned \(test_guarded.py line \d+\)"),
         (SystemExit, r"update\(\) raised SystemExit: as planned"),
         (ValueError("no such robot"), r"__init__\(\) raised ValueError: no such robot"),

@@ -82,7 +82,7 @@ def _stopped(
         if by_datagram:
             answers.append(datagrams.ask(made.endpoint, datagrams.stop("operator"), ANSWER_S))
         else:
-            answers.append(observer.ask(keys.ESTOP, EstopRequest(who="operator")).ok)
+            answers.append(observer.ask(keys.ESTOP, EstopRequest(requester="operator")).ok)
 
     asking = threading.Thread(target=ask, daemon=True)
     asking.start()
@@ -114,7 +114,7 @@ def second_run(request: Request) -> Iterator[Trial]:
         for number in range(request.trials):
             if observer.state() != "armed":
                 observer.arm()
-            observer.ask(keys.LIFECYCLE, LifecycleRequest(action="disarm", who="bench"))
+            observer.ask(keys.LIFECYCLE, LifecycleRequest(action="disarm", requester="bench"))
             observer.until(lambda: observer.state() == "disarmed", "disarmed")
             observer.watch(0.1)
             observer.forget()

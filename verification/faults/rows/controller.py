@@ -28,7 +28,7 @@ def _trial(made: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
     status = observer.first_fault(failed_ns)
     failures: list[str] = []
     if not any(fault.what == "lease_expired" for fault in status.faults):
-        failures.append(f"not because of the lease: {status.why}")
+        failures.append(f"not because of the lease: {status.reason}")
     if status.lease_holder is not None:
         failures.append(f"the lease is still {status.lease_holder}'s")
     mend(made)

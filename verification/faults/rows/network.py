@@ -67,7 +67,7 @@ def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
     if any(h.message.sequence is not None for h in observer.applied):
         failures.append("commands were applied without an arm session")
     if not any(fault.what == "lease_expired" for fault in status.faults):
-        failures.append(f"not because of the lease: {status.why}")
+        failures.append(f"not because of the lease: {status.reason}")
     return recovered(observer, value, "; ".join(failures))
 
 

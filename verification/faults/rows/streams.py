@@ -27,7 +27,7 @@ def no_joints(request: Request) -> Iterator[Trial]:
             status = observer.first_fault(asked_ns)
             failures: list[str] = []
             if [fault.what for fault in status.faults] != ["lease_expired"]:
-                failures.append(f"not because of the lease: {status.why}")
+                failures.append(f"not because of the lease: {status.reason}")
             if status.lease_holder is not None:
                 failures.append(f"the lease is still {status.lease_holder}'s")
             _mend(observer, keys.JOINTS)

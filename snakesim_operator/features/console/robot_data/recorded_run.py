@@ -74,7 +74,7 @@ class RecordedRun:
             # From the other messages of the recording.
             status=history.find_newest(keys.STATUS, time_s),
             power=history.find_newest(keys.POWER, time_s),
-            settings=history.find_newest(keys.SETTINGS_IN_FORCE, time_s),
+            parameters=history.find_newest(keys.PARAMETERS_IN_FORCE, time_s),
             images=self._find_images(time_s),
             own=history.find_all_newest(keys.OWN_ALL, time_s),
             streams=history.measure_streams(time_s),
@@ -114,7 +114,7 @@ class RecordedRun:
         """
         messages: list[tuple[float, Any]] = [
             *self.history.iterate_messages(keys.STATUS),
-            *self.history.iterate_messages(keys.SETTINGS_IN_FORCE),
+            *self.history.iterate_messages(keys.PARAMETERS_IN_FORCE),
             *((timestamp_s(state), state) for state in self.record.control),
         ]
         messages.sort(key=lambda timed_message: timed_message[0])

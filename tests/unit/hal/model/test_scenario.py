@@ -207,7 +207,7 @@ def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_fla
     for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):
         config = with_flags(path, *flags).config
         assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
-        assert config.control_settings == {"gain": 3} and config.control_section == "controllers.Wave"
+        assert config.controller_parameters == {"gain": 3} and config.control_section == "controllers.Wave"
     assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
     assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {"emulator": {"step": 1}}
 

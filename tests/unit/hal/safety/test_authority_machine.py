@@ -349,7 +349,7 @@ class Everything(Model):
 
     @rule(who=st.text(min_size=1, max_size=64))
     def estop(self, who: str) -> None:
-        answer = self.authority.on_estop(EstopRequest(who=who), self.tick)
+        answer = self.authority.on_estop(EstopRequest(requester=who), self.tick)
         self.leave_for("estop")
         self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
         self.check(answer, True)

@@ -199,7 +199,7 @@ def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
 def test_diagnostics(status: m.Status) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
-    assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.why}")
+    assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.reason}")
     assert {"lifecycle", "backend", "lease holder"} <= {value.key for value in seen.values}
 
 

@@ -8,7 +8,7 @@ from snakesim_testing.hal.small_robots import run_config, status
 
 
 def at(tick: int, lifecycle: LifecycleState = "armed") -> Status:
-    return status(tick=tick, timestamp_ns=tick * 10**7, lifecycle=lifecycle, why=lifecycle)
+    return status(tick=tick, timestamp_ns=tick * 10**7, lifecycle=lifecycle, reason=lifecycle)
 
 
 def shown(progress: Progress, found: Status, capsys: pytest.CaptureFixture[str]) -> str:

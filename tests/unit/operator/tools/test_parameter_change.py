@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_gnc.control.live_settings import LiveSettings
+from snakesim_gnc.control.live_parameters import LiveParameters
 from snakesim_hal.base.errors import ControllerError, RefusedError
 from snakesim_hal.model.scenario import load
 from snakesim_hal.network.client import Client
@@ -33,7 +33,7 @@ class Control:
         """reported: after a request; None: it is silent. gone: it publishes no settings after it."""
         self._network = LocalNetwork()
         session = self._network.session()
-        self._settings = LiveSettings(Client(session, "control"), load("triplet", []).config)
+        self._settings = LiveParameters(Client(session, "control"), load("triplet", []).config)
         self._settings.configure(description())
         self._settings.answer_requests(CLOCK)
         self._states = session.publisher(keys.CONTROL_STATE, ControlState)
@@ -65,7 +65,7 @@ def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("reported", [state("standing still"), None], ids=["goes on", "time stands"])
 def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | None) -> None:
     before, now = parameters.change_parameters(Control(reported).operator, CHANGES, "ada")
-    assert (before.changes, now.changes, now.who) == (0, 1, "ada")
+    assert (before.changes, now.changes, now.requester) == (0, 1, "ada")
 
 
 @pytest.mark.parametrize("gone", [False, True])

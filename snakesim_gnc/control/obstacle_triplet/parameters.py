@@ -7,7 +7,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 
-class TripletSettings(FileStruct, frozen=True, kw_only=True):
+class TripletParameters(FileStruct, frozen=True, kw_only=True):
     """The defaults suit modules of about 0.1 m and some hundred grams. The speed is that of the mission."""
 
     # Propulsion. Its rate is limited because a body that starts and stops in jerks would shake the command.

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snakesim_hal.wire.messages import ControlSettings
-from snakesim_operator.features.console.page.settings_form import InputField, list_input_fields
+from snakesim_hal.wire.messages import ControlParameters
+from snakesim_operator.features.console.page.parameter_form import InputField, list_input_fields
 
 SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
     "push_n": {"type": "number", "unit": "N", "description": "a bound", "exclusiveMinimum": 0, "maximum": 10000},
@@ -15,8 +15,8 @@ SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
 VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": true, "names": ["x"]}'
 
 
-def settings(values: str, schema: str) -> ControlSettings:
-    return ControlSettings(tick=0, timestamp_ns=0, controller="any", settings=values, schema=schema)
+def settings(values: str, schema: str) -> ControlParameters:
+    return ControlParameters(tick=0, timestamp_ns=0, controller="any", parameters=values, schema=schema)
 
 
 def test_each_setting_has_an_input_within_its_bounds():

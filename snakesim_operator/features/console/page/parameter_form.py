@@ -1,4 +1,4 @@
-"""A controller's settings as sliders and boxes, made from the controller's own schema.
+"""A controller's parameters as sliders and boxes, made from the controller's own schema.
 
 The schema comes from the network. It decides which inputs are shown, and nothing else: control checks every value
 again.
@@ -11,13 +11,13 @@ from typing import Any
 import msgspec
 import viser
 
-from snakesim_hal.wire.messages import ControlSettings
+from snakesim_hal.wire.messages import ControlParameters
 from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
 
 
 @dataclass(frozen=True)
 class InputField:
-    """The input for one setting. A number has a range that is sensible to slide over."""
+    """The input for one parameter. A number has a range that is sensible to slide over."""
 
     name: str
     value: bool | int | float | str
@@ -29,10 +29,10 @@ class InputField:
     hint: str = ""
 
 
-def list_input_fields(settings: ControlSettings) -> list[InputField]:
-    """Return the inputs for the settings that a form can change; empty for a schema that cannot be read."""
+def list_input_fields(in_force: ControlParameters) -> list[InputField]:
+    """Return the inputs for the parameters that a form can change; empty for a schema that cannot be read."""
     fields: list[InputField] = []
-    for parameter in read_parameters(settings):
+    for parameter in read_parameters(in_force):
         field = _make_field(parameter)
         if field is not None:
             fields.append(field)
@@ -87,15 +87,15 @@ def _describe_number(parameter: Parameter) -> str:
     return "; ".join(parts)
 
 
-class SettingsForm:
-    """The inputs of one viewer for the settings of one controller."""
+class ParameterForm:
+    """The inputs of one viewer for the parameters of one controller."""
 
-    def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, settings: ControlSettings) -> None:
-        self.controller = settings.controller
-        self._values = _decode_values(settings)
-        self._inputs: dict[str, Any] = {}  # handles of viser, by the setting's name
+    def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, in_force: ControlParameters) -> None:
+        self.controller = in_force.controller
+        self._values = _decode_values(in_force)
+        self._inputs: dict[str, Any] = {}  # handles of viser, by the parameter's name
         with folder:
-            for field in list_input_fields(settings):
+            for field in list_input_fields(in_force):
                 self._inputs[field.name] = _add_input(gui, field)
 
     @property
@@ -108,16 +108,16 @@ class SettingsForm:
         for control in self._inputs.values():
             control.disabled = not enabled
 
-    def encode_settings(self) -> str:
-        """Return all settings as JSON, with the values that the viewer has entered."""
+    def encode_parameters(self) -> str:
+        """Return all parameters as JSON, with the values that the viewer has entered."""
         entered = {name: control.value for name, control in self._inputs.items()}
         return msgspec.json.encode({**self._values, **entered}).decode()
 
-    def show_values(self, settings: ControlSettings) -> bool:
+    def show_values(self, in_force: ControlParameters) -> bool:
         """Show the values in force, and return whether this form is for their controller."""
-        if settings.controller != self.controller:
+        if in_force.controller != self.controller:
             return False
-        self._values = _decode_values(settings)
+        self._values = _decode_values(in_force)
         for name, control in self._inputs.items():
             if name in self._values:
                 control.value = self._values[name]
@@ -129,8 +129,8 @@ class SettingsForm:
             control.remove()
 
 
-def _decode_values(settings: ControlSettings) -> dict[str, Any]:
-    return msgspec.json.decode(settings.settings, type=dict[str, Any])
+def _decode_values(in_force: ControlParameters) -> dict[str, Any]:
+    return msgspec.json.decode(in_force.parameters, type=dict[str, Any])
 
 
 def _add_input(gui: viser.GuiApi, field: InputField) -> Any:
