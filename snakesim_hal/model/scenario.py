@@ -109,7 +109,7 @@ class Mission(FileStruct, frozen=True, kw_only=True):
             raise ValueError("`until_goal`: this mission has no goal to reach; give it one in [mission.goal]")
 
 
-class Service(FileStruct, frozen=True, kw_only=True):
+class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
     """A process of the run that acts every `decimation` ticks.
 
     In lockstep, the output that a service computes for tick t is used from tick t + latency_ticks on, no matter when
@@ -187,7 +187,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     # What the parts of the run do.
     start: Start = Start()
     mission: Mission = Mission()
-    services: dict[str, Service]  # by name
+    services: dict[str, ServiceSchedule]  # by name
     max_age: MaxAge = MaxAge()
 
     # Parameters of each controller and settings of each backend, by name. The plugins check them.
@@ -215,7 +215,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return self.backends.get(_section_name(self.backend), {})
 
     @property
-    def own_services(self) -> dict[str, Service]:
+    def own_services(self) -> dict[str, ServiceSchedule]:
         """Return the services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
 

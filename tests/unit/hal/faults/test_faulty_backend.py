@@ -51,7 +51,7 @@ class Bench:
         return self.backend.sample(self.tick, self.tick * PERIOD_NS).joints
 
     def inject(self, text: str, *, begins: bool = True) -> None:
-        self.backend.inject(parse_injection(f"{text}@0"), begins)
+        self.backend.inject(parse_injection(f"{text}@0"), begins=begins)
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_an_angle_can_be_off_and_can_be_no_number(bench: Bench) -> None:
 
 
 def test_a_slow_simulator_takes_its_time(bench: Bench) -> None:
-    bench.backend.inject(parse_injection("slow:simulator@0=0.2"), True)
+    bench.backend.inject(parse_injection("slow:simulator@0=0.2"), begins=True)
     began = time.monotonic()
     bench.sample()
     assert 0.05 <= time.monotonic() - began < 1.0

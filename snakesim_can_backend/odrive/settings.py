@@ -1,0 +1,32 @@
+"""Settings of the backend `odrive`."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from msgspec import Meta
+
+from snakesim_can_backend.can_drives.backend import CanDriveSettings
+from snakesim_drivers.emulation.mounted import Mounted
+
+Amperes = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "A"})]
+Seconds = Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})]
+TurnsPerSecond = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "turns/s"})]
+
+
+class MountedAxis(Mounted, frozen=True, kw_only=True):
+    """How an emulated axis is mounted and configured, where that is not what the robot file needs."""
+
+    current_soft_max_a: Amperes | None = None
+    watchdog_timeout_s: Seconds | None = None  # 0: its watchdog is off
+    vel_limit_turns_s: TurnsPerSecond | None = None
+
+
+class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
+    """The scenario's `[backends.odrive]` section. `watchdog_s` is what the axes have in `watchdog_timeout`."""
+
+    # Files flat_endpoints.json that ODrive publishes with each firmware: one for each firmware and hardware on the bus.
+    # With them the driver reads watchdog, current and speed limits of every axis at the start. Empty: they are unknown.
+    endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
+    # The driver never sets a higher current limit. Default: what each axis is configured for; 1 A where it is unknown.
+    max_current_a: Amperes | None = None
+    mounted: Mapping[str, MountedAxis] = {}  # of emulated axes: joint -> how it is mounted and configured in truth
