@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import SafeSetpoints, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.fault_plan import check_backend_can
@@ -32,18 +32,19 @@ MOTORS_OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
 DIVERGED_SPEED_M_S = 10.0 * MAX_SPEED  # of the base, when a divergence is injected
 
 
-class SimBackend:
-    """A `snakesim_hal.backend.Backend` on MuJoCo. Deterministic: seed and commands decide every byte."""
+class SimBackend(Backend):
+    """The backend on MuJoCo. Deterministic: seed and commands decide every byte."""
 
     Settings = SimSettings
 
-    @staticmethod
-    def check(config: RunConfig, _settings: SimSettings) -> tuple[ClockMode, ...]:
+    @classmethod
+    def check(cls, config: RunConfig, settings: SimSettings) -> tuple[ClockMode, ...]:
         """Check that this backend can run a scenario, and return the clock modes that it supports: all of them.
 
         Raises:
             ConfigError: a gain, a sensor or an injected fault of the run is not possible here.
         """
+        del settings
         check_gains(config.robot)
         check_models(config.robot)
         possible_faults = ["diverge"]

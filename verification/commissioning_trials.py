@@ -17,8 +17,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from snakesim_drivers.emulation.emulated_body import EmulatedBody, SharedPhysics, make_physics_model
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
 from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_gnc.control.identify import Identify, IdentifyParameters
 from snakesim_hal.base.arrays import Floats

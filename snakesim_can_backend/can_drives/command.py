@@ -12,7 +12,7 @@ from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_w
 from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
-from snakesim_drivers.emulation.emulated_body import serve_until_stopped
+from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent

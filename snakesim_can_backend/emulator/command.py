@@ -19,7 +19,7 @@ from snakesim_can_backend.emulator.faults import describe_faults, parse_fault, p
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.emulated_body import make_physics_model
+from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent, on_stop_signal, tune_garbage_collector

@@ -13,7 +13,7 @@ from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.emulated_body import make_physics_model
+from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection

@@ -41,7 +41,7 @@ class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
 
 
 class MoteusBackend(CanDriveBackend):
-    """A `snakesim_hal.backend.Backend` on moteus controllers, real or emulated."""
+    """The backend on moteus controllers, real or emulated."""
 
     Settings = MoteusSettings
     drives_class = Controllers

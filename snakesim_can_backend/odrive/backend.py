@@ -1,12 +1,9 @@
 """The backend `odrive`, and `snakesim odrives`, which emulates axes as a process."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated
+from collections.abc import Sequence
 
-from msgspec import Meta
-
-from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
+from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.can_drives.command import run
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.odrive.axes import (
@@ -19,49 +16,15 @@ from snakesim_can_backend.odrive.axes import (
 from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
-from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_can_backend.odrive.settings import OdriveSettings
 from snakesim_drivers.kit.drive_settings import joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
-Amperes = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "A"})]
-Seconds = Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})]
-TurnsPerSecond = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "turns/s"})]
-
-
-class MountedAxis(Mounted, frozen=True, kw_only=True):
-    """How an emulated axis is mounted and configured, where that is not what the robot file needs."""
-
-    current_soft_max_a: Amperes | None = None
-    """Current limit that the emulated axis is configured with; none: what the robot file needs."""
-
-    watchdog_timeout_s: Seconds | None = None
-    """Time of the axis's watchdog; 0: it is off; none: `watchdog_s` of the backend."""
-
-    vel_limit_turns_s: TurnsPerSecond | None = None
-    """Speed limit that the emulated axis is configured with; none: what the robot file needs."""
-
-
-class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
-    """The scenario's `[backends.odrive]` section. `watchdog_s` is what the axes have in `watchdog_timeout`."""
-
-    endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
-    """Files flat_endpoints.json of every firmware on the bus, to read watchdog, current and speed limits at the start;
-    empty: they are unknown.
-    """
-
-    max_current_a: Amperes | None = None
-    """Current limit above which the driver never sets an axis; none: what each axis is configured for, or 1 A where
-    that is unknown.
-    """
-
-    mounted: Mapping[str, MountedAxis] = {}
-    """For joints of emulated axes, how each is really mounted and configured."""
-
 
 class OdriveBackend(CanDriveBackend):
-    """A `snakesim_hal.backend.Backend` on ODrive axes, real or emulated."""
+    """The backend on ODrive axes, real or emulated."""
 
     Settings = OdriveSettings
     drives_class = Axes

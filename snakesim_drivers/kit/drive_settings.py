@@ -5,8 +5,9 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, SharedPhysics, make_physics_model
+from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
+from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_drivers.motion_capture.mocap import check_pose
 from snakesim_hal.base.errors import ConfigError

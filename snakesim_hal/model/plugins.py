@@ -8,6 +8,7 @@ import ast
 import contextlib
 import importlib.util
 import sys
+from abc import ABC
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
@@ -219,6 +220,22 @@ def _from_file(name: str, kind: str) -> Any:
     if not hasattr(module, attribute):
         raise _missing_class_error(name, kind, tree)
     return getattr(module, attribute)
+
+
+def require_base_class(plugin: Any, base: type[ABC], label: str) -> None:
+    """Raise ConfigError if a plugin does not derive from a base class, or does not implement its abstract methods.
+
+    Args:
+        plugin: the object that `find_plugin` has returned.
+        base: the class that describes the interface.
+        label: kind and name of the plugin, with which the error begins.
+    """
+    file = base.__module__.replace(".", "/") + ".py"
+    if not (isinstance(plugin, type) and issubclass(plugin, base)):
+        raise ConfigError(f"{label} is not derived from `{base.__name__}` in {file}: derive its class from that one")
+    missing = sorted(plugin.__abstractmethods__)
+    if missing:
+        raise ConfigError(f"{label} has no {', '.join(missing)}: implement what {file} describes")
 
 
 def plugin_settings(

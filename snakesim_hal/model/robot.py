@@ -17,7 +17,8 @@ from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, make_joints
 from snakesim_hal.model.links import Link
-from snakesim_hal.model.plugins import SENSORS, find_plugin
+from snakesim_hal.model.plugins import SENSORS, find_plugin, require_base_class
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import CustomSensor, LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -329,8 +330,9 @@ def with_serials(robot: Description, serials: Sequence[str], firmware: Sequence[
 def _own_schema(sensor: CustomSensor) -> str:
     """Return the schema of a custom sensor's message. Raises ConfigError if its class cannot be loaded or has none."""
     model = find_plugin(SENSORS, sensor.model)
-    message = getattr(model, "message", None)
-    return make_message_schema(message, f"sensor {sensor.name!r}: model {shorten(sensor.model)}")
+    label = f"sensor {sensor.name!r}: model {shorten(sensor.model)}"
+    require_base_class(model, SensorModel, label)
+    return make_message_schema(model.message, label)
 
 
 def layout_hash(joints: list[JointDescription]) -> str:

@@ -125,7 +125,7 @@ class Mission(FileStruct, frozen=True, kw_only=True):
             raise ValueError("`until_goal`: this mission has no goal to reach; give it one in [mission.goal]")
 
 
-class Service(FileStruct, frozen=True, kw_only=True):
+class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
     """A process of the run that acts every `decimation` ticks.
 
     In lockstep, the output that a service computes for tick t is used from tick t + latency_ticks on, no matter when
@@ -244,7 +244,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     mission: Mission = Mission()
     """Speed and goal of the motion, and what navigation knows."""
 
-    services: dict[str, Service]
+    services: dict[str, ServiceSchedule]
     """Processes of the run by name, as sections such as `[services.control]`."""
 
     max_age: MaxAge = MaxAge()
@@ -277,7 +277,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return self.backends.get(_section_name(self.backend), {})
 
     @property
-    def own_services(self) -> dict[str, Service]:
+    def own_services(self) -> dict[str, ServiceSchedule]:
         """Return the services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
 

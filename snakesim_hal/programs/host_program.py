@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 
-from snakesim_hal.backend import BackendFactory
+from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import BackendError, RefusedError, SnakesimError
 from snakesim_hal.base.process import (
     HOST_PRIORITY,
@@ -29,7 +29,6 @@ from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.model.checked import CHECK, why_unchecked
 from snakesim_hal.model.fault_plan import check_without_run
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
@@ -37,7 +36,7 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.programs.arguments import add_host
-from snakesim_hal.programs.preflight import backend_settings, check_backend
+from snakesim_hal.programs.preflight import backend_settings, check_backend, find_backend
 from snakesim_hal.programs.service_program import ProcessOptions, open_session_when_ready, process_options
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
@@ -73,7 +72,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
     arguments = given.arguments
     with contextlib.ExitStack() as opened:
         stop_port = _open_stop_port(given, config, opened)
-        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
         network = open_session(given.link) if given.link.listen else open_session_when_ready(given.link, "host")
@@ -152,11 +151,11 @@ def refuse_second_host(session: Session, link: Link) -> None:
             )
 
 
-def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
+def open_backend(backend_type: type[Backend], config: RunConfig) -> GuardedBackend:
     """Open the run's backend. Raises BackendError for any error in it."""
-    settings = backend_settings(config, factory)
+    settings = backend_settings(config, backend_type)
     try:
-        return GuardedBackend(factory(config, settings))
+        return GuardedBackend(backend_type(config, settings))
     except SnakesimError:
         raise
     except (Exception, SystemExit) as error:  # a backend may be third-party code

@@ -1,22 +1,31 @@
 """Checks before a run that all plugins of its configuration are installed, and that their sections are valid."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
+from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.controller import Controller, decode_parameters, require_controller
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
-from snakesim_hal.model.robot import describe_joints, with_modes
+from snakesim_hal.model.plugins import (
+    BACKENDS,
+    CONTROLLERS,
+    SERVICES,
+    find_installed,
+    find_plugin,
+    plugin_settings,
+    require_base_class,
+)
+from snakesim_hal.model.robot import describe_joints
 from snakesim_hal.model.scenario import CONTROL, RunConfig, describe_run_robot
+from snakesim_hal.service import Service
 from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
 POSE_SERVICES = {GUIDANCE, "navigation"}  # of no use without a pose of the robot
-SERVICE_ATTRIBUTES = ("name", "urgent", "too_slow", "configure", "outputs", "silence", "pause")
 
 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
@@ -35,13 +44,18 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
-    config = with_backend_modes(config, find(BACKENDS, config.backend))
+    backend = _find_backend(config.backend, run_files=run_files)
+    if backend is not None:
+        config = with_backend_modes(config, backend)
     plugin = find(CONTROLLERS, config.controller)
     if plugin is not None:
         controller = require_controller(plugin, config.controller)
         config = _check_controller(config, controller, source, table)
     for service in config.own_services:
-        find_service(config, service, find)
+        code = _service_code(config, service)
+        service_type = find(SERVICES, code)
+        if service_type is not None:
+            _check_service(config, service, code, service_type)
     _check_in_host_services(config, source)
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
@@ -71,28 +85,34 @@ def _check_in_host_services(config: RunConfig, source: str) -> None:
         )
 
 
-def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] = find_plugin) -> Any:
-    """Find the class of a service: of the scenario, installed, or `./file.py:Class`.
+def find_service(config: RunConfig, name: str) -> type[Service]:
+    """Find the class of a service: of the scenario, installed, or `./file.py:Class`, which is run.
 
     Args:
         config: configuration of the run.
         name: of the service.
-        find: or `find_installed`, which returns None for a file, and runs no code of it.
 
     Raises:
         ConfigError: the class is not found, or is not that of a service.
     """
+    code = _service_code(config, name)
+    service = find_plugin(SERVICES, code)
+    _check_service(config, name, code, service)
+    return service
+
+
+def _service_code(config: RunConfig, name: str) -> str:
+    """Return the plugin name of a service."""
     section = config.services.get(name)
-    code = (section.code if section is not None else "") or name
-    service = find(SERVICES, code)
-    if service is None:
-        return None
-    missing = [attribute for attribute in SERVICE_ATTRIBUTES if not hasattr(service, attribute)]
-    if missing:
-        raise ConfigError(
-            f"service {shorten(code)!r} has no {', '.join(missing)}; write its class as in snakesim_hal/service.py, "
-            "or derive it from Service there"
-        )
+    if section is not None and section.code:
+        return section.code
+    return name
+
+
+def _check_service(config: RunConfig, name: str, code: str, service: Any) -> None:
+    """Raise ConfigError if a plugin is not the class of the service of this name."""
+    require_base_class(service, Service, f"service {shorten(code)!r}")
+    section = config.services.get(name)
     if section is not None and service.name != name:
         raise ConfigError(
             f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
@@ -100,7 +120,24 @@ def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] =
             f"have one name. Write [services.{service.name}] with code = {shorten(code)!r}, or change the "
             "class's `name`"
         )
-    return service
+
+
+def find_backend(name: str) -> type[Backend]:
+    """Find the class of a backend: an installed one, or `./file.py:Class`, which is run.
+
+    Raises:
+        ConfigError: the class is not found, or is not that of a backend.
+    """
+    plugin = find_plugin(BACKENDS, name)
+    require_base_class(plugin, Backend, f"backend {shorten(name)!r}")
+    return plugin
+
+
+def _find_backend(name: str, *, run_files: bool) -> type[Backend] | None:
+    """Find the class of a backend; None for that of a file that must not run."""
+    if not run_files and find_installed(BACKENDS, name) is None:
+        return None
+    return find_backend(name)
 
 
 def describe_missing_capability(
@@ -153,20 +190,15 @@ def _without_pose_services(config: RunConfig, controller: type[Controller[Any]])
     return msgspec.structs.replace(config, services=remaining)
 
 
-def with_backend_modes(config: RunConfig, backend: Any) -> RunConfig:
-    """Return the configuration with the control modes that the joints have on a backend.
-
-    These are all modes, unless the backend's class names them in `MODES`, or for each joint in `as_driven`.
-    """
-    if hasattr(backend, "as_driven"):
-        return msgspec.structs.replace(config, robot=backend.as_driven(config.robot))
-    modes = getattr(backend, "MODES", None)
-    if modes is None:
+def with_backend_modes(config: RunConfig, backend: type[Backend]) -> RunConfig:
+    """Return the configuration with the control modes that the joints have on a backend."""
+    robot = backend.limit_modes(config.robot)
+    if robot is config.robot:
         return config
-    return msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
+    return msgspec.structs.replace(config, robot=robot)
 
 
-def backend_settings(config: RunConfig, backend: Any, table: Table | None = None) -> Any:
+def backend_settings(config: RunConfig, backend: type[Backend], table: Table | None = None) -> Any:
     """Return the scenario's [backends.<name>] section, checked by the backend's own Struct. Raises ConfigError."""
     source = f"scenario {config.name!r}" if table is None else table.source
     origin = None if table is None else table.origin
@@ -187,8 +219,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     Raises:
         ConfigError: the backend is missing, its settings are wrong, or it does not support a requested clock mode.
     """
-    find = find_plugin if run_files else find_installed
-    backend = find(BACKENDS, config.backend)
+    backend = _find_backend(config.backend, run_files=run_files)
     if backend is None:
         return config
     settings = backend_settings(config, backend, table)

@@ -24,11 +24,10 @@ from snakesim_hal.base.terminal import report_error
 from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.model.fault_plan import parse_planned
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.host_program import open_backend
-from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.programs.preflight import find_backend, find_service
 from snakesim_hal.service import SERVICE_START_LIMIT_S, ServiceLoop
 from snakesim_hal.wire.messages import make_arm_request
 
@@ -102,7 +101,7 @@ class InProcessRun:
         config = self.config
         # As in processes of their own: sums of several threads are rounded otherwise, and the digest would differ.
         opened.enter_context(threadpool_limits(1))
-        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         if not backend.describe().emulated:
             raise RefusedError(

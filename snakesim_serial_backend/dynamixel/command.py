@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_drivers.emulation.emulated_body import serve_until_stopped
+from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent

@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, expand_home
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.scope import Scope
@@ -22,7 +23,7 @@ class Line(msgspec.Struct, frozen=True):
     message: DepthImage
 
 
-class RecordedDepth:
+class RecordedDepth(SensorModel):
     """Plays a recording by the robot's time, and begins again at its end."""
 
     class Settings(FileStruct, frozen=True):

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from typing import Any
 from zlib import crc32
 
+import msgspec
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings, require_base_class
 from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import AnyMounted
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColorImage, Contacts, Imu, Message, OwnSample, Pose, Power
@@ -27,7 +29,7 @@ from snakesim_sim_backend.sensors.rendered import RenderedColor, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
 # Sensors that look around: the model's name in the robot file -> its classes, each with a message of its own.
-MODELS = {
+MODELS: dict[str, tuple[type[SensorModel], ...]] = {
     "rays": (RayCamera, RayBeams),
     "rendered": (RenderedDepth,),
     "recorded": (RecordedDepth,),
@@ -81,21 +83,28 @@ def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
     Raises:
         ConfigError: its model is unknown, makes another message, or has wrong settings.
     """
-    model, settings = _find_model(key, sensor, find_plugin)
+    found = _find_model(key, sensor, find_plugin)
+    assert found is not None
+    model, settings = found
     return model(sensor, scope, settings)
 
 
-def _find_model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
-    """Return a sensor's class and its checked settings; None for both if `find` does not know the model."""
+def _find_model(
+    key: str, sensor: AnyMounted, find: Callable[[str, str], Any]
+) -> tuple[type[SensorModel], msgspec.Struct] | None:
+    """Return a sensor's class and its checked settings; None if `find` does not load the model."""
     message = keys.find_message(key)
     if message is ColorImage:
         return RenderedColor, RenderedColor.Settings()
     assert message is not None
-    model = _find_shipped_model(message, sensor.model) or find(SENSORS, sensor.model)
+    model = _find_shipped_model(message, sensor.model)
     if model is None:
-        return None, None
+        model = find(SENSORS, sensor.model)
+        if model is None:
+            return None
+        require_base_class(model, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
     # A sensor with a message of its own has a schema, which is checked instead.
-    if message is not OwnSample and getattr(model, "message", None) is not message:
+    if message is not OwnSample and model.message is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
             f"carries; its class says in `message` what it makes"
@@ -103,7 +112,7 @@ def _find_model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -
     return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
 
 
-def _find_shipped_model(message: type[Message], name: str) -> Any:
+def _find_shipped_model(message: type[Message], name: str) -> type[SensorModel] | None:
     """Return the class of this package that makes a message by the model of this name; None without one."""
     for model in MODELS.get(name, ()):
         if model.message is message:

@@ -150,7 +150,7 @@ class RealTimeWorkbench(BusWorkbench):
 
     KNOWN_AT_ONCE = False
 
-    @staticmethod
-    def check(_config: Any, _settings: Any) -> Any:
+    @classmethod
+    def check(cls, config: Any, settings: Any) -> Any:
         """As a real robot."""
         return ("realtime",)

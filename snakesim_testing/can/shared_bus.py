@@ -18,7 +18,7 @@ from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.emulated_body import make_physics_model
+from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_testing.can.driver_loop import Loop, armed, config

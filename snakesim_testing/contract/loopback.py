@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from snakesim_hal.backend import Backend, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
@@ -19,6 +19,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
+    Description,
     Fault,
     JointCommand,
     JointState,
@@ -46,20 +47,31 @@ def wait_until(happened: Callable[[], Any], what: str) -> None:
         time.sleep(0.002)
 
 
-class RecordingBackend:
+class RecordingBackend(Backend):
     """A backend that forwards and records all calls; a fault can be planted in it."""
 
     def __init__(self, inner: Backend) -> None:
         self._inner = inner
-        self.describe, self.enact, self.advance, self.close = inner.describe, inner.enact, inner.advance, inner.close
         self.seen: list[JointState] = []
         self.planted: Callable[[int], Fault | None] | None = None  # tick -> a fault to report besides the backend's own
+
+    def describe(self) -> Description:
+        return self._inner.describe()
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """The backend's, recorded."""
         samples = self._inner.sample(tick, timestamp_ns)
         self.seen.append(samples.joints)
         return samples
+
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
+        self._inner.enact(setpoints, lifecycle)
+
+    def advance(self) -> None:
+        self._inner.advance()
+
+    def close(self) -> None:
+        self._inner.close()
 
     def faults(self) -> list[Fault]:
         """The backend's, and the planted one."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.backend import SafeSetpoints, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.guarded_backend import GuardedBackend
@@ -69,7 +69,7 @@ def meeting(*namespaces: str | None) -> Iterator[list[Session]]:
         yield [stack.enter_context(open_session(each)) for each in links]
 
 
-class LagBackend:
+class LagBackend(Backend):
     """Joints that follow their setpoints with a first-order lag. Neither mass nor contacts."""
 
     class Settings(msgspec.Struct):

@@ -35,7 +35,7 @@ class Held(Workbench):
 
     def sample(self, tick, timestamp_ns):
         drives = np.array(json.loads(Path("drives.json").read_text()))
-        self.angle = Mounting(self.robot.joint_table).joint_angle_rad(drives)
+        self.angle = Mounting(self.robot.joint_table).to_joint_angle_rad(drives)
         return super().sample(tick, timestamp_ns)
 '''
 

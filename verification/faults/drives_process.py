@@ -17,11 +17,13 @@ from typing import Any
 
 from snakesim_can_backend.bus.adapter import open_wire
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
+from snakesim_can_backend.can_drives.emulator import CanEmulatorContext
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
-from snakesim_drivers.emulation.emulated_body import EmulatedBody, make_physics_model
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
+from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import make_body
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
@@ -105,9 +107,8 @@ def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, open
     joints = list(part.joints.values())
     if issubclass(driver_type, CanDriveBackend):
         wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
-        return opened.enter_context(
-            closing(driver_type.emulator_class(joints, part.settings, body, [wire] * len(joints), clock.now_ns))
-        )
+        context = CanEmulatorContext(joints, part.settings, body, [wire] * len(joints), clock.now_ns)
+        return opened.enter_context(closing(driver_type.emulator_class(context)))
     ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
     return emulator_of(joints, part.settings, body, ptys * len(joints), clock)
 

@@ -21,7 +21,7 @@ from snakesim_testing.can.driver_loop import Loop, armed, cleared_and_armed_agai
 
 
 def inject(run: Loop, text: str, *, begins: bool = True) -> None:
-    FaultyBackend(run.backend).inject(parse_injection(f"{text}@0"), begins)
+    FaultyBackend(run.backend).inject(parse_injection(f"{text}@0"), begins=begins)
 
 
 # --- modules -------------------------------------------------------------------------------------------------
@@ -31,13 +31,13 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
     with loop() as run:
         run.run(3)
         faulty = FaultyBackend(run.backend)
-        faulty.inject(parse_injection("wrong:joint_2@0=0.4"), True)
+        faulty.inject(parse_injection("wrong:joint_2@0=0.4"), begins=True)
         reported = faulty.sample(3, 3 * run.config.period_ns).joints.angle_rad
         assert reported == pytest.approx([0.0, 0.4, 0.0, 0.0], abs=0.02)
         with pytest.raises(ConfigError, match="no joint_9"):
-            faulty.inject(parse_injection("leak:joint_9@0"), True)
+            faulty.inject(parse_injection("leak:joint_9@0"), begins=True)
         with pytest.raises(ConfigError, match="there is no bus_2; this robot has bus_1 to bus_1"):
-            faulty.inject(parse_injection("cut:bus_2@0"), True)
+            faulty.inject(parse_injection("cut:bus_2@0"), begins=True)
 
 
 @pytest.mark.parametrize(

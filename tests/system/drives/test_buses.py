@@ -266,11 +266,11 @@ def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened:
         ),
         (
             {"robot__joints": {"joint_2": {"driver": "sim"}}},
-            "joint_2: `driver` = 'sim', a backend that drives whole robots",
+            "joint_2: `driver` = 'sim', which is a backend of whole robots",
         ),
         (
             {"robot__joints": {"joint_2": {"driver": "can"}}},
-            "joint_2: `driver` = 'can', a backend that drives whole robots",
+            "joint_2: `driver` = 'can', which is a backend of whole robots",
         ),
         ({"backends": {"odrive": {"mounted": {}}}}, "`backends.odrive.mounted` .* say `backends.mixed.mounted`"),
         ({"backends": {"dynamixel": {"baud": 7}}}, "backends.dynamixel.baud"),

@@ -21,7 +21,7 @@ WALL = {"ground": {"friction": 0.0}, "box": [{"position_m": [4.0, 0.0], "size_m"
 SLOW = """
 import time
 from snakesim_sim_backend.sensors.depth import RayCamera
-from snakesim_sim_backend.sensors.scope import NoSettings
+from snakesim_hal.wire.messages import Ranges
 
 class Slow(RayCamera):
     def read(self, tick, timestamp_ns):
@@ -32,8 +32,11 @@ class Broken(RayCamera):
     def read(self, tick, timestamp_ns):
         raise OSError("lens cap on")
 
-class Mute:
-    Settings = NoSettings
+class Mute(RayCamera):
+    message = Ranges
+
+class Plain:
+    message = Ranges
 """
 
 
@@ -154,3 +157,5 @@ def test_a_model_that_cannot_be_is_refused_before_anything_is_opened(camera, why
 def test_a_model_that_makes_something_else_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"does not make a DepthImage, which is what sensor/depth/head carries"):
         run_with(slow(tmp_path, 0, "Mute"))
+    with pytest.raises(ConfigError, match=r"Plain' is not derived from `SensorModel` in snakesim_hal/model/sensor_mod"):
+        run_with(slow(tmp_path, 0, "Plain"))

@@ -32,6 +32,10 @@ class Bare:
     name = "sensor"
 
 
+class Empty(Service):
+    name = "sensor"
+
+
 from pathlib import Path
 (Path(__file__).parent / "ran").touch()
 """
@@ -66,9 +70,14 @@ def test_a_service_of_a_file_publishes_a_pose_in_processes_and_in_one(home: Path
 
 
 WRONG = {
-    "no such class": ("MotionCaptuer", "no 'MotionCaptuer', as in", "classes in it are MotionCapture, Another, Bare"),
+    "no such class": (
+        "MotionCaptuer",
+        "no 'MotionCaptuer', as in",
+        "classes in it are MotionCapture, Another, Bare, Empty",
+    ),
     "another name": ("Another", "calls itself 'another'", "[services.another]"),
-    "no service": ("Bare", "has no urgent, too_slow, configure, outputs, silence, pause", "snakesim_hal/service.py"),
+    "no service": ("Bare", "is not derived from `Service`", "snakesim_hal/service.py"),
+    "no outputs": ("Empty", "has no outputs", "snakesim_hal/service.py"),
 }
 
 

@@ -13,6 +13,7 @@ from snakesim_can_backend.driver import modules
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.buses import Buses
 from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_type import DriverTypeContext
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
@@ -83,7 +84,8 @@ def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
     clock = DriverClock(config)
     opened_buses: list[BusSpec] = []
     for part in factory.split_by_driver_type(config, backend_settings(config, factory)):
-        opened_buses += part.driver_type.buses(config, part.settings, part.joints, clock, None)
+        context = DriverTypeContext(config, part.settings, part.joints, clock, None)
+        opened_buses += part.driver_type.plan_buses(context)
     in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
     assert (
         Buses(in_turn, DriveReadings(config.robot.joint_table, clock.now_ns), opened_buses, clock.now_ns).emulated

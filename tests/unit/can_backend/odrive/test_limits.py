@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
-from snakesim_can_backend.odrive.backend import MountedAxis, OdriveBackend, OdriveSettings
+from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.endpoints import EMULATED, AxisSetting, read_endpoints
 from snakesim_can_backend.odrive.protocol import MessageId, decode_setting_answer, encode_setting_request, split_id
+from snakesim_can_backend.odrive.settings import MountedAxis, OdriveSettings
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig

@@ -51,7 +51,7 @@ class Bench:
         return self.backend.sample(self.tick, self.tick * PERIOD_NS).joints
 
     def inject(self, text: str, *, begins: bool = True) -> None:
-        self.backend.inject(parse_injection(f"{text}@0"), begins)
+        self.backend.inject(parse_injection(f"{text}@0"), begins=begins)
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_an_angle_can_be_off_and_can_be_no_number(bench: Bench) -> None:
 def test_slow_simulator_sample_takes_the_amount(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     slept_s: list[float] = []
     monkeypatch.setattr(time, "sleep", slept_s.append)
-    bench.backend.inject(parse_injection("slow:simulator@0=0.2"), True)
+    bench.backend.inject(parse_injection("slow:simulator@0=0.2"), begins=True)
     bench.sample()
     bench.inject("slow:simulator", begins=False)
     bench.sample()

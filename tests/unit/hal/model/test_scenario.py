@@ -19,7 +19,7 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.scenario import (
     Loaded,
     Override,
-    Service,
+    ServiceSchedule,
     WaypointGoal,
     capsules_at_start,
     config_hash,
@@ -45,7 +45,7 @@ def with_flags(path: str, *flags: str) -> Loaded:
 def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     config = load(write_files(tmp_path)).config
     assert (config.name, config.robot.name, config.scene.name) == ("crawl", "worm", "bend")
-    assert config.services == {"control": Service(), "guidance": Service(decimation=2)}
+    assert config.services == {"control": ServiceSchedule(), "guidance": ServiceSchedule(decimation=2)}
     assert config.robot.sensors.pose is not None and config.robot.sensors.contacts is None
     assert (config.clock_mode, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
     assert config.period_ns == 10_000_000
@@ -135,7 +135,7 @@ def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(r
 
 @given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
 def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, lag: int) -> None:
-    service = Service(decimation=every, latency_ticks=lag)
+    service = ServiceSchedule(decimation=every, latency_ticks=lag)
     counting = service.used_output_tick(tick)
     assert counting % every == 0 and counting >= 0
     assert counting == 0 or counting <= tick - lag
