@@ -36,16 +36,25 @@ def name_controller(controller: ControllerArgument) -> tuple[str, Any | None]:
     name = re.sub(r"\W+", "", getattr(controller, "__name__", type(controller).__name__)) or "function"
     if isinstance(controller, type):
         if not callable(getattr(controller, "update", None)):
-            raise ConfigError(f"controller={name}: a controller class needs a method update(view); see docs/python.md")
+            raise ConfigError(
+                f"controller={name}: a controller class needs a method update(view); see docs/python.md",
+                code="python/invalid-argument",
+            )
         return f"program:{name}", controller
     if callable(getattr(controller, "update", None)):
-        raise ConfigError(f"controller={controller!r:.60}: give its class; every arming makes an object of it")
+        raise ConfigError(
+            f"controller={controller!r:.60}: give its class; every arming makes an object of it",
+            code="python/invalid-argument",
+        )
     if not callable(controller):
-        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}")
+        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}", code="python/invalid-argument")
     try:
         inspect.signature(controller).bind(0.0, None)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"controller={name}: is called as f(time_s, joints), which does not fit: {error}") from None
+        raise ConfigError(
+            f"controller={name}: is called as f(time_s, joints), which does not fit: {error}",
+            code="python/invalid-argument",
+        ) from None
     return f"program:{name}", _wrap_function(controller, name)
 
 

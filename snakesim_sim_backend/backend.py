@@ -109,7 +109,7 @@ class SimBackend:
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the sensor samples of `tick`; after a divergence, those of the last good state."""
         if not self._open:
-            raise BackendError(CLOSED)
+            raise BackendError(CLOSED, code="backend/closed")
         return self._sensors.sample(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
@@ -126,7 +126,7 @@ class SimBackend:
             BackendError: the simulation has diverged, or is closed.
         """
         if not self._open:
-            raise BackendError(CLOSED)
+            raise BackendError(CLOSED, code="backend/closed")
         self._motors.before_steps()
         self._tick += 1
         try:
@@ -137,7 +137,9 @@ class SimBackend:
             self._physics.step(self._steps_with_sensors)
             self._watch.check(self._tick)
         except mujoco.FatalError as error:
-            raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
+            raise BackendError(
+                f"MuJoCo cannot go on at tick {self._tick}: {error}", code="simulator/diverged"
+            ) from error
         if self._simulates_heat:
             self._warm_windings()
 

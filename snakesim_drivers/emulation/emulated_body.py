@@ -200,10 +200,15 @@ class EmulatedBody:
     def inject(self, injection: Injection, *, begins: bool) -> int | None:
         """Begin or end a fault of a drive: its number if it restarts now. Raises ConfigError."""
         if injection.target_type != "joint" or injection.kind not in FAULTS:
-            raise ConfigError(f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}")
+            raise ConfigError(
+                f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}", code="injection/unknown-fault"
+            )
         i = injection.number
         if i >= len(self.joints):
-            raise ConfigError(f"fault {str(injection)!r}: this robot has joint_1 to joint_{len(self.joints)}")
+            raise ConfigError(
+                f"fault {str(injection)!r}: this robot has joint_1 to joint_{len(self.joints)}",
+                code="injection/unknown-target",
+            )
         motion, j = self._all, self._at[i]
         match injection.kind:
             case "mute":

@@ -97,6 +97,9 @@ class InertiaModel:
 
     def _stop(self, back_rad: Floats) -> None:
         if not np.isfinite(self._angle).all():
-            raise BackendError("inertia physics model: a joint angle is NaN or infinite, because a torque was")
+            raise BackendError(
+                "inertia physics model: a joint angle is NaN or infinite, because a torque was",
+                code="simulator/diverged",
+            )
         self._velocity[self._velocity * back_rad < 0] = 0.0
         np.clip(self._angle, self._least, self._most, out=self._angle)

@@ -158,7 +158,10 @@ class Buses:
     def _inject_into_bus(self, injection: Injection, *, begins: bool) -> bool:
         number = injection.number
         if not 0 <= number < len(self.buses):
-            raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}")
+            raise ConfigError(
+                f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}",
+                code="injection/unknown-target",
+            )
         bus = self.buses[number]
         if injection.kind == "slow":
             delay_s = injection.amount or 0.0

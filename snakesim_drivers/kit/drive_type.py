@@ -109,7 +109,8 @@ class DriverTypeBackend(DriveBackend):
             if joint.drive.driver not in ("", cls.name):
                 raise ConfigError(
                     f"{joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
-                    f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
+                    f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`",
+                    code="drive/unknown-type",
                 )
         return [DriverTypePart(cls, settings, config.backend_section, joints)]
 

@@ -64,15 +64,19 @@ def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     where = f"robot {robot.name!r}, {joint.name}: `driver`"
     fix = f"say it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
     if not driver:
-        raise ConfigError(f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}")
+        raise ConfigError(
+            f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}",
+            code="drive/unknown-type",
+        )
     try:
         plugin: Any = find_plugin(BACKENDS, driver)
     except ConfigError as error:
-        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}") from None
+        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}", code="drive/unknown-type") from None
     is_driver_type = isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)
     if not is_driver_type or issubclass(plugin, MixedBackend):
         raise ConfigError(
-            f"{where} = {driver!r}, a backend that drives whole robots, and no driver type of drives; {fix}"
+            f"{where} = {driver!r}, a backend that drives whole robots, and no driver type of drives; {fix}",
+            code="drive/unknown-type",
         )
     return plugin
 
@@ -86,7 +90,8 @@ def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBacke
     if robot_wide:
         raise ConfigError(
             f"`{section}.{robot_wide[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-            f"say `backends.mixed.{robot_wide[0]}`"
+            f"say `backends.mixed.{robot_wide[0]}`",
+            code="config/conflict",
         )
     settings = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
     joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
@@ -100,5 +105,6 @@ def _check_same_world(parts: list[DriverTypePart]) -> None:
     if on_bus and emulated:
         raise ConfigError(
             f"`{emulated[0].section}` names no bus, and `{on_bus[0].section}` does: drives that are emulated here do "
-            f"not move with those on a bus. Name the buses of all driver types, or of none"
+            f"not move with those on a bus. Name the buses of all driver types, or of none",
+            code="bus/not-virtual",
         )

@@ -44,7 +44,8 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
         raise ConfigError(
             f"`{config.backend_section}.pose_listen` = {pose_listen!r} needs a section [sensors.pose] in the file of "
             f"robot {config.robot.name!r}: its `delay_s` is the age of a pose when it arrives, 0 to 1 s, from the "
-            f"manual of the motion-capture system"
+            f"manual of the motion-capture system",
+            code="config/missing-key",
         )
 
 
@@ -74,7 +75,9 @@ class MocapReceiver:
             self._socket.bind((host or "127.0.0.1", int(port)))
         except (OSError, OverflowError, ValueError) as error:
             self._socket.close()
-            raise ConfigError(f"`{setting}` = {address!r}: {error}; choose another port") from error
+            raise ConfigError(
+                f"`{setting}` = {address!r}: {error}; choose another port", code="network/invalid-address"
+            ) from error
         self._socket.setblocking(False)
         self._clock, self._setting = clock, setting
         self._delay_ns = round(delay_s * 1e9)
@@ -145,7 +148,9 @@ class MocapReceiver:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise BackendError(f"`{self._setting}`: poses cannot be received: {error}") from error
+                raise BackendError(
+                    f"`{self._setting}`: poses cannot be received: {error}", code="network/port-in-use"
+                ) from error
             try:
                 sample = self._decoder.decode(datagram)
             except UNDECODABLE as error:

@@ -52,7 +52,7 @@ def _check_controller(config: RunConfig, controller: Any, source: str, table: Ta
     config = _without_pose_services(config, controller)
     problem = describe_missing_capability(describe_joints(config.robot), controller, config.controller)
     if problem is not None:
-        raise ConfigError(f"robot {config.robot.name!r}: {problem}")
+        raise ConfigError(f"robot {config.robot.name!r}: {problem}", code="config/conflict")
     if hasattr(controller, "check"):
         controller.check(describe_run_robot(config), settings)
     return config
@@ -64,7 +64,8 @@ def _check_in_host_services(config: RunConfig, source: str) -> None:
     if others:
         raise ConfigError(
             f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
-            'what plans or looks would keep the host from its ticks; leave it at "process"'
+            'what plans or looks would keep the host from its ticks; leave it at "process"',
+            code="config/conflict",
         )
 
 
@@ -88,14 +89,16 @@ def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] =
     if missing:
         raise ConfigError(
             f"service {shorten(code)!r} has no {', '.join(missing)}; write its class as in snakesim_hal/service.py, "
-            "or derive it from Service there"
+            "or derive it from Service there",
+            code="plugin/not-loadable",
         )
     if section is not None and service.name != name:
         raise ConfigError(
             f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
             f"services.{shorten(name)}, and both "
             f"have one name. Write [services.{service.name}] with code = {shorten(code)!r}, or change the "
-            "class's `name`"
+            "class's `name`",
+            code="plugin/not-loadable",
         )
     return service
 
@@ -194,6 +197,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     origin = table.origin_of("clock_mode") if table is not None else f"scenario {config.name!r}"
     if origin.startswith("--"):
         raise ConfigError(
-            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}"
+            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}",
+            code="backend/wrong-clock-mode",
         )
     return msgspec.structs.replace(config, clock_mode=clock_modes[0])

@@ -98,7 +98,8 @@ def _find_model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -
     if message is not OwnSample and getattr(model, "message", None) is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
-            f"carries; its class says in `message` what it makes"
+            f"carries; its class says in `message` what it makes",
+            code="plugin/not-loadable",
         )
     return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
 
