@@ -64,7 +64,7 @@ class Buses:
         if errors:
             lines = [line for error in errors for line in error.lines]
             distinct_lines = dict.fromkeys(lines)
-            raise BackendError(*distinct_lines)
+            raise BackendError(*distinct_lines, code=errors[0].code)
         for bus in self.buses:
             self._readings.copy_from(bus.readings, bus.spec.joints)
 

@@ -4,8 +4,6 @@ import threading
 import time
 from typing import Any
 
-import pytest
-
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.injector import Injector
 from snakesim_hal.faults.message_faults import MessageFaults
@@ -14,6 +12,7 @@ from snakesim_hal.host.host import Host
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
+from snakesim_testing.messages import raises_error
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import LagBackend, Running, commanded, meeting, running
 from tests.unit.hal.rig import clock, description, run_config, state
@@ -59,7 +58,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
     config = run_config(faults=["mute:joint_1@1"])
     with (
         meeting("worm") as (own,),
-        pytest.raises(ConfigError, match="something real moves here"),
+        raises_error(ConfigError, code="injection/not-allowed"),
     ):
         Host(config, GuardedBackend(LagBackend(config)), own)
 

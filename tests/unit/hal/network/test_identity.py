@@ -19,6 +19,7 @@ from snakesim_hal.network.run_key import RUN_KEY, add_proof, is_proven, new_run_
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, make_arm_request
+from snakesim_testing.messages import raises_error
 from tests.harness.wait import wait_until
 from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.rig import description, run_config
@@ -132,7 +133,7 @@ def test_of_two_runs_that_start_at_once_each_has_an_endpoint_of_its_own() -> Non
     second, other_port = meeting_point(None, None, "worm")
     with its_port, other_port:
         assert first != second
-        with pytest.raises(NotConnectedError, match="Another run may hold the port"):
+        with raises_error(NotConnectedError, code="network/port-in-use"):
             meeting_point(first.endpoint, None, "worm")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", int(first.endpoint.rpartition(":")[2])))

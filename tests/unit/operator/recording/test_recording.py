@@ -29,6 +29,7 @@ from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.tap import Tap
+from snakesim_testing.messages import raises_error
 from tests.harness.endpoint import free_endpoint
 from tests.harness.file_size import max_file_size
 from tests.harness.wait import wait_until
@@ -170,7 +171,7 @@ def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monk
 def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
     """What is damaged: tests/whole/test_damaged_recordings.py."""
     (tmp_path / "bad.mcap").write_bytes(b"no recording at all")
-    with pytest.raises(ConfigError, match=r"bad\.mcap is not a recording"):
+    with raises_error(ConfigError, code="recording/not-readable", field="bad.mcap"):
         recover_recording(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
     assert not (tmp_path / "copy.mcap").exists()
 
