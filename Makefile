@@ -116,9 +116,10 @@ bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link bes
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
 	$(bin)/python -m verification.golden
 
-schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables of faults and errors
 	$(bin)/snakesim schemas --write schemas
 	$(bin)/python -m docs.site.kinds_table
+	$(bin)/python -m tests.error_pages
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

@@ -44,14 +44,20 @@ def name_controller(controller: ControllerArgument) -> tuple[str, type[Controlle
         name = f"program:{controller.__name__}"
         return name, require_controller(controller, name)
     if isinstance(controller, Controller):
-        raise ConfigError(f"controller={controller!r:.60}: give its class; every arming makes an object of it")
+        raise ConfigError(
+            f"controller={controller!r:.60}: give its class; every arming makes an object of it",
+            code="python/invalid-argument",
+        )
     if not callable(controller):
-        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}")
+        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}", code="python/invalid-argument")
     name = _name_function(controller)
     try:
         inspect.signature(controller).bind(0.0, None)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"controller={name}: is called as f(time_s, joints), which does not fit: {error}") from None
+        raise ConfigError(
+            f"controller={name}: is called as f(time_s, joints), which does not fit: {error}",
+            code="python/invalid-argument",
+        ) from None
     return f"program:{name}", _wrap_function(controller, name)
 
 

@@ -104,7 +104,8 @@ class Result:
         if name not in self.signal_names:
             raise ConfigError(
                 f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
-                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`"
+                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`",
+                code="recording/unknown-signal",
             )
         return self.arrays[name] if name in self.arrays else self.columns[name]
 
@@ -121,7 +122,8 @@ class Result:
             pandas = importlib.import_module("pandas")
         except ImportError as error:
             raise ConfigError(
-                f"to_pandas() needs pandas ({error}); install it with: {sys.executable} -m pip install pandas"
+                f"to_pandas() needs pandas ({error}); install it with: {sys.executable} -m pip install pandas",
+                code="extra/not-installed",
             ) from None
         frame = pandas.DataFrame(self.columns).set_index("time_s")
         frame.attrs["units"] = {name: self.units[name] for name in frame.columns}

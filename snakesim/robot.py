@@ -129,10 +129,13 @@ class Robot:
             links = find_robots(selection)
         if not links:
             named = "" if selection.namespace is None else f" named {selection.namespace}"
-            raise NotConnectedError(f"no robot{named} on {', '.join(selection.endpoints())}; is its HAL host running?")
+            raise NotConnectedError(
+                f"no robot{named} on {', '.join(selection.endpoints())}; is its HAL host running?",
+                code="network/no-robot",
+            )
         if len(links) > 1:
             choices = [f"  endpoint={link.endpoint!r}, name={link.namespace!r}" for link in links]
-            raise RefusedError("several robots found; choose one:", *choices)
+            raise RefusedError("several robots found; choose one:", *choices, code="network/several-robots")
         return Robot(links[0])
 
     def __enter__(self) -> Self:
@@ -210,7 +213,10 @@ class Robot:
         message = keys.find_message(key)
         if message is None or "*" in key:
             known = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
-            raise ConfigError(f"no key {key!r} in the key space; {suggest_word(key, known)}see schemas/keys.md")
+            raise ConfigError(
+                f"no key {key!r} in the key space; {suggest_word(key, known)}see schemas/keys.md",
+                code="network/unknown-key",
+            )
         message = find_message_type(key, self.description) or message
         may_wait = key not in self._readers and self._control is None
         return self._read_newest(key, message, FIRST_MESSAGE_TIMEOUT_S if may_wait else 0.0)
@@ -231,7 +237,8 @@ class Robot:
         if self._armed and clock.lifecycle != "armed":
             self._armed = False
             raise RefusedError(
-                f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}"
+                f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}",
+                code="robot/not-armed",
             )
         return clock.timestamp_ns * 1e-9
 
@@ -273,7 +280,9 @@ class Robot:
         self._send_request(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
         control.turn_until(lambda: self._clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed)
         if self._clock.lifecycle != "armed":
-            raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.reason}")
+            raise RefusedError(
+                f"not armed any more, but {self._clock.lifecycle}: {self.status.reason}", code="robot/not-armed"
+            )
         self._armed = True
 
     def disarm(self) -> None:
@@ -304,7 +313,7 @@ class Robot:
         selection = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
         exit_code = estop(selection, output.append)
         if exit_code:
-            raise RefusedError(*output)
+            raise RefusedError(*output, code="robot/not-confirmed")
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -368,9 +377,9 @@ class Robot:
         count = len(self.joint_names)
         expected = f"{name} is {values!r:.80}, must be {count} finite numbers, tail to head"
         if len(values) != count:
-            raise ConfigError(f"{expected}; got {len(values)}")
+            raise ConfigError(f"{expected}; got {len(values)}", code="python/invalid-argument")
         if not all(math.isfinite(value) for value in values):
-            raise ConfigError(expected)
+            raise ConfigError(expected, code="python/invalid-argument")
 
     def _send_request(self, request: LifecycleRequest, done: str) -> None:
         """Send a lifecycle request and wait for its effect, while the lease is renewed."""
@@ -405,7 +414,9 @@ class Robot:
         """Return the newest message of a key that every robot publishes. Raises NotConnectedError."""
         newest = self._read_newest(key, message, CONNECT_TIMEOUT_S)
         if newest is None:
-            raise NotConnectedError(f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?")
+            raise NotConnectedError(
+                f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?", code="network/no-robot"
+            )
         return newest
 
     def _read_newest(self, key: str, message: type[Message], first_timeout_s: float) -> Any:
@@ -448,6 +459,9 @@ def _select_robot(endpoint: str | None, name: str | None, session: str | os.Path
     if session is None:
         return RobotSelection(endpoint, name)
     if endpoint is not None:
-        raise ConfigError("endpoint and session: the session file names the endpoint; leave one out")
+        raise ConfigError(
+            "endpoint and session: the session file names the endpoint; leave one out",
+            code="command/conflicting-options",
+        )
     file = read_session(Path(session))
     return RobotSelection(file.endpoints[0], file.namespace_for(name), file)

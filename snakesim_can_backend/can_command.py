@@ -231,7 +231,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     if loaded.config.backend != MODULES:
         raise ConfigError(
             f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim can replay` reads "
-            f"the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run"
+            f"the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run",
+            code="recording/missing-data",
         )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)

@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None))
+        return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None), as_json="--json" in words)
     except ModuleNotFoundError as error:
         from snakesim_operator.base.extras import explained
 
@@ -86,7 +86,7 @@ def _refuse_empty_words(words: list[str]) -> None:
     for previous, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
             option = word.rstrip("=") or previous or "the command"
-            raise ConfigError(f"{option}: empty; give a value, or leave it out")
+            raise ConfigError(f"{option}: empty; give a value, or leave it out", code="command/invalid-option")
 
 
 def _find_installed_command(commands: "Commands", name: str) -> Callable[[list[str]], int] | None:
@@ -100,7 +100,9 @@ def _find_installed_command(commands: "Commands", name: str) -> Callable[[list[s
     if name not in list_installed(COMMANDS):
         commands.add_installed()
         hint = suggest_word(name, [*commands.commands.choices, *list_installed(COMMANDS)])
-        raise ConfigError(f"no command {shorten(name)!r}; {hint}`snakesim` alone lists all")
+        raise ConfigError(
+            f"no command {shorten(name)!r}; {hint}`snakesim` alone lists all", code="command/unknown-command"
+        )
     plugin = find_plugin(COMMANDS, name)
     if getattr(plugin, "__name__", "") != ADDS:
         return plugin
@@ -112,8 +114,10 @@ def _refuse_unknown_word(word: str, parser: argparse.ArgumentParser) -> NoReturn
     """Raise ConfigError for an argument that the command does not have."""
     options = [option for action in parser._actions for option in action.option_strings]
     hint = suggest_word(word.partition("=")[0], options) if word.startswith("-") else ""
+    command = parser.prog.removeprefix("snakesim ")
     raise ConfigError(
-        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {shorten(word)!r}; {hint}see `{parser.prog} --help`"
+        f"{command}: unknown argument {shorten(word)!r}; {hint}see `{parser.prog} --help`",
+        code="command/unknown-argument",
     )
 
 

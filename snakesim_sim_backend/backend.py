@@ -110,7 +110,7 @@ class SimBackend(Backend):
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the sensor samples of `tick`; after a divergence, those of the last good state."""
         if not self._open:
-            raise BackendError(CLOSED)
+            raise BackendError(CLOSED, code="backend/closed")
         return self._sensors.sample(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
@@ -127,7 +127,7 @@ class SimBackend(Backend):
             BackendError: the simulation has diverged, or is closed.
         """
         if not self._open:
-            raise BackendError(CLOSED)
+            raise BackendError(CLOSED, code="backend/closed")
         self._motors.before_steps()
         self._tick += 1
         try:
@@ -138,7 +138,9 @@ class SimBackend(Backend):
             self._physics.step(self._steps_with_sensors)
             self._watch.check(self._tick)
         except mujoco.FatalError as error:
-            raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
+            raise BackendError(
+                f"MuJoCo cannot go on at tick {self._tick}: {error}", code="simulator/diverged"
+            ) from error
         if self._simulates_heat:
             self._warm_windings()
 

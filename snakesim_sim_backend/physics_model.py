@@ -108,7 +108,9 @@ class MujocoPhysicsModel(PhysicsModel):
         try:
             self._physics.step(1)
         except mujoco.FatalError as error:
-            raise BackendError(f"MuJoCo cannot go on at step {self._step_count}: {error}") from error
+            raise BackendError(
+                f"MuJoCo cannot go on at step {self._step_count}: {error}", code="simulator/diverged"
+            ) from error
         self._unchecked_steps += 1
         # Divergence shows here first. It is detected in the same step, because firmware would read NaN otherwise.
         plausible = self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED

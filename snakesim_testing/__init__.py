@@ -3,4 +3,4 @@
 python -m pytest -p snakesim_testing --pyargs snakesim_testing.contract --snakesim-backend NAME_or_./file.py:Class
 """
 
-pytest_plugins = ["snakesim_testing.contract.plugin"]
+pytest_plugins = ["snakesim_testing.contract.plugin", "snakesim_testing.messages"]

@@ -83,18 +83,31 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         """
         self._arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         if scenario is None:
-            raise ConfigError("SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file")
+            raise ConfigError(
+                "SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file",
+                code="python/invalid-argument",
+            )
         if type(frame_skip) is not int or frame_skip < 1:
-            raise ConfigError(f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more")
+            raise ConfigError(
+                f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more",
+                code="python/invalid-argument",
+            )
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ConfigError(f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out")
+            raise ConfigError(
+                f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out", code="python/invalid-argument"
+            )
         if not residual_rad > 0:
-            raise ConfigError(f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad")
+            raise ConfigError(
+                f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad", code="python/invalid-argument"
+            )
         controller = corrected_controller(action)
         overrides = list_overrides(set, duration_s=duration)
         if controller is not None:
             if not safe:
-                raise ConfigError(f"action={action!r}: a controller commands through the limiter; leave safe=False out")
+                raise ConfigError(
+                    f"action={action!r}: a controller commands through the limiter; leave safe=False out",
+                    code="python/invalid-argument",
+                )
             overrides.insert(0, Override("controller", controller, f"action={action}"))
 
         # The scenario, and what each seed changes in it.

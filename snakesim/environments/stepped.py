@@ -144,7 +144,7 @@ class SteppedRobot:
         answer = authority.on_lifecycle(make_arm_request(self.description, REQUESTER), 0)
         if not answer.ok:
             self._backend.close()
-            raise RefusedError(f"not ready to arm: {answer.reason}")
+            raise RefusedError(f"not ready to arm: {answer.reason}", code="robot/not-ready")
 
     def _offer(self, authority: Authority, modes: list[Mode], target: list[float]) -> None:
         """Send a command that answers the present samples."""
@@ -171,7 +171,8 @@ def _check_planned_faults(config: RunConfig) -> None:
         if injection.target_type not in FAULT_TARGETS:
             raise ConfigError(
                 f"fault {str(injection)!r} is one of a {injection.target_type}: without a controller there are "
-                f"only faults of {', '.join(FAULT_TARGETS)}; take action='residual:...', or leave it out"
+                f"only faults of {', '.join(FAULT_TARGETS)}; take action='residual:...', or leave it out",
+                code="injection/not-supported",
             )
 
 
@@ -181,7 +182,10 @@ def _open_simulated_backend(config: RunConfig) -> Backend:
     backend = backend_type(config, backend_settings(config, backend_type))
     if not backend.describe().emulated:
         backend.close()
-        raise RefusedError(f"backend {config.backend!r} moves real hardware; environments are for simulated robots")
+        raise RefusedError(
+            f"backend {config.backend!r} moves real hardware; environments are for simulated robots",
+            code="robot/real-hardware",
+        )
     return backend
 
 

@@ -51,7 +51,8 @@ def learned_by(policy: str) -> dict[str, float]:
         return msgspec.json.decode(metadata.get(LEARNED, ""), type=dict[str, float])
     except msgspec.MsgspecError:
         raise ConfigError(
-            f"--from {policy}: does not tell what `snakesim train` has learned; give a policy.onnx that it has written"
+            f"--from {policy}: does not tell what `snakesim train` has learned; give a policy.onnx that it has written",
+            code="command/invalid-option",
         ) from None
 
 

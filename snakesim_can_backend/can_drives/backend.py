@@ -94,7 +94,8 @@ class CanDriveBackend(DriverTypeBackend):
                 raise ConfigError(
                     f"{joint_label(config, joint)}: `id` = {joint.id}, and {cls.plural_noun} have ids of "
                     f"{cls.first_id} to {cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as "
-                    f"`id` of the joint"
+                    f"`id` of the joint",
+                    code="drive/unsupported-setting",
                 )
             cls.check_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.decimation

@@ -61,7 +61,10 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
         return 0
     for channel in channels:
         if not is_emulated(channel):
-            raise ConfigError(f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous")
+            raise ConfigError(
+                f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous",
+                code="bus/not-virtual",
+            )
     check_channels(channels, fd=settings.fd_rate is not None)
     config = msgspec.structs.replace(config, clock_mode="realtime")
     wires = [open_wire(channel, None, settings.bit_rate, settings.fd_rate) for channel in channels]

@@ -175,9 +175,11 @@ class CanDrives(Drives):
         self._wait_for_duplicates()
         problems = [f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_problems(i)]
         if self._second_host:
-            raise BackendError("another program commands drives on this bus; end it first. Nothing was sent")
+            raise BackendError(
+                "another program commands drives on this bus; end it first. Nothing was sent", code="bus/second-host"
+            )
         if problems:
-            raise BackendError("the robot is not complete; nothing was enabled:", *problems)
+            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
         self._may_write = True
         for i in drives:
             self.send_command(i, "idle")
@@ -186,7 +188,7 @@ class CanDrives(Drives):
         self._request_until(self.readings.is_known, self.request_motion)
         silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
         if silent:
-            raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled")
+            raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled", code="drive/silent")
         for i in drives:
             self.request_health(i)
         self._receive()

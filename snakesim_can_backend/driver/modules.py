@@ -121,10 +121,17 @@ class JointModules(Drives):
         limit_s = self._settings.bring_up_limit_s
         identities = find_modules(self._buses, limit_s, self.reading.process_frame)
         if self.reading.from_other_host:
-            raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
+            raise BackendError(
+                "another program commands the modules on this bus; end it first. Nothing was sent",
+                code="bus/second-host",
+            )
         errors = discovery_errors(self._buses, identities, self._names, lockstep=self._lockstep)
         if errors:
-            raise BackendError("the robot is not complete; nothing was enabled:", *(f"  {error}" for error in errors))
+            raise BackendError(
+                "the robot is not complete; nothing was enabled:",
+                *(f"  {error}" for error in errors),
+                code="drive/not-complete",
+            )
         self._is_only_host = True
         self.emulated = all(identity.emulated for identity in identities)
         for identity in identities:
@@ -325,7 +332,9 @@ class JointModules(Drives):
                 return
         modules = zip(self._names, self.reading.modules, strict=True)
         silent = [name for name, module in modules if module.sync < 0]
-        raise BackendError(f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled")
+        raise BackendError(
+            f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled", code="drive/silent"
+        )
 
     def _clear_faults_of_killed_driver(self) -> None:
         """Clear the faults that a killed driver has left; but not heat, leaks and emergencies."""

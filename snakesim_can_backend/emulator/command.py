@@ -138,7 +138,8 @@ def _check_names(channels: Sequence[str], *, on_real_bus: bool) -> None:
         if not is_emulated(channel) and not on_real_bus:
             raise ConfigError(
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
-                "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus"
+                "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus",
+                code="bus/not-virtual",
             )
 
 

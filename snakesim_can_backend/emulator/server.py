@@ -29,7 +29,9 @@ class EmulatorServer:
     def __init__(self, wires: Sequence[Wire], chain: ModuleChain) -> None:
         """Connect a chain to its buses. Raises ConfigError if their numbers differ."""
         if len(wires) != len(chain.modules_per_bus):
-            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses")
+            raise ConfigError(
+                f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses", code="bus/invalid-channel"
+            )
         self.wires = wires
         self.chain = chain
         self.unsent = 0  # frames that an interface did not accept

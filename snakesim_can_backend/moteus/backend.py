@@ -74,7 +74,8 @@ class MoteusBackend(CanDriveBackend):
             raise ConfigError(
                 f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {needed_kp:.4g} N·m/turn on, and "
                 f"`.kd` from {needed_kd:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
-                f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`"
+                f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`",
+                code="drive/unsupported-setting",
             )
 
 

@@ -49,11 +49,15 @@ class OdriveBackend(CanDriveBackend):
         """
         where = joint_label(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
-            raise ConfigError(f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it")
+            raise ConfigError(
+                f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it",
+                code="drive/unsupported-setting",
+            )
         if joint.motor.torque_constant_nm_per_a is None and cls.has_real_bus(settings):
             raise ConfigError(
                 f"{where}: `torque_constant_nm_per_a` is not given, and ODrives measure and limit amperes: take it "
-                f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it"
+                f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it",
+                code="drive/unsupported-setting",
             )
         cls.check_current(config, settings, joint)
 
@@ -80,7 +84,8 @@ class OdriveBackend(CanDriveBackend):
             )
         raise ConfigError(
             f"{joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A "
-            f"at {constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`"
+            f"at {constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`",
+            code="drive/unsupported-setting",
         )
 
     @classmethod

@@ -157,10 +157,15 @@ class EmulatedBody:
             ConfigError: There is no such fault, or no such joint.
         """
         if injection.target_type != "joint" or injection.kind not in FAULTS:
-            raise ConfigError(f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}")
+            raise ConfigError(
+                f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}", code="injection/unknown-fault"
+            )
         i = injection.number
         if i >= len(self.joints):
-            raise ConfigError(f"fault {str(injection)!r}: this robot has joint_1 to joint_{len(self.joints)}")
+            raise ConfigError(
+                f"fault {str(injection)!r}: this robot has joint_1 to joint_{len(self.joints)}",
+                code="injection/unknown-target",
+            )
         j = self._joint_indices[i]
         match injection.kind:
             case "mute":

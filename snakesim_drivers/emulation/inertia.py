@@ -113,7 +113,10 @@ class InertiaModel(PhysicsModel):
             BackendError: An angle is not finite.
         """
         if not np.isfinite(self._angle_rad).all():
-            raise BackendError("inertia physics model: a joint angle is NaN or infinite, because a torque was")
+            raise BackendError(
+                "inertia physics model: a joint angle is NaN or infinite, because a torque was",
+                code="simulator/diverged",
+            )
         moves_outwards = self._velocity_rad_s * correction_rad < 0
         self._velocity_rad_s[moves_outwards] = 0.0
         np.clip(self._angle_rad, self._lower_rad, self._upper_rad, out=self._angle_rad)

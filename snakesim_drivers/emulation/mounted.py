@@ -120,6 +120,12 @@ def check_mounted(robot: RobotFile, section: str, mounted: Mapping[str, Mounted]
     names = [joint.name for joint in robot.joint_table]
     for name in mounted:
         if name not in names:
-            raise ConfigError(f"`{section}.mounted.{name}`: robot {robot.name!r} has {names[0]} to {names[-1]}")
+            raise ConfigError(
+                f"`{section}.mounted.{name}`: robot {robot.name!r} has {names[0]} to {names[-1]}",
+                code="config/conflict",
+            )
     if mounted and not emulators:
-        raise ConfigError(f"`{section}.mounted` is for emulators; the modules on this bus are mounted as they are")
+        raise ConfigError(
+            f"`{section}.mounted` is for emulators; the modules on this bus are mounted as they are",
+            code="config/conflict",
+        )

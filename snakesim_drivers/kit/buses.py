@@ -63,7 +63,7 @@ class Buses(Drives):
         if errors:
             lines = [line for error in errors for line in error.lines]
             distinct_lines = dict.fromkeys(lines)
-            raise BackendError(*distinct_lines)
+            raise BackendError(*distinct_lines, code=errors[0].code)
         for bus in self.buses:
             self._readings.copy_from(bus.readings, bus.spec.joints)
 
@@ -153,7 +153,10 @@ class Buses(Drives):
     def _inject_into_bus(self, injection: Injection, *, begins: bool) -> bool:
         number = injection.number
         if not 0 <= number < len(self.buses):
-            raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}")
+            raise ConfigError(
+                f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}",
+                code="injection/unknown-target",
+            )
         bus = self.buses[number]
         if injection.kind == "slow":
             delay_s = injection.amount or 0.0

@@ -241,7 +241,7 @@ class DriveBackend(Backend):
 
     def _require_open(self) -> None:
         if not self._open:
-            raise BackendError("the buses are closed; open a new backend")
+            raise BackendError("the buses are closed; open a new backend", code="backend/closed")
 
     def _make_description(self, config: RunConfig, name: str, hardware: str) -> Description:
         description = describe_run_robot(config, name, emulated=self._drives.emulated)

@@ -118,7 +118,8 @@ def check_buses(
         if joint.drive.port and joint.drive.port not in ports:
             raise ConfigError(
                 f"{joint_label(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
-                f"`{section}`: {', '.join(ports) or 'none'}"
+                f"`{section}`: {', '.join(ports) or 'none'}",
+                code="bus/invalid-channel",
             )
     _check_watchdog(config, settings, section)
     _check_decimation(config, settings.decimation, section)
@@ -132,7 +133,8 @@ def _check_watchdog(config: RunConfig, settings: DriveSettings, section: str) ->
     decimation_text = f" and `decimation` = {decimation}" if decimation > 1 else ""
     raise ConfigError(
         f"`{section}.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}{decimation_text}: "
-        f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more"
+        f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more",
+        code="drive/watchdog-too-short",
     )
 
 
@@ -143,7 +145,8 @@ def _check_decimation(config: RunConfig, decimation: int, section: str) -> None:
     age_ms = 1000 * decimation / config.rate_hz
     raise ConfigError(
         f"`{section}.decimation` = {decimation} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
-        f"{age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}"
+        f"{age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}",
+        code="drive/watchdog-too-short",
     )
 
 

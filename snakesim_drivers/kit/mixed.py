@@ -63,13 +63,19 @@ def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     where = f"robot {robot.name!r}, {joint.name}: `driver`"
     fix = f"say it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
     if not driver:
-        raise ConfigError(f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}")
+        raise ConfigError(
+            f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}",
+            code="drive/unknown-type",
+        )
     try:
         plugin: Any = find_plugin(BACKENDS, driver)
     except ConfigError as error:
-        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}") from None
+        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}", code="drive/unknown-type") from None
     if not (isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)):
-        raise ConfigError(f"{where} = {driver!r}, which is a backend of whole robots, and not a driver type; {fix}")
+        raise ConfigError(
+            f"{where} = {driver!r}, which is a backend of whole robots, and not a driver type; {fix}",
+            code="drive/unknown-type",
+        )
     return plugin
 
 
@@ -82,7 +88,8 @@ def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBacke
     if robot_wide:
         raise ConfigError(
             f"`{section}.{robot_wide[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-            f"say `backends.mixed.{robot_wide[0]}`"
+            f"say `backends.mixed.{robot_wide[0]}`",
+            code="config/conflict",
         )
     settings = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
     joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
@@ -96,5 +103,6 @@ def _check_same_world(parts: list[DriverTypePart]) -> None:
     if on_bus and emulated:
         raise ConfigError(
             f"`{emulated[0].section}` names no bus, and `{on_bus[0].section}` does: drives that are emulated here do "
-            f"not move with those on a bus. Name the buses of all driver types, or of none"
+            f"not move with those on a bus. Name the buses of all driver types, or of none",
+            code="bus/not-virtual",
         )

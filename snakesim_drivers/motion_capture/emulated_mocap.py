@@ -28,7 +28,9 @@ class PoseSender:
         """
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
-            raise ConfigError(f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450")
+            raise ConfigError(
+                f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450", code="network/invalid-address"
+            )
         self._address = (host, int(port))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)

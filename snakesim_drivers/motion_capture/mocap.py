@@ -53,7 +53,8 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
         raise ConfigError(
             f"`{config.backend_section}.pose_listen` = {pose_listen!r} needs a section [sensors.pose] in the file of "
             f"robot {config.robot.name!r}: its `delay_s` is the age of a pose when it arrives, 0 to 1 s, from the "
-            f"manual of the motion-capture system"
+            f"manual of the motion-capture system",
+            code="config/missing-key",
         )
 
 
@@ -178,7 +179,9 @@ class MocapReceiver:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise BackendError(f"`{self._setting}`: poses cannot be received: {error}") from error
+                raise BackendError(
+                    f"`{self._setting}`: poses cannot be received: {error}", code="network/port-in-use"
+                ) from error
             sample = self._decode(datagram)
             if sample is not None:
                 samples.append(sample)

@@ -129,13 +129,21 @@ def select_parts(robot: Description, observe: Sequence[str] | None) -> dict[str,
     if observe is None:
         return {name: observable[name] for name in DEFAULT if name in observable}
     if isinstance(observe, str) or not observe:
-        raise ConfigError(f"observe={observe!r:.60}: give a sequence of names, such as ('angle_rad', 'contact_n')")
+        raise ConfigError(
+            f"observe={observe!r:.60}: give a sequence of names, such as ('angle_rad', 'contact_n')",
+            code="policy/invalid",
+        )
     for name in observe:
         if name not in parts:
             hint = suggest_word(str(name), parts)
-            raise ConfigError(f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}")
+            raise ConfigError(
+                f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}", code="policy/invalid"
+            )
         if name not in observable:
-            raise ConfigError(f"observe: {name!r} needs {parts[name].sensor}, which robot {robot.robot!r} has not")
+            raise ConfigError(
+                f"observe: {name!r} needs {parts[name].sensor}, which robot {robot.robot!r} has not",
+                code="policy/invalid",
+            )
     return {name: parts[name] for name in observe}
 
 

@@ -188,7 +188,9 @@ class _Metadata:
         try:
             return select_parts(robot, names)
         except ConfigError as error:
-            raise ConfigError(f"{self._file}: metadata `{OBSERVATIONS}` is {shorten(text)!r}: {error}") from None
+            raise ConfigError(
+                f"{self._file}: metadata `{OBSERVATIONS}` is {shorten(text)!r}: {error}", code="policy/invalid"
+            ) from None
 
     def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
         """Return a text that is one of the choices."""
@@ -217,13 +219,16 @@ class _Metadata:
 
     def make_error(self, field: str, value: object, allowed: str) -> ConfigError:
         """Return an error that names the file, the field, its value and what is allowed."""
-        return ConfigError(f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}")
+        return ConfigError(
+            f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}", code="policy/invalid"
+        )
 
     def _read_text(self, field: str, allowed: str) -> str:
         if field not in self._properties:
             available = ", ".join(sorted(self._properties)) or "no metadata"
             raise ConfigError(
-                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {shorten(available, 200)}"
+                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {shorten(available, 200)}",
+                code="policy/invalid",
             )
         return self._properties[field]
 
@@ -240,7 +245,8 @@ def _find_model_file(name: str) -> Path:
     if name not in shipped:
         raise ConfigError(
             f"no policy called {shorten(name)!r}; {suggest_word(name, shipped)}shipped are {', '.join(shipped)}. For a "
-            f"file of your own give its path, such as ./{shorten(name)}{SUFFIX}"
+            f"file of your own give its path, such as ./{shorten(name)}{SUFFIX}",
+            code="config/unknown-name",
         )
     return POLICIES / f"{name}{SUFFIX}"
 
@@ -259,7 +265,7 @@ def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     """
     data = read_bytes(_find_model_file(file))
     if RUNTIME is None:
-        raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}")
+        raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}", code="extra/not-installed")
     options = RUNTIME.SessionOptions()
     # One thread adds in the same order on every computer, so that results are equal to the bit.
     options.intra_op_num_threads = 1
@@ -268,7 +274,9 @@ def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     try:
         session = RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many classes that share no base class
-        raise ConfigError(f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}") from error
+        raise ConfigError(
+            f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}", code="policy/invalid"
+        ) from error
     return session, session.get_modelmeta().custom_metadata_map
 
 
@@ -291,7 +299,8 @@ def _check_tensor(kind: str, tensors: Sequence[Any], width: int, meaning: str, f
     available = shorten("; ".join(descriptions) or "none", 200)
     raise ConfigError(
         f"{shorten(file)}: {kind} is {available}, must be one tensor(float), that is float32, of shape (1, {width}): "
-        f"{meaning}"
+        f"{meaning}",
+        code="policy/invalid",
     )
 
 

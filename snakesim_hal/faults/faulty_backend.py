@@ -45,7 +45,10 @@ class FaultyBackend(Backend):
         if "samples" in injection.about.by:
             self._change_samples(injection, begins)
             return True
-        raise ConfigError(f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}")
+        raise ConfigError(
+            f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}",
+            code="injection/not-supported",
+        )
 
     def describe(self) -> Description:
         """Return the backend's description."""
@@ -80,7 +83,10 @@ class FaultyBackend(Backend):
 
     def _slow_down(self, injection: Injection, begins: bool) -> None:
         if not self._description.emulated:
-            raise ConfigError(f"backend {self._description.backend!r} has no simulation that could be slow")
+            raise ConfigError(
+                f"backend {self._description.backend!r} has no simulation that could be slow",
+                code="injection/not-supported",
+            )
         self._speed_ratio = injection.amount if begins else None
 
     def _change_samples(self, injection: Injection, begins: bool) -> None:
@@ -88,7 +94,10 @@ class FaultyBackend(Backend):
         joint = injection.number
         count = len(self._description.joints)
         if joint >= count:
-            raise ConfigError(f"there is no {injection.target}; this robot has joint_1 to joint_{count}")
+            raise ConfigError(
+                f"there is no {injection.target}; this robot has joint_1 to joint_{count}",
+                code="injection/unknown-target",
+            )
         kinds = self._active.setdefault(joint, {})
         if begins:
             kinds[injection.kind] = injection

@@ -38,7 +38,8 @@ def _guarded(method: MethodT) -> MethodT:
         except StepTooLongError as error:
             where = f"{self.name}.{method.__name__}"
             raise BackendError(
-                f"{where} did not return in time: it was in {describe_interrupted_line(error)}"
+                f"{where} did not return in time: it was in {describe_interrupted_line(error)}",
+                code="backend/step-timeout",
             ) from error
         except (Exception, SystemExit) as error:  # third-party code, which must not end the host
             where = f"{self.name}.{method.__name__}"

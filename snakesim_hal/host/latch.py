@@ -142,7 +142,7 @@ def remove_latched_stop(path: Path) -> str:
         path.unlink(missing_ok=True)
         sync_folder(path.parent)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from error
+        raise ConfigError(f"{path}: {error.strerror}; remove it by hand", code="file/not-writable") from error
     return f"emergency stop by {'nobody' if latched is None else latched.requester}"
 
 

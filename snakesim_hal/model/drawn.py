@@ -60,7 +60,8 @@ def make_draws(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
             draws.append(Draw(set=key_list, low=low, high=high))
         except (TypeError, ValueError):
             raise ConfigError(
-                f"draw {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite"
+                f"draw {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite",
+                code="command/invalid-option",
             ) from None
     return draws
 
@@ -73,5 +74,8 @@ def parse_draw(text: str) -> tuple[str, list[str]]:
     """
     keys, equals, bounds = (part.strip() for part in text.partition("="))
     if not (keys and equals and bounds):
-        raise ConfigError(f"--draw {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4")
+        raise ConfigError(
+            f"--draw {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4",
+            code="command/invalid-option",
+        )
     return keys, bounds.split(":")

@@ -90,9 +90,13 @@ def find_plugin(group: str, name: str) -> Any:
     try:
         return entry.load()
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_install_hint(entry)}") from error
+        raise ConfigError(
+            f"{kind} {name!r} cannot be loaded: {error}.{_install_hint(entry)}", code="extra/not-installed"
+        ) from error
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}") from error
+        raise ConfigError(
+            f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}", code="plugin/not-loadable"
+        ) from error
 
 
 def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
@@ -103,14 +107,16 @@ def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
             f"no {kind} called {shorten(name)!r} is installed; "
             f"{suggest_word(name, list_installed(group))}installed are "
             f"{', '.join(list_installed(group)) or 'none'}. "
-            f"A package adds one by an entry point in the group {group!r}"
+            f"A package adds one by an entry point in the group {group!r}",
+            code="plugin/not-found",
         )
     different_objects = {entry.value for entry in entries}
     if len(different_objects) > 1:
         packages = " and ".join(f"{_package(entry)} ({entry.value})" for entry in entries)
         raise ConfigError(
             f"{kind} {name!r} is in several installed packages: {packages}; uninstall all but one, or name a file "
-            f"and a class in it, ./file.py:Class"
+            f"and a class in it, ./file.py:Class",
+            code="plugin/ambiguous",
         )
     return entries[0]
 
@@ -173,7 +179,7 @@ def _parse_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
         tree = ast.parse(read_bytes(path), str(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}") from None
+        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}", code="plugin/not-loadable") from None
     if not attribute:
         raise _missing_class_error(name, kind, tree)
     return path, attribute, tree
@@ -190,7 +196,10 @@ def _missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
     else:
         example = f"{path}:Class"
         available = "there is no class in it"
-    return ConfigError(f"{kind} {shorten(name)!r}: {problem}, as in {shorten(example)}; {shorten(available, 400)}")
+    return ConfigError(
+        f"{kind} {shorten(name)!r}: {problem}, as in {shorten(example)}; {shorten(available, 400)}",
+        code="plugin/not-found",
+    )
 
 
 def _names(tree: ast.Module) -> Iterator[str]:
@@ -209,14 +218,16 @@ def _from_file(name: str, kind: str) -> Any:
     path, attribute, tree = _parse_file(name, kind)
     spec = importlib.util.spec_from_file_location(f"snakesim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python")
+        raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python", code="plugin/not-loadable")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     find_siblings_of(path)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise ConfigError(
+            f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}", code="plugin/not-loadable"
+        ) from error
     if not hasattr(module, attribute):
         raise _missing_class_error(name, kind, tree)
     return getattr(module, attribute)
@@ -255,5 +266,8 @@ def plugin_settings(
     """
     settings = getattr(plugin, "Settings", None)
     if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):
-        raise ConfigError(f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty")
+        raise ConfigError(
+            f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty",
+            code="plugin/not-loadable",
+        )
     return decode(Table(section, source, origin or {}), settings, where)

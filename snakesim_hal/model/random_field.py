@@ -121,7 +121,8 @@ def place_random_obstacles(
     if len(placed) < field.wanted:
         raise ConfigError(
             f"{where}: only {len(placed)} of {field.wanted} pegs fit; lower `density_per_m2` = "
-            f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}"
+            f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}",
+            code="scene/invalid",
         )
     return placed
 
@@ -144,18 +145,23 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
     if not np.all(np.array(field.max_corner_m) > np.array(field.min_corner_m)):
         raise ConfigError(
             f"{where}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
-            f"{field.min_corner_m} in x and y"
+            f"{field.min_corner_m} in x and y",
+            code="scene/invalid",
         )
     for name in ("radius_m", "box_size_m"):
         sizes = getattr(field, name)
         if sizes[1] < sizes[0]:
-            raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest")
+            raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid")
     if field.route_clearance_m is not None and route is None:
-        raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
+        raise ConfigError(
+            f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section",
+            code="scene/no-route",
+        )
     if field.wanted > MAX_RANDOM_OBSTACLES:
         raise ConfigError(
             f"{where}: `density_per_m2` = {field.density_per_m2} asks for {field.wanted} pegs on this area; at most "
-            f"{MAX_RANDOM_OBSTACLES}"
+            f"{MAX_RANDOM_OBSTACLES}",
+            code="scene/invalid",
         )
 
 

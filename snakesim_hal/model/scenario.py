@@ -363,7 +363,10 @@ def parse_set(text: str) -> Override:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or not key:
-        raise ConfigError(f"--set {shorten(text)}: give section.key=value, such as --set control.propulsion_n=35")
+        raise ConfigError(
+            f"--set {shorten(text)}: give section.key=value, such as --set control.propulsion_n=35",
+            code="command/invalid-option",
+        )
     try:
         parsed = parse_toml(f"value = {value}", "--set")["value"]
     except ConfigError:
@@ -481,7 +484,8 @@ def check(config: RunConfig) -> None:
     if config.start.on_route and config.scene.route is None:
         raise ConfigError(
             f"scenario {config.name!r}: `start.on_route` is true but scene {config.scene.name!r} has no route; "
-            f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene"
+            f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene",
+            code="scene/no-route",
         )
     angles_rad = find_start_pose(config).angles_rad.tolist()
     for joint, angle_rad in zip(config.robot.joint_table, angles_rad, strict=True):
@@ -497,12 +501,14 @@ def _start_angle_error(config: RunConfig, joint: Joint, angle_rad: float) -> Con
         return ConfigError(
             f"robot {config.robot.name!r}: {joint.name} may turn from {limits.lower_rad:g} to "
             f"{limits.upper_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
-            f"start it on a route that suits them"
+            f"start it on a route that suits them",
+            code="config/out-of-range",
         )
     return ConfigError(
         f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
         f"{config.robot.name!r} allows {limits.lower_rad:g} to {limits.upper_rad:g} rad. Choose a "
-        f"smoother route"
+        f"smoother route",
+        code="config/out-of-range",
     )
 
 

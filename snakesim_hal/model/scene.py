@@ -254,7 +254,7 @@ def make_route(scene: SceneFile) -> Route | None:
             try:
                 return Route(np.asarray(points))
             except ValueError as error:
-                raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}") from None
+                raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}", code="scene/invalid") from None
 
 
 class Placed(Upright, frozen=True, kw_only=True):
@@ -298,7 +298,9 @@ def _check_count(scene: SceneFile) -> None:
     count += sum(row.count for row in scene.pegs_along_route)
     count += sum(min(field.wanted, MAX_RANDOM_OBSTACLES) for field in scene.random_field)
     if count > MAX_OBSTACLES:
-        raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
+        raise ConfigError(
+            f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed", code="scene/invalid"
+        )
 
 
 def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
@@ -306,7 +308,10 @@ def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
     counts = Counter(item.obstacle.name for item in placed)
     duplicates = sorted(name for name, count in counts.items() if count > 1)
     if duplicates:
-        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {duplicates[0]!r}; rename one")
+        raise ConfigError(
+            f"scene {scene.name!r}: two obstacles are called {duplicates[0]!r}; rename one",
+            code="config/duplicate-name",
+        )
 
 
 def _with_material(obstacle: Obstacle, solid: Solid) -> Placed:
@@ -345,7 +350,9 @@ def _placed_wall(scene: SceneFile, index: int, wall: Wall) -> Placed:
     run_y = to_y - from_y
     length_m = math.hypot(run_x, run_y)
     if length_m == 0:
-        raise ConfigError(f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point")
+        raise ConfigError(
+            f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point", code="scene/invalid"
+        )
     name = wall.name or f"wall_{index}"
     middle_m = ((from_x + to_x) / 2, (from_y + to_y) / 2)
     size_m = (length_m, wall.thickness_m, wall.height_m)
@@ -368,14 +375,15 @@ def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: 
     """
     where = f"scene {scene.name!r}: `pegs_along_route.{index}`"
     if route is None:
-        raise ConfigError(f"{where}: the scene has no route; add a [route] section")
+        raise ConfigError(f"{where}: the scene has no route; add a [route] section", code="scene/no-route")
     inflections_s_m = route.inflections_s_m()
     used_s_m = inflections_s_m[row.first : row.first + row.count]
     if len(used_s_m) < row.count:
         available = len(inflections_s_m)
         raise ConfigError(
             f"{where}: `count` = {row.count} pegs from inflection {row.first} on, but the route has {available} "
-            f"inflections; make the route longer or `count` at most {max(available - row.first, 0)}"
+            f"inflections; make the route longer or `count` at most {max(available - row.first, 0)}",
+            code="scene/invalid",
         )
     start_w, end_w = route.position_w(np.array([0.0, route.length_m]))
     forward = (end_w - start_w) / np.linalg.norm(end_w - start_w)
@@ -426,7 +434,8 @@ def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) ->
         raise ConfigError(
             f"scene {scene.name!r}: obstacle {obstacles[obstacle_index].name!r} overlaps {snake[link_index].name} of "
             f"the snake at its start by {overlap_mm:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
-            f"change [start] in the scenario"
+            f"change [start] in the scenario",
+            code="scene/overlap",
         )
 
 

@@ -72,7 +72,8 @@ def open_stop_port(host: str, port: int) -> socket.socket:
         opened.close()
         raise NotConnectedError(
             f"cannot listen for emergency stops on udp/{host}:{port}: {error.strerror}. Another run may hold the port; "
-            f"choose one with --endpoint tcp/{host}:PORT"
+            f"choose one with --endpoint tcp/{host}:PORT",
+            code="network/port-in-use",
         ) from error
     return opened
 
@@ -165,7 +166,9 @@ class StopRequester:
         """
         opened = self._sockets.get(address)
         if opened is None:
-            raise NotConnectedError(f"no socket is prepared for udp/{address[0]}:{address[1]}")
+            raise NotConnectedError(
+                f"no socket is prepared for udp/{address[0]}:{address[1]}", code="network/nothing-listens"
+            )
         try:
             opened.connect(address)
             opened.send(TEST)

@@ -169,7 +169,10 @@ def check_network(arguments: argparse.Namespace) -> None:
         if given is not None:
             check_endpoint(given, flag)
             if arguments.session is not None:
-                raise ConfigError(f"{flag} and --session: the session file names the endpoint; leave one out")
+                raise ConfigError(
+                    f"{flag} and --session: the session file names the endpoint; leave one out",
+                    code="command/conflicting-options",
+                )
     if arguments.namespace is not None:
         check_namespace(arguments.namespace, "--namespace")
 

@@ -147,7 +147,8 @@ def refuse_second_host(session: Session, link: Link) -> None:
             raise RefusedError(
                 f"another HAL host is on {link.endpoint} as {link.namespace}: "
                 f"{keys.parse_service(others[0])}. End it, or "
-                f"give this robot another --namespace"
+                f"give this robot another --namespace",
+                code="robot/already-running",
             )
 
 

@@ -70,7 +70,7 @@ def _check_controller(
     config = _without_pose_services(config, controller)
     problem = describe_missing_capability(describe_joints(config.robot), controller, config.controller)
     if problem is not None:
-        raise ConfigError(f"robot {config.robot.name!r}: {problem}")
+        raise ConfigError(f"robot {config.robot.name!r}: {problem}", code="config/conflict")
     controller.check(describe_run_robot(config), parameters)
     return config
 
@@ -81,7 +81,8 @@ def _check_in_host_services(config: RunConfig, source: str) -> None:
     if others:
         raise ConfigError(
             f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
-            'what plans or looks would keep the host from its ticks; leave it at "process"'
+            'what plans or looks would keep the host from its ticks; leave it at "process"',
+            code="config/conflict",
         )
 
 
@@ -118,7 +119,8 @@ def _check_service(config: RunConfig, name: str, code: str, service: Any) -> Non
             f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
             f"services.{shorten(name)}, and both "
             f"have one name. Write [services.{service.name}] with code = {shorten(code)!r}, or change the "
-            "class's `name`"
+            "class's `name`",
+            code="plugin/not-loadable",
         )
 
 
@@ -230,6 +232,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     origin = table.origin_of("clock_mode") if table is not None else f"scenario {config.name!r}"
     if origin.startswith("--"):
         raise ConfigError(
-            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}"
+            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}",
+            code="backend/wrong-clock-mode",
         )
     return msgspec.structs.replace(config, clock_mode=clock_modes[0])

@@ -44,16 +44,24 @@ def check(config: RunConfig) -> None:
     where = f"scenario {config.name!r} in one process"
     if config.clock_mode != "lockstep":
         raise ConfigError(
-            f"{where}: clock mode is {config.clock_mode!r}, must be 'lockstep'; add --clock-mode lockstep"
+            f"{where}: clock mode is {config.clock_mode!r}, must be 'lockstep'; add --clock-mode lockstep",
+            code="backend/wrong-clock-mode",
         )
     if not config.has_own_control:
-        raise ConfigError(f"{where}: nobody commands the robot; it needs a control service that is not external")
+        raise ConfigError(
+            f"{where}: nobody commands the robot; it needs a control service that is not external",
+            code="config/conflict",
+        )
     for name, service in config.services.items():
         if service.external:
-            raise ConfigError(f"{where}: services.{name} is external, and there is no network to meet it")
+            raise ConfigError(
+                f"{where}: services.{name} is external, and there is no network to meet it", code="config/conflict"
+            )
     for injection in parse_planned(config):
         if injection.target_type in ("process", "clock"):
-            raise ConfigError(f"{where}: fault {str(injection)!r} needs processes of their own")
+            raise ConfigError(
+                f"{where}: fault {str(injection)!r} needs processes of their own", code="injection/not-supported"
+            )
 
 
 class InProcessRun:
@@ -88,7 +96,9 @@ class InProcessRun:
                 with self._limit:
                     self._open(opening)
             except StepTooLongError as error:
-                raise RefusedError(f"the run did not begin: {self._explain(error)}") from error
+                raise RefusedError(
+                    f"the run did not begin: {self._explain(error)}", code="backend/step-timeout"
+                ) from error
             self._opened = opening.pop_all()
         self._limit.limit_s = self._turn_limit_s
         return self
@@ -106,7 +116,8 @@ class InProcessRun:
         if not backend.describe().emulated:
             raise RefusedError(
                 f"backend {config.backend!r} moves real hardware, which nobody could stop from outside: run it in "
-                "processes of their own"
+                "processes of their own",
+                code="robot/real-hardware",
             )
         session = self.network.session()
         opened.callback(session.close)
@@ -150,7 +161,9 @@ class InProcessRun:
                 if not self.host.authority.arm_session and not self.failed:
                     status = self.host.status()
                     if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
-                        raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.reason}")
+                        raise RefusedError(
+                            f"not ready to arm within {limit_s:g} s: {status.reason}", code="robot/not-ready"
+                        )
                     if status.ready_to_arm:
                         self.host.submit_request(make_arm_request(self.host.description, WHO), lambda _answer: None)
                 if not before_services:
@@ -195,7 +208,7 @@ class InProcessRun:
                 loop.act()
         except StepTooLongError as error:
             traceback.print_exc()
-            raise ServiceError(self._explain(error)) from None
+            raise ServiceError(self._explain(error), code="backend/step-timeout") from None
 
     def _explain(self, error: StepTooLongError) -> str:
         """Return why a part was interrupted, and what to do about it."""

@@ -45,7 +45,9 @@ def require(extra: str, who: str, otherwise: str = "") -> None:
     """
     missing = _missing_packages(extra)
     if missing:
-        raise ConfigError(f"{who} needs {', '.join(missing)}: {pip_install(extra)}{otherwise}")
+        raise ConfigError(
+            f"{who} needs {', '.join(missing)}: {pip_install(extra)}{otherwise}", code="extra/not-installed"
+        )
 
 
 def explained(error: ModuleNotFoundError) -> ConfigError | None:
@@ -53,7 +55,7 @@ def explained(error: ModuleNotFoundError) -> ConfigError | None:
     package = (error.name or "").partition(".")[0]
     for extra, packages in BRINGS.items():
         if package in packages:
-            return ConfigError(f"this command needs {package}: {pip_install(extra)}")
+            return ConfigError(f"this command needs {package}: {pip_install(extra)}", code="extra/not-installed")
     return None
 
 

@@ -48,7 +48,7 @@ def echo(key: str | None, where: RobotSelection, *, rate_only: bool, count: int 
     if not rows:
         hint = suggest_word(key, [row.key for row in _published_rows()]).strip()
         lines = [*_key_lines(), hint] if hint else _key_lines()
-        raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines)
+        raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines, code="network/unknown-key")
     prefix = "" if where.namespace is not None else "**/"
     queue = OutputQueue()
     with contextlib.ExitStack() as stack:

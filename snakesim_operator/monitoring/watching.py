@@ -98,7 +98,9 @@ def _record(arguments: argparse.Namespace) -> int:
     if arguments.episodes is not None:
         return _record_episodes(arguments)
     if arguments.task is not None:
-        raise ConfigError("--task is for --episodes DIR; add it, or leave --task out")
+        raise ConfigError(
+            "--task is for --episodes DIR; add it, or leave --task out", code="command/conflicting-options"
+        )
     if arguments.foxglove is not None:
         extras.require("foxglove", "--foxglove")
     from snakesim_operator.playback.record_command import record_robot
@@ -116,11 +118,15 @@ def _record(arguments: argparse.Namespace) -> int:
 def _record_episodes(arguments: argparse.Namespace) -> int:
     for name in ("out", "duration", "foxglove"):
         if getattr(arguments, name) is not None:
-            raise ConfigError(f"--{name} and --episodes: episodes are files in a folder, begun and ended by Enter")
+            raise ConfigError(
+                f"--{name} and --episodes: episodes are files in a folder, begun and ended by Enter",
+                code="command/conflicting-options",
+            )
     task = (arguments.task or "").strip()
     if not 0 < len(task) <= MAX_TASK:
         raise ConfigError(
-            f"--task: say what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'"
+            f"--task: say what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'",
+            code="command/invalid-option",
         )
     from snakesim_operator.playback.demonstrations import record_demonstrations
 

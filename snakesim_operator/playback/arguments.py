@@ -166,7 +166,9 @@ def _video(arguments: argparse.Namespace) -> int:
 
     size = (arguments.width, arguments.height)
     if any(pixels % 2 for pixels in size):
-        raise ConfigError(f"--width {size[0]} --height {size[1]}: give even numbers of pixels")
+        raise ConfigError(
+            f"--width {size[0]} --height {size[1]}: give even numbers of pixels", code="command/invalid-option"
+        )
     span_s = (arguments.from_s, arguments.to_s)
     return video(arguments.run, arguments.out, size=size, fps=arguments.fps, speed=arguments.speed, span_s=span_s)
 
@@ -183,7 +185,8 @@ def _export(arguments: argparse.Namespace) -> int:
         return export_dataset(arguments.recordings, arguments.out, print_line, **choice)
     if arguments.images or arguments.task is not None or arguments.fps is not None:
         raise ConfigError(
-            f"--images, --task and --fps are for --format lerobot, not {arguments.format}; leave them out"
+            f"--images, --task and --fps are for --format lerobot, not {arguments.format}; leave them out",
+            code="command/conflicting-options",
         )
     return export(arguments.recordings, arguments.format, arguments.out, print_line)
 
@@ -204,7 +207,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     if arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code:
         raise ConfigError(
             "--set, --controller, --run-recorded-code and --out are for --control, which runs the services; add it, or "
-            "leave them out"
+            "leave them out",
+            code="command/conflicting-options",
         )
     if arguments.endpoint is not None:
         check_endpoint(arguments.endpoint, "--endpoint")

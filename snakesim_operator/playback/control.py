@@ -112,7 +112,10 @@ def config_of(contents: Contents, overrides: list[Override], *, run_recorded_cod
         ConfigError: There is no configuration, it is invalid, or it names Python files that are not allowed.
     """
     if contents.config is None:
-        raise ConfigError(f"{contents.path}: holds no hal/config, so it is not known which controller was at work")
+        raise ConfigError(
+            f"{contents.path}: holds no hal/config, so it is not known which controller was at work",
+            code="recording/missing-data",
+        )
     with TemporaryDirectory(prefix="snakesim-") as folder:
         path = Path(folder) / "config.json"
         path.write_text(contents.config.content)
@@ -142,7 +145,8 @@ def _refuse_recorded_files(path: Path, config: RunConfig, overridden: set[str]) 
             raise ConfigError(
                 f"{path}: the recording names {shorten(code)!r} as {what}, and would have that Python file run on this "
                 f"computer. If you trust the file, name it yourself, with {flag}{shorten(code)}, or run what the "
-                f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME"
+                f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME",
+                code="recording/untrusted-code",
             )
 
 
@@ -168,7 +172,7 @@ class Replay:
         self.config = config_of(contents, overrides, run_recorded_code=run_recorded_code)
         self.changed = bool(overrides) and self.config != config_of(contents, [], run_recorded_code=True)
         if contents.description is None:
-            raise ConfigError(f"{path}: holds no hal/description")
+            raise ConfigError(f"{path}: holds no hal/description", code="recording/missing-data")
         self.robot: Description = contents.description
         self.clock_mode = self.config.clock_mode
         self.stopped = ""  # why it did not reach the end of a recording that lacks something
@@ -282,7 +286,10 @@ class Replay:
                 continue
             self._pending_changes.remove((change, query))
             if not answer.ok:
-                raise ConfigError(f"{self._path}: what {change.requester} set at tick {change.tick}: {answer.reason}")
+                raise ConfigError(
+                    f"{self._path}: what {change.requester} set at tick {change.tick}: {answer.reason}",
+                    code="controller/unknown-parameter",
+                )
 
     def _change_parameters(self, recorded: ControlParameters) -> None:
         """Change the parameters of the controller as in the recording, where they come before their tick's clock.
@@ -358,7 +365,9 @@ def replay_control(
         recording = None if out is None else out / RECORDING
         replay = Replay(path, overrides, recording, run_recorded_code=run_recorded_code)
     except FileExistsError:
-        raise ConfigError(f"--out {out}: holds a recording already; choose another folder") from None
+        raise ConfigError(
+            f"--out {out}: holds a recording already; choose another folder", code="file/already-exists"
+        ) from None
     comparison = replay.run()
     if out is not None:
         write_config(replay.config, out / CONFIG)
@@ -366,7 +375,7 @@ def replay_control(
     if replay.stopped:
         say(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
     elif not comparison.recorded:
-        raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}")
+        raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
     are_same = _print_comparison(comparison, replay, say)
     if are_same or replay.changed or replay.lacks:
         return exit_code(path, replay.lacks)

@@ -71,7 +71,9 @@ def read_labels(path: Path) -> list[EpisodeLabel]:
     try:
         return [msgspec.json.decode(line, type=EpisodeLabel) for line in path.read_bytes().splitlines() if line.strip()]
     except (msgspec.DecodeError, OSError) as error:
-        raise ConfigError(f"{path}: {str(error)[:200]}; it has a line of JSON for each episode") from None
+        raise ConfigError(
+            f"{path}: {str(error)[:200]}; it has a line of JSON for each episode", code="recording/not-readable"
+        ) from None
 
 
 def _episodes_of(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:

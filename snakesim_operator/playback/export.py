@@ -61,7 +61,10 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: PrintLine) ->
         ConfigError: There are several runs, the run cannot be read, or the file cannot be written.
     """
     if len(runs) > 1:
-        raise ConfigError(f"--format {form}: one run at a time; several make a dataset, with --format lerobot")
+        raise ConfigError(
+            f"--format {form}: one run at a time; several make a dataset, with --format lerobot",
+            code="command/invalid-option",
+        )
     run = runs[0]
     path = _reserve(out or _default_path(run, form))
     if form == "mcap":
@@ -121,9 +124,13 @@ def _reserve(path: Path) -> Path:
         path.unlink()
     except FileExistsError:
         what = "a symbolic link" if path.is_symlink() else "such a file"
-        raise ConfigError(f"{path}: there is {what} already; choose another one with --out") from None
+        raise ConfigError(
+            f"{path}: there is {what} already; choose another one with --out", code="file/already-exists"
+        ) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another one with --out") from None
+        raise ConfigError(
+            f"{path}: cannot be written: {error.strerror}; choose another one with --out", code="file/not-writable"
+        ) from None
     return path
 
 

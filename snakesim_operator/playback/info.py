@@ -83,7 +83,7 @@ def recording_of(given: Path) -> Path:
     """Return the recording of a run's folder, or the file itself. Raises ConfigError if there is none."""
     path = given / RECORDING if given.is_dir() else given
     if not path.is_file():
-        raise ConfigError(f"{path}: there is no such recording; {GIVE}")
+        raise ConfigError(f"{path}: there is no such recording; {GIVE}", code="file/not-found")
     return path
 
 

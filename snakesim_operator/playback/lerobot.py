@@ -77,7 +77,8 @@ def write_lerobot(
     for episode in episodes:
         if not any(one.record is episode.record for one, _, _ in kept):
             raise ConfigError(
-                f"{episode.record.folder}: no picture came while it was armed; export it without --images"
+                f"{episode.record.folder}: no picture came while it was armed; export it without --images",
+                code="recording/missing-data",
             )
     dataset = _Dataset(folder, write_table, content, seconds_per_frame=step / robot_hz)
     for episode, rows, shown in kept:
@@ -221,7 +222,9 @@ def _step(robot_hz: int, fps: float | None) -> int:
     step = max(round(robot_hz / fps), 1)
     if fps != round(fps) or robot_hz != step * fps:
         allowed = ", ".join(str(hz) for hz in range(1, robot_hz + 1) if robot_hz % hz == 0)
-        raise ConfigError(f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}")
+        raise ConfigError(
+            f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}", code="command/invalid-option"
+        )
     return step
 
 
@@ -247,13 +250,20 @@ def _rows(episode: Episode, content: _Content, step: int) -> tuple[NDArray[np.in
 
 def _common_rate_hz(records: Sequence[RunRecord]) -> int:
     if any(one.description.layout != records[0].description.layout for one in records):
-        raise ConfigError("the runs are of robots with different joints; a dataset is of one")
+        raise ConfigError(
+            "the runs are of robots with different joints; a dataset is of one", code="recording/not-comparable"
+        )
     rate_hz = records[0].config.rate_hz
     if any(one.config.rate_hz != rate_hz for one in records) or rate_hz != round(rate_hz):
-        raise ConfigError("a dataset has one rate, a whole number of Hz; export the runs of each rate apart")
+        raise ConfigError(
+            "a dataset has one rate, a whole number of Hz; export the runs of each rate apart",
+            code="recording/not-comparable",
+        )
     empty = [one.folder for one in records if not len(one.time_s)]
     if empty:
-        raise ConfigError(f"{empty[0]} has no tick after arming, so no frame; leave it out")
+        raise ConfigError(
+            f"{empty[0]} has no tick after arming, so no frame; leave it out", code="recording/missing-data"
+        )
     return round(rate_hz)
 
 

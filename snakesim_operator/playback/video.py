@@ -72,7 +72,7 @@ def film(
         ConfigError: The record has no pose, `out` is no film, or something that a film needs is not installed.
     """
     if out.suffix not in (".mp4", ".gif"):
-        raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
+        raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif", code="command/invalid-option")
     extras.require("video", "a film")
     times = times_of_pictures(record, fps, speed, span_s)
     picture_s = speed / fps
@@ -113,12 +113,18 @@ def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span)
     """Return the robot time of the pose in each picture. In a gap the last pose before it stays."""
     known = record.time_s[record.posed]
     if not len(known):
-        raise ConfigError(f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film")
+        raise ConfigError(
+            f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film",
+            code="recording/missing-data",
+        )
     first = max(float(known[0]), float(record.time_s[0]) + span_s[0])
     last = min(float(known[-1]), float(record.time_s[0]) + span_s[1])
     if last <= first:
         lasts_s = known[-1] - known[0]
-        raise ConfigError(f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s")
+        raise ConfigError(
+            f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s",
+            code="command/invalid-option",
+        )
     wanted = np.arange(first, last, speed / fps)
     rounding_s = 0.5 * record.config.period_ns * 1e-9
     newest = np.searchsorted(known, wanted + rounding_s, side="right") - 1

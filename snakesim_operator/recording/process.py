@@ -156,7 +156,7 @@ def record_to_file(
     try:
         recorder = Recorder(path, shown_as, show)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
+        raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
     with open_session(link, connect_timeout_s=SERVICE_START_LIMIT_S) as session:
         tap = Tap(session)
         hosts = _watch_hosts(session)

@@ -30,7 +30,7 @@ def recover_recording(path: Path, out: Path) -> tuple[int, list[str]]:
     try:
         file = GrowingFile(out)
     except OSError as error:
-        raise ConfigError(f"{out}: {error.strerror}; choose another file") from error
+        raise ConfigError(f"{out}: {error.strerror}; choose another file", code="file/not-writable") from error
     try:
         reader = RecordingReader(path)
         copy = _Copy(file)

@@ -18,6 +18,7 @@ from snakesim_hal.wire.messages import Description
 
 INCOMPLETE = 3
 """Exit code of a command that succeeded, but whose record is incomplete."""
+INCOMPLETE_CODE = "recording/incomplete"
 
 MAX_MAGNITUDE = 1e9  # no signal is larger, in its SI unit; a larger number counts as infinite
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
@@ -38,7 +39,7 @@ def exit_code(given: Path, lacks: Sequence[str], code: int = 0) -> int:
     """
     if not lacks:
         return code
-    print_stderr(f"snakesim: incomplete: {given} lacks {'; '.join(lacks)}")
+    print_stderr(f"snakesim: incomplete: {given} lacks {'; '.join(lacks)} [{INCOMPLETE_CODE}]")
     return code or INCOMPLETE
 
 

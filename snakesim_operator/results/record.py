@@ -82,20 +82,24 @@ class RunRecord:
         if not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file():
             return RunRecord._load_recording_alone(folder / RECORDING, host, hear)
         if not folder.exists():
-            raise ConfigError(f"{folder}: no such folder; {GIVE}")
+            raise ConfigError(f"{folder}: no such folder; {GIVE}", code="recording/not-a-run")
         needed = [CONFIG, BLACK_BOX, DESCRIPTION]
         if host is None:
             needed.append(HOST_RECORD)
         for name in needed:
             if not (folder / name).is_file():
-                raise ConfigError(f"{folder} is not the folder of a run: {name} is missing; {GIVE}")
+                raise ConfigError(
+                    f"{folder} is not the folder of a run: {name} is missing; {GIVE}", code="recording/not-a-run"
+                )
         try:
             return RunRecord._load_folder(folder, host, hear)
         except ConfigError:
             raise
         except DAMAGED as error:
             why = f"{type(error).__name__}: {error}"[:300]
-            raise ConfigError(f"{folder}: the record of this run is damaged ({why}); run it again") from None
+            raise ConfigError(
+                f"{folder}: the record of this run is damaged ({why}); run it again", code="recording/not-readable"
+            ) from None
 
     @staticmethod
     def _load_folder(folder: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
@@ -103,7 +107,10 @@ class RunRecord:
         description = msgspec.json.decode((folder / DESCRIPTION).read_bytes(), type=Description)
         layout, columns = read_black_box(folder / BLACK_BOX)
         if layout != Layout.for_robot(description):
-            raise ConfigError(f"{folder / BLACK_BOX} is of another robot than {DESCRIPTION} beside it")
+            raise ConfigError(
+                f"{folder / BLACK_BOX} is of another robot than {DESCRIPTION} beside it",
+                code="recording/not-comparable",
+            )
         if host is None:
             host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
         if host.ended == "running":
@@ -123,11 +130,13 @@ class RunRecord:
         description = contents.description
         if description is None or contents.config is None:
             why = "; ".join(contents.lacks) or "was it recorded beside a HAL host?"
-            raise ConfigError(f"{path}: holds no hal/description and hal/config; {why}")
+            raise ConfigError(f"{path}: holds no hal/description and hal/config; {why}", code="recording/missing-data")
         try:
             config = msgspec.json.decode(contents.config.content, type=RunConfig)
         except UNDECODABLE as error:
-            raise ConfigError(f"{path}: its hal/config cannot be read: {str(error)[:200]}") from None
+            raise ConfigError(
+                f"{path}: its hal/config cannot be read: {str(error)[:200]}", code="recording/not-readable"
+            ) from None
         columns = contents.columns(description)
         if host is None:
             host = contents.host(columns)

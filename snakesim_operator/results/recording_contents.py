@@ -226,7 +226,10 @@ class Contents:
         status = self.status
         if status is None:
             why = "; ".join(["", *self.lacks])
-            raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run{why}")
+            raise ConfigError(
+                f"{self.path}: holds no hal/status, so it is not known what became of the run{why}",
+                code="recording/missing-data",
+            )
         armed = {tick for tick, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
         wall_s = 0.0
         if self.armed_wall_ns:

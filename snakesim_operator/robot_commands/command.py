@@ -50,7 +50,8 @@ def arm(
         if mismatches:
             raise RefusedError(
                 f"not armed: {'; '.join(mismatches)}. To arm, name robot and backend: "
-                f"`snakesim arm {description.robot} {description.backend}`"
+                f"`snakesim arm {description.robot} {description.backend}`",
+                code="robot/wrong-robot",
             )
         request = make_arm_request(description, get_user_name(), unchecked=unchecked)
         return request_from_host(session, keys.LIFECYCLE, request, "armed", link, say)
@@ -114,7 +115,9 @@ def request_from_host(
         )
     if doubt is not None:
         now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.reason}"
-        raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
+        raise RefusedError(
+            f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}", code="robot/not-confirmed"
+        )
     if not answers[0].ok:
         raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
     say(f"{name}: {done}: {answers[0].reason}")
@@ -177,9 +180,13 @@ def _read_description(session: Session, link: Link) -> Description:
         descriptions = reader.drain()
     if not descriptions:
         raise NotConnectedError(
-            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?"
+            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?",
+            code="network/no-robot",
         )
     if len({description.host for description in descriptions}) > 1:
         count = len(descriptions)
-        raise RefusedError(f"{link.namespace}: {count} hosts describe it; at least one is an impostor. Not armed")
+        raise RefusedError(
+            f"{link.namespace}: {count} hosts describe it; at least one is an impostor. Not armed",
+            code="robot/several-hosts",
+        )
     return descriptions[-1]

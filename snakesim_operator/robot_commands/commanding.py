@@ -152,6 +152,9 @@ def _param_set(arguments: argparse.Namespace) -> int:
 def _robot_of(arguments: argparse.Namespace) -> RobotSelection:
     """The robot that is named, by its namespace."""
     if arguments.namespace not in (None, arguments.robot):
-        raise ConfigError(f"{arguments.robot} and --namespace {arguments.namespace}: name one robot; leave one out")
+        raise ConfigError(
+            f"{arguments.robot} and --namespace {arguments.namespace}: name one robot; leave one out",
+            code="command/conflicting-options",
+        )
     arguments.namespace = arguments.robot
     return select_robots(arguments)

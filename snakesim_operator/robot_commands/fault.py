@@ -36,17 +36,23 @@ def fault(order: FaultOrder, where: RobotSelection, say: PrintLine = print_line)
     if order.kind not in kinds:
         meant = suggest_word(order.kind, kinds)
         raise ConfigError(
-            f"fault {shorten(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
+            f"fault {shorten(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all",
+            code="injection/unknown-fault",
         )
     if order.target is None:
-        raise ConfigError(f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`")
+        raise ConfigError(
+            f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`",
+            code="injection/unknown-target",
+        )
     injection = check_injection(
         Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}"
     )
     if order.for_s is not None and not 0.0 < order.for_s < inf:
-        raise ConfigError(f"--for {order.for_s:g}: give more than 0 s")
+        raise ConfigError(f"--for {order.for_s:g}: give more than 0 s", code="injection/unknown-fault")
     if injection.about.once and (order.end or order.for_s is not None):
-        raise ConfigError(f"{order.kind} happens once and has no end; omit --for and --end")
+        raise ConfigError(
+            f"{order.kind} happens once and has no end; omit --for and --end", code="injection/unknown-fault"
+        )
     request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
     with open_session(only_robot(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
         try:

@@ -187,7 +187,9 @@ def change_parameters(
     finally:
         session.stop_reading(states)
     if now is None:
-        raise RefusedError(f"NOT CONFIRMED: {answer.reason}; but no controller publishes them")
+        raise RefusedError(
+            f"NOT CONFIRMED: {answer.reason}; but no controller publishes them", code="robot/not-confirmed"
+        )
     return before, now
 
 
@@ -234,7 +236,8 @@ def known_name(name: str, in_force: ControlParameters) -> str:
     if name not in known:
         raise ConfigError(
             f"controller {in_force.controller} has no parameter {shorten(name)!r}; {suggest_word(name, known)}it has "
-            f"{', '.join(known) or 'none'}"
+            f"{', '.join(known) or 'none'}",
+            code="controller/unknown-parameter",
         )
     return name.removeprefix(PREFIX)
 

@@ -55,7 +55,7 @@ def order_of(arguments: argparse.Namespace) -> SimulatorOrder:
             return SimulatorOrder(action, speed=_check_speed(number))
         case _:
             if number is not None:
-                raise ConfigError(f"sim {action} {number:g}: {action} takes no number")
+                raise ConfigError(f"sim {action} {number:g}: {action} takes no number", code="command/invalid-option")
             return SimulatorOrder(action)
 
 
@@ -63,7 +63,9 @@ def _check_ticks(number: float | None) -> int:
     """Return the number of ticks, by default 1. Raises ConfigError unless it is a whole number in its range."""
     ticks = 1 if number is None else number
     if not 1 <= ticks <= MAX_TICKS or ticks != int(ticks):  # in this order: NaN and infinity have no int()
-        raise ConfigError(f"sim step {ticks:g}: give a whole number of ticks from 1 to {MAX_TICKS}")
+        raise ConfigError(
+            f"sim step {ticks:g}: give a whole number of ticks from 1 to {MAX_TICKS}", code="command/invalid-option"
+        )
     return int(ticks)
 
 
@@ -72,6 +74,7 @@ def _check_speed(number: float | None) -> float:
     if number is None or not MIN_SPEED <= number <= MAX_SPEED:
         given = "" if number is None else f" {number:g}"
         raise ConfigError(
-            f"sim speed{given}: give a number from {MIN_SPEED:g} to {MAX_SPEED:g}; 1 is as the wall clock"
+            f"sim speed{given}: give a number from {MIN_SPEED:g} to {MAX_SPEED:g}; 1 is as the wall clock",
+            code="command/invalid-option",
         )
     return number

@@ -114,7 +114,10 @@ def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int
     config = _config_of(arguments)
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
-            raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
+            raise ConfigError(
+                f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out",
+                code="command/conflicting-options",
+            )
 
     from snakesim_operator.run.in_process import run_in_process
 

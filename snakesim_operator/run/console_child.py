@@ -18,7 +18,9 @@ LOG = "console.log"
 def check_console() -> None:
     """Raise ConfigError when the console, or what it needs, is not installed."""
     if importlib.util.find_spec(CONSOLE) is None:
-        raise ConfigError("--console: this installation is one without the console; leave it out")
+        raise ConfigError(
+            "--console: this installation is one without the console; leave it out", code="extra/not-installed"
+        )
     extras.require("console", "--console", "; or leave it out")
 
 

@@ -61,7 +61,8 @@ def _lock(out: Path) -> Iterator[None]:
                 os.close(handle)
                 raise ConfigError(
                     f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
-                    "choose another folder, or end that run"
+                    "choose another folder, or end that run",
+                    code="file/in-use",
                 ) from None
             if _is(handle, path):
                 break
@@ -94,7 +95,9 @@ def _opened(out: Path) -> int:
             return os.open(out, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
         except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
             if not attempts or not isinstance(error, FileNotFoundError):  # it may have been moved aside in between
-                raise ConfigError(f"--out {out}: {error.strerror}: {error.filename}; choose another folder") from error
+                raise ConfigError(
+                    f"--out {out}: {error.strerror}: {error.filename}; choose another folder", code="file/not-writable"
+                ) from error
 
 
 def _is(handle: int, path: Path) -> bool:
@@ -106,14 +109,18 @@ def _is(handle: int, path: Path) -> bool:
 
 def _move_aside(out: Path) -> Path:
     if Path.cwd().is_relative_to(out):
-        raise ConfigError(f"--out {out} holds an earlier run, and you are in it; choose another folder")
+        raise ConfigError(
+            f"--out {out} holds an earlier run, and you are in it; choose another folder", code="file/already-exists"
+        )
     began_s = min((out / name).stat().st_mtime for name in LEFT if (out / name).exists())
     aside = _free(out.with_name(f"{out.name}.{datetime.fromtimestamp(began_s).strftime(TIME)}"))
     try:
         out.rename(aside)
     except OSError as error:
         raise ConfigError(
-            f"--out {out} holds an earlier run that cannot be moved to {aside}: {error.strerror}; choose another folder"
+            f"--out {out} holds an earlier run that cannot be moved to {aside}: {error.strerror}; "
+            "choose another folder",
+            code="file/already-exists",
         ) from error
     (aside / LOCK).unlink(missing_ok=True)
     return aside

@@ -126,7 +126,8 @@ def simulate(
     """
     if not isinstance(config, RunConfig):
         raise ConfigError(
-            f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path"
+            f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path",
+            code="python/invalid-argument",
         )
     if not is_pinned() and not anything_offered():  # a child would not have the plugins that this program offers
         return call_pinned(
@@ -148,7 +149,7 @@ def simulate(
         else:
             files, _ = opened.enter_context(opened_files(config, out))
         if files.folder is None:
-            raise ConfigError(f"{out} cannot be written to; choose another folder")
+            raise ConfigError(f"{out} cannot be written to; choose another folder", code="file/not-writable")
         opened.callback(files.close)
         recorded_keys = SERVICE_STREAMS if out is None else _all_keys()
         run, outcome, gave_up = _run_to_end(

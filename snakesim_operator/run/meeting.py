@@ -37,7 +37,7 @@ def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tup
             if _is_free(port):
                 return Link(f"tcp/{LOOPBACK}:{port}", namespace), stop_port
             stop_port.close()
-    raise NotConnectedError("no free port on the loopback interface")
+    raise NotConnectedError("no free port on the loopback interface", code="network/port-in-use")
 
 
 def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
@@ -50,14 +50,16 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
             if session.present(keys.alive_key("hal")) or session.present(keys.HOST_ALL):
                 raise RefusedError(
                     f"{lab.namespace} is on {lab.endpoint} already; end that run first, or give this one another "
-                    f"--namespace"
+                    f"--namespace",
+                    code="robot/already-running",
                 )
     elif endpoint is not None:
         with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_S) as session:
             there = ", ".join(robots_on(session)) or "another host"
             raise RefusedError(
                 f"{there} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
-                f"--router {endpoint} with another --namespace"
+                f"--router {endpoint} with another --namespace",
+                code="robot/already-running",
             )
 
 

@@ -182,7 +182,7 @@ class RunMonitor:
         if self._robot is not None and not self._armed:
             refusal = self._faults.refusal(self._robot)
             if refusal is not None:
-                raise RefusedError(refusal)
+                raise RefusedError(refusal, code="injection/not-allowed")
         self._faults.carry_out(self._robot, status.lifecycle if status is not None else "disarmed")
         if status is None:
             return
@@ -300,7 +300,7 @@ class RunMonitor:
             answer = host.answers.pop(0)
             self._arm_request_time_s = None
             if not answer.ok and answer.refusal != "not_ready":
-                raise RefusedError(answer.reason)
+                raise RefusedError(answer.reason, code="robot/not-ready")
             self._armed = answer.ok
         elif time.monotonic() - self._arm_request_time_s > ARM_LIMIT_S:
             raise NotConnectedError(f"the host does not answer within {ARM_LIMIT_S:.0f} s; see host.log")

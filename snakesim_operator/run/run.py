@@ -182,12 +182,16 @@ def _check_router(request: RunRequest) -> None:
     if request.with_router:
         if request.lab is not None:
             raise ConfigError(
-                "--with-router starts a router of the run's own, --router and --session join another: give one of them"
+                "--with-router starts a router of the run's own, --router and --session join another: give one of them",
+                code="command/conflicting-options",
             )
         return
     router_faults = [injection for injection in parse_planned(request.config) if injection.target == ROUTER]
     if router_faults:
-        raise ConfigError(f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router")
+        raise ConfigError(
+            f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router",
+            code="injection/not-supported",
+        )
 
 
 class _RunProcesses:
@@ -297,7 +301,7 @@ def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Itera
             except NotConnectedError:
                 ended = supervisor.describe_first_end()
                 if ended is not None:
-                    raise NotConnectedError(ended) from None
+                    raise NotConnectedError(ended, code="run/failed") from None
                 now = time.monotonic()
                 if now > began_s + SERVICE_START_LIMIT_S or ending.interrupted:
                     raise

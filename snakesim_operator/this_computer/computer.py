@@ -55,6 +55,7 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     state: Literal["ok", "warn", "fail"]
     detail: str
     fix: list[str] = []  # commands
+    code: str | None = None  # of the error that was found
 
 
 def python() -> Iterator[Finding]:

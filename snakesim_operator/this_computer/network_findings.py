@@ -46,6 +46,7 @@ def routers(where: RobotSelection) -> Iterator[Finding]:
                 robots = ", ".join(robots_on(session)) or "no robot"
         except SnakesimError as error:
             fix = ["snakesim router    # there; and is a firewall between?"]
-            yield Finding(what="endpoint", state="fail", detail=f"{link.endpoint}: {error}", fix=fix)
+            detail = f"{link.endpoint}: {error}"
+            yield Finding(what="endpoint", state="fail", detail=detail, fix=fix, code=error.code)
             continue
         yield Finding(what="endpoint", state="ok", detail=f"{link.endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")

@@ -123,18 +123,21 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}"
+                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}",
+                code="drive/unsupported-setting",
             )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
                 f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when "
                 f"it is off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
-                f"{TURN - 2 * SLACK_RAD:.2f} rad"
+                f"{TURN - 2 * SLACK_RAD:.2f} rad",
+                code="drive/unsupported-setting",
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
                 f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
-                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)",
+                code="drive/unsupported-setting",
             )
 
 
@@ -148,7 +151,8 @@ def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joi
             f"{fullest} servos at {rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
             f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
             f"most {MAX_LOAD:.0%}: use rate_hz = {fits_hz(fullest, settings.baud)}, a higher "
-            f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`"
+            f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`",
+            code="bus/overloaded",
         )
 
 
@@ -185,4 +189,6 @@ def _open_log(path: str) -> TextIO | None:
     try:
         return Path(path).open("w", encoding="utf-8")
     except OSError as error:
-        raise BackendError(f"`backends.dynamixel.log` = {path!r}: {error.strerror}") from error
+        raise BackendError(
+            f"`backends.dynamixel.log` = {path!r}: {error.strerror}", code="file/not-writable"
+        ) from error

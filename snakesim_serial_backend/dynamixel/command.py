@@ -95,7 +95,7 @@ def _make_link(link: Path, target: str) -> None:
             link.unlink()
         link.symlink_to(target)
     except OSError as error:
-        raise ConfigError(f"--link {link}: {error.strerror}; give another name") from error
+        raise ConfigError(f"--link {link}: {error.strerror}; give another name", code="file/not-writable") from error
 
 
 def table() -> Iterator[str]:

@@ -62,16 +62,21 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise ConfigError(f"{file}: {size} bytes, at most {MAX_BYTES}; record for a shorter time")
+            raise ConfigError(
+                f"{file}: {size} bytes, at most {MAX_BYTES}; record for a shorter time", code="file/too-large"
+            )
         images = [decoder.decode(line).message for line in path.read_bytes().splitlines()]
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
             f"the recording of camera {camera.name!r}, {file}, cannot be read: {error}; "
-            f"make one with `snakesim echo sensor/depth/{camera.name} > {file}`"
+            f"make one with `snakesim echo sensor/depth/{camera.name} > {file}`",
+            code="recording/not-readable",
         ) from error
     flaw = _find_flaw(images)
     if flaw is not None:
-        raise ConfigError(f"the recording of camera {camera.name!r}, {file}, cannot be used: {flaw}")
+        raise ConfigError(
+            f"the recording of camera {camera.name!r}, {file}, cannot be used: {flaw}", code="recording/not-readable"
+        )
     return images
 
 

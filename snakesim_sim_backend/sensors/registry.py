@@ -107,7 +107,8 @@ def _find_model(
     if message is not OwnSample and model.message is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
-            f"carries; its class says in `message` what it makes"
+            f"carries; its class says in `message` what it makes",
+            code="plugin/not-loadable",
         )
     return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
 

@@ -165,5 +165,6 @@ def opened_context(width: int, height: int, what: str) -> Any:
         raise ConfigError(
             f"{what} is rendered, which needs OpenGL by {kind.upper()}, and that does not work here: "
             f"{type(error).__name__}: {error}. Install the Debian packages {PACKAGES[kind]} and libgl1-mesa-dri; or "
-            f'leave out `color` and take `model = "rays"`, which need no OpenGL'
+            f'leave out `color` and take `model = "rays"`, which need no OpenGL',
+            code="simulator/no-opengl",
         ) from error

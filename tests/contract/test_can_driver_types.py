@@ -22,6 +22,7 @@ from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.messages import raises_error
 
 JOINTS = 4
 SHOWN = 20  # ticks in which a fault shows: a heartbeat takes ten
@@ -257,7 +258,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
         emulator._index_of_node.pop((id(emulator.wires[1]), 2))
 
     monkeypatch.setattr(twin_class, "__init__", elsewhere)
-    with pytest.raises(BackendError, match=rf"joint_2 \(node 2 on .*\) {robot.driver_type.unheard}"):
+    with raises_error(BackendError, code="backend/failed", field="joint_2"):
         Robot(robot.driver_type)
 
 
@@ -271,8 +272,7 @@ def test_two_drives_of_one_id_stop_the_robot_and_are_refused_at_the_start_with_b
     assert (fault.what, fault.joint, fault.reach) == ("duplicate_node", "joint_2", "robot")
     assert serials[1] in fault.cause and robot.following() == [False] * JOINTS
     assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "cleared while it is there"
-    words = rf"(?s)not complete; .*joint_2 \(node 2 on .*\) answers with 2 serial numbers, .*{serials[1]}.* its own id"
-    with pytest.raises(BackendError, match=words):
+    with raises_error(BackendError, code="backend/failed"):
         robot.backend._drives.bring_up()
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
     robot.backend._drives.bring_up()
@@ -306,22 +306,20 @@ def test_a_log_of_the_bus_is_read_by_python_can_as_it_was_sent(driver_type: Fami
 
 @on_can
 @pytest.mark.parametrize(
-    ("dotted", "words"),
+    "dotted",
     [
-        ({"rate_hz": 0}, "drives at .* Hz need .* at worst-case stuffing"),
-        ({"rate_hz": 20}, "`watchdog_s` = 0.1 s at `rate_hz` = 20: one lost setpoint"),
-        (
-            {"robot__joints": {"joint_2": {"id": 127}}},
-            "joint_2: `id` = 127, and .* have ids of .* broadcast address",
-        ),
-        ({"robot__joints": {"joint_2": {"port": "can7"}}}, "joint_2: `port` = 'can7' is not among"),
+        {"rate_hz": 0},
+        {"rate_hz": 20},
+        {"robot__joints": {"joint_2": {"id": 127}}},
+        {"robot__joints": {"joint_2": {"port": "can7"}}},
     ],
 )
-def test_what_drives_cannot_do_is_refused_before_the_start(
-    driver_type: Family, dotted: dict[str, Any], words: str
-) -> None:
+def test_what_drives_cannot_do_is_refused_before_the_start(driver_type: Family, dotted: dict[str, Any]) -> None:
     name = driver_type.backend.name
     fixed = {"backend": name, "robot__chain__modules": JOINTS, "rate_hz": 100}
     config = run_config(**fixed | dotted | ({"rate_hz": driver_type.too_fast_hz} if dotted.get("rate_hz") == 0 else {}))
-    with pytest.raises(ConfigError, match=words.replace("`watchdog_s`", f"`backends.{name}.watchdog_s`")):
+    with raises_error(
+        ConfigError,
+        code=("bus/invalid-channel", "bus/overloaded", "drive/unsupported-setting", "drive/watchdog-too-short"),
+    ):
         driver_type.backend.check(config, driver_type.backend.Settings())

@@ -46,13 +46,14 @@ def running_joints(session: Session, path: Path) -> Sequence[Joint]:
     """
     configuration = session.latest(keys.CONFIG, Configuration, HOST_TIMEOUT_S)
     if configuration is None:
-        raise RefusedError(NO_ANSWER)
+        raise RefusedError(NO_ANSWER, code="network/no-answer")
     running = msgspec.json.decode(configuration.content, type=RunConfig).robot.joint_table
     joints = joints_on_drives(path, running)
     if [_identity(joint) for joint in running] != [_identity(joint) for joint in joints]:
         raise ConfigError(
             f"{path}: its joints are not those that the host was started with, so what is measured would be "
-            f"reckoned wrongly; restart the host with this file"
+            f"reckoned wrongly; restart the host with this file",
+            code="commissioning/not-possible",
         )
     return joints
 
@@ -76,7 +77,7 @@ class HandMovedRobot:
         self.joints = running_joints(session, path)
         status = session.latest(keys.STATUS, Status, HOST_TIMEOUT_S)
         if status is None:
-            raise RefusedError(NO_ANSWER)
+            raise RefusedError(NO_ANSWER, code="network/no-answer")
         self._status = status
 
     def read_angles_rad(self, is_over: Callable[[], bool]) -> Iterator[Floats]:
@@ -99,7 +100,10 @@ class HandMovedRobot:
             if states:
                 last_arrival_s = time.monotonic()
             elif time.monotonic() - last_arrival_s > MAX_SILENCE_S:
-                raise RefusedError(f"the robot has sent no joint angles for {MAX_SILENCE_S:g} s; see `snakesim status`")
+                raise RefusedError(
+                    f"the robot has sent no joint angles for {MAX_SILENCE_S:g} s; see `snakesim status`",
+                    code="network/no-answer",
+                )
             for state in states:
                 self._refuse_unknown_angles(state)
                 yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
@@ -112,12 +116,18 @@ class HandMovedRobot:
             case "disarmed" | "fault" | "estop":
                 return
             case _:
-                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim disarm` first")
+                raise RefusedError(
+                    "the robot is armed: its motors hold the joints; type `snakesim disarm` first",
+                    code="robot/not-disarmed",
+                )
 
     def _refuse_unknown_angles(self, state: JointState) -> None:
         unknown = [joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid]
         if unknown:
-            raise RefusedError(f"{', '.join(unknown)}: the angle is not known; see `snakesim status`")
+            raise RefusedError(
+                f"{', '.join(unknown)}: the angle is not known; see `snakesim status`",
+                code="commissioning/not-possible",
+            )
 
 
 @contextmanager
@@ -139,7 +149,10 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
         try:
             zeros_rad = find_zeros(robot.joints, np.array(samples))
         except NotStillError as error:
-            raise RefusedError(f"{error} within {ZERO_SAMPLING_S:g} s; let go of the robot, and try again") from None
+            raise RefusedError(
+                f"{error} within {ZERO_SAMPLING_S:g} s; let go of the robot, and try again",
+                code="commissioning/not-possible",
+            ) from None
     values: dict[str, dict[str, Any]] = {}
     for joint, zero_rad in zip(robot.joints, zeros_rad, strict=True):
         print_line(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
@@ -312,7 +325,10 @@ def choose_joints(joints: Sequence[Joint], names: Sequence[str], path: Path) -> 
     known = {joint.name: joint for joint in joints}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ConfigError(f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}")
+        raise ConfigError(
+            f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}",
+            code="config/unknown-name",
+        )
     if not names:
         return joints
     return [known[name] for name in names]
@@ -323,7 +339,7 @@ def _line_was_typed() -> bool:
     if not select.select([sys.stdin], [], [], 0.0)[0]:
         return False
     if not sys.stdin.readline():
-        raise RefusedError("the terminal is gone; nothing was written")
+        raise RefusedError("the terminal is gone; nothing was written", code="commissioning/not-possible")
     return True
 
 

@@ -56,7 +56,8 @@ def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
     if record.config.controller != CHECK:
         raise ConfigError(
             f"{run}: its controller was {record.config.controller!r}; make a run with `snakesim run joint_check`, or "
-            "any other scenario with --controller joint_check"
+            "any other scenario with --controller joint_check",
+            code="commissioning/not-possible",
         )
     columns: dict[str, Floats] = {name: getattr(record, name) for name in COLUMNS}
     measurements = collect_measurements(
@@ -137,9 +138,15 @@ def _write_result(path: Path, record: RunRecord, rows: Sequence[JointVerdict], r
     joints = record.config.robot.joint_table
     must_be_own(path)
     if robot.emulated:
-        raise ConfigError(f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written")
+        raise ConfigError(
+            f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written",
+            code="commissioning/not-possible",
+        )
     if mounting_digest(joints_on_drives(path, joints)) != mounting_digest(joints):
-        raise ConfigError(f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again")
+        raise ConfigError(
+            f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again",
+            code="commissioning/not-possible",
+        )
     unconfirmed = [row.joint for row in rows if not row.all_confirmed]
     if unconfirmed:
         print_line(f"{path}: nothing was written: {', '.join(unconfirmed)} are wrong or unknown")

@@ -51,7 +51,8 @@ def identify(run: Path, robot_file: Path | None, out: Path | None) -> int:
     """
     if robot_file is not None and find_file(str(robot_file), "robots") != robot_file:
         raise ConfigError(
-            f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay"
+            f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay",
+            code="commissioning/not-possible",
         )
     record = RunRecord.load(run)
     judged_ticks = _find_judged_ticks(record)
@@ -77,7 +78,8 @@ def _find_judged_ticks(record: RunRecord) -> slice:
     if record.config.controller != CONTROLLER:
         raise ConfigError(
             f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
-            f"run with `snakesim run identify`"
+            f"run with `snakesim run identify`",
+            code="commissioning/not-possible",
         )
     columns = [getattr(record, name) for name in COLUMNS]
     usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
@@ -88,7 +90,10 @@ def _find_judged_ticks(record: RunRecord) -> slice:
     edges = np.flatnonzero(np.diff(padded))
     parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
     if not parts:
-        raise ConfigError(f"{record.folder}: the joints were never moved by position targets; run it again")
+        raise ConfigError(
+            f"{record.folder}: the joints were never moved by position targets; run it again",
+            code="commissioning/not-possible",
+        )
     start, end = max(parts, key=lambda part: part[1] - part[0])
     return slice(start, end)
 

@@ -62,7 +62,9 @@ class JogRequest:
 
 def _check_bound(option: str, value: float, maximum: float, unit: str) -> None:
     if not 0 < value <= maximum:
-        raise ConfigError(f"{option} {value:g}: give more than 0, and at most {maximum:g} {unit}")
+        raise ConfigError(
+            f"{option} {value:g}: give more than 0, and at most {maximum:g} {unit}", code="command/invalid-option"
+        )
 
 
 class JogTarget:
@@ -119,9 +121,14 @@ def jog(path: Path, selection: RobotSelection, request: JogRequest) -> int:
         robot = session.latest(keys.DESCRIPTION, Description, CONNECT_S)
         status = session.latest(keys.STATUS, Status, CONNECT_S)
         if robot is None or status is None:
-            raise RefusedError("the robot's host has not said what it is; see `snakesim status`")
+            raise RefusedError(
+                "the robot's host has not said what it is; see `snakesim status`", code="network/no-answer"
+            )
         if status.lifecycle != "disarmed":
-            raise RefusedError(f"the robot is {status.lifecycle}; it must be disarmed to jog: see `snakesim status`")
+            raise RefusedError(
+                f"the robot is {status.lifecycle}; it must be disarmed to jog: see `snakesim status`",
+                code="robot/not-disarmed",
+            )
         with keyboard:
             _JogSession(session, link, robot, status, request, joints.index(joint)).run(keyboard)
     return 0
@@ -182,7 +189,7 @@ class _JogSession:
             clock = self._cycle()
             if clock.lifecycle != "armed":
                 self._read_status()
-                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.reason}")
+                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.reason}", code="robot/not-armed")
             if moved and not target.moves:
                 print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
             moved = target.moves
@@ -213,7 +220,10 @@ class _JogSession:
     def _read_angle_rad(self) -> float:
         joints = self._commanding.read(keys.JOINTS)
         if not isinstance(joints, JointState) or not joints.valid[self._joint]:
-            raise RefusedError(f"{self._request.joint}: the angle is not known; see `snakesim status`")
+            raise RefusedError(
+                f"{self._request.joint}: the angle is not known; see `snakesim status`",
+                code="commissioning/not-possible",
+            )
         return joints.angle_rad[self._joint]
 
     def _read_status(self) -> None:
@@ -230,7 +240,7 @@ class _JogSession:
         while not condition():
             self._cycle()
             if time.monotonic() > deadline_s or self._stop_requested:
-                raise RefusedError(f"not armed: {self._status.reason}")
+                raise RefusedError(f"not armed: {self._status.reason}", code="robot/not-armed")
 
     def _send_request(self, request: LifecycleRequest, outcome: str) -> None:
         """Send a lifecycle request, and run cycles until it is answered. outcome: such as `armed`."""

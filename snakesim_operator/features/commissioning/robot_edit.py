@@ -23,7 +23,10 @@ from snakesim_hal.model.textfiles import read_text
 def must_be_own(path: Path) -> None:
     """Raise ConfigError for a robot file that is shipped."""
     if find_file(str(path), "robots") != path:
-        raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
+        raise ConfigError(
+            f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay",
+            code="commissioning/not-possible",
+        )
 
 
 def joints_on_drives(path: Path, running: Sequence[Joint]) -> list[Joint]:
@@ -85,7 +88,8 @@ def _replace_file(path: Path, document: tomlkit.TOMLDocument) -> None:
         write_through(path, content, durable=True)
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot be written: {error.strerror}; it is as it was. Correct that, and repeat the command"
+            f"{path}: cannot be written: {error.strerror}; it is as it was. Correct that, and repeat the command",
+            code="file/not-writable",
         ) from None
     finally:
         candidate.unlink(missing_ok=True)

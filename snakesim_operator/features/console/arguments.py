@@ -40,6 +40,6 @@ def _run_console(arguments: argparse.Namespace) -> int:
 
     if arguments.run is not None:
         if arguments.commission is not None:
-            raise ConfigError("--commission is for a running robot; leave RUN out")
+            raise ConfigError("--commission is for a running robot; leave RUN out", code="command/conflicting-options")
         return show_record(arguments.run, arguments.at, arguments.port)
     return console(select_robots(arguments), arguments.port, arguments.commission)

@@ -141,7 +141,7 @@ class Operations:
             NotConnectedError: There is no connection or no answer.
         """
         if self._session is None:
-            raise NotConnectedError("not connected to the robot yet")
+            raise NotConnectedError("not connected to the robot yet", code="network/no-robot")
         answer = self._session.request(key, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)

@@ -224,7 +224,9 @@ def _parse_numbers(text: str, option: str) -> list[int]:
 
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not all(word.isdecimal() and len(word) < 7 for word in words):
-        raise ConfigError(f"{option} {text[:60]}: give whole numbers, such as {option} 1,2")
+        raise ConfigError(
+            f"{option} {text[:60]}: give whole numbers, such as {option} 1,2", code="command/invalid-option"
+        )
     return [int(word) for word in words]
 
 

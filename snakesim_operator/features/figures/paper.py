@@ -62,7 +62,8 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
     if not instants:
         raise ConfigError(
             f"{record.folder}: at no time within it did a controller say which forces it solved for; such are "
-            "obstacle_triplet and obstacle_aided, with a pose and a recording; signals can be drawn of any run"
+            "obstacle_triplet and obstacle_aided, with a pose and a recording; signals can be drawn of any run",
+            code="recording/missing-data",
         )
     first = instants[0]
     moment_indices = np.unique(np.linspace(0, len(instants) - 1, MAX_MOMENTS).astype(int))

@@ -120,7 +120,8 @@ def check_buses(robots: Mapping[str, LabRobot], source: str) -> None:
             _check_mixed(robot, where)
         elif robot.buses:
             raise ConfigError(
-                f"{where}.buses` is for backend `{MIXED}`; of backend {robot.backend!r} say `can` or `serial`"
+                f"{where}.buses` is for backend `{MIXED}`; of backend {robot.backend!r} say `can` or `serial`",
+                code="lab/invalid-file",
             )
         elif robot.backend in DRIVE_TYPES:
             _check_one_type(robot, where)
@@ -130,7 +131,8 @@ def check_buses(robots: Mapping[str, LabRobot], source: str) -> None:
             other = used_by.setdefault((robot.machine, bus), name)
             if other != name:
                 raise ConfigError(
-                    f"{where}`: {bus} of machine {robot.machine!r} has the robot {other!r}, too; a bus is of one robot"
+                    f"{where}`: {bus} of machine {robot.machine!r} has the robot {other!r}, too; a bus is of one robot",
+                    code="lab/invalid-file",
                 )
 
 
@@ -145,12 +147,14 @@ def _check_one_type(robot: LabRobot, where: str) -> None:
     if other_buses:
         raise ConfigError(
             f"{where}.{other_kind}` = {other_buses}: drives of backend {robot.backend!r} are on buses named in "
-            f"`{kind}`, such as {example}; leave `{other_kind}` out"
+            f"`{kind}`, such as {example}; leave `{other_kind}` out",
+            code="lab/invalid-file",
         )
     if not buses:
         raise ConfigError(
             f"{where}.{kind}` is empty, and backend {robot.backend!r} without a bus emulates its drives: nothing real "
-            f"would move. Name the bus, such as {example}; or say `emulated = true`, if that is meant"
+            f"would move. Name the bus, such as {example}; or say `emulated = true`, if that is meant",
+            code="lab/invalid-file",
         )
 
 
@@ -159,27 +163,39 @@ def _check_mixed(robot: LabRobot, where: str) -> None:
     if not robot.buses:
         raise ConfigError(
             f"{where}.buses` is missing, and backend `{MIXED}` without buses emulates its drives: nothing real would "
-            f'move. Say which drive type is on which bus, such as buses = {{ odrive = ["can0"] }}; or `emulated = true`'
+            'move. Say which drive type is on which bus, such as buses = { odrive = ["can0"] }; or `emulated = true`',
+            code="lab/invalid-file",
         )
     named: list[str] = []
     for name, buses in robot.buses.items():
         if name not in DRIVE_TYPES:
             raise ConfigError(
                 f"{where}.buses.{name}`: no such drive type; {suggest_word(name, list(DRIVE_TYPES))}there are "
-                f"{', '.join(DRIVE_TYPES)}"
+                f"{', '.join(DRIVE_TYPES)}",
+                code="lab/invalid-file",
             )
         kind = DRIVE_TYPES[name].kind
         known = robot.can if kind == "can" else robot.serial
         if not buses:
-            raise ConfigError(f"{where}.buses.{name}` is empty; name its buses, or leave it out")
+            raise ConfigError(
+                f"{where}.buses.{name}` is empty; name its buses, or leave it out", code="lab/invalid-file"
+            )
         for bus in buses:
             if bus not in known:
-                raise ConfigError(f"{where}.buses.{name}` = {bus!r} is not in `{kind}` = {known}; add it there")
+                raise ConfigError(
+                    f"{where}.buses.{name}` = {bus!r} is not in `{kind}` = {known}; add it there",
+                    code="lab/invalid-file",
+                )
             if bus in named:
-                raise ConfigError(f"{where}.buses.{name}` = {bus!r} has another drive type, too; a bus has one")
+                raise ConfigError(
+                    f"{where}.buses.{name}` = {bus!r} has another drive type, too; a bus has one",
+                    code="lab/invalid-file",
+                )
         named += buses
     if unused := [bus for bus in (*robot.can, *robot.serial) if bus not in named]:
-        raise ConfigError(f"{where}.buses` does not say which drive type is on {', '.join(unused)}")
+        raise ConfigError(
+            f"{where}.buses` does not say which drive type is on {', '.join(unused)}", code="lab/invalid-file"
+        )
 
 
 def _check_other_backend(robot: LabRobot, where: str) -> None:
@@ -190,7 +206,8 @@ def _check_other_backend(robot: LabRobot, where: str) -> None:
         raise ConfigError(
             f"{where}.backend` = {robot.backend!r} is none of {', '.join([SIMULATOR, *DRIVE_TYPES, MIXED])}, so this "
             f"program does not know how it is given a bus. Say it in `set`, such as "
-            f"set = [\"backends.{robot.backend}.port='/dev/ttyUSB0'\"], or in a scenario file of your own"
+            f"set = [\"backends.{robot.backend}.port='/dev/ttyUSB0'\"], or in a scenario file of your own",
+            code="lab/invalid-file",
         )
 
 
@@ -205,5 +222,6 @@ def _check_settings(robot: LabRobot, where: str) -> None:
         if drive_type is not None and name in (drive_type.buses_key, "bit_rate", "data_bit_rate"):
             raise ConfigError(
                 f"{where}.set` has {setting!r}, which `{drive_type.kind}`, `buses`, `bitrate` and `data_bitrate` say: "
-                f"the units are made from these, too. Say it there"
+                f"the units are made from these, too. Say it there",
+                code="lab/invalid-file",
             )

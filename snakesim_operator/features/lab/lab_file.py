@@ -124,20 +124,30 @@ def load_lab(path: Path) -> Lab:
 
 def _check(file: LabFile, table: Table) -> None:
     if not file.routers:
-        raise ConfigError(f"{table.source}: `routers` is empty; a lab has at least one, such as [routers.main]")
+        raise ConfigError(
+            f"{table.source}: `routers` is empty; a lab has at least one, such as [routers.main]",
+            code="lab/invalid-file",
+        )
     for name, router in file.routers.items():
         _known(table, f"routers.{name}.machine", router.machine, file.machines)
         if file.machines[router.machine].address is None:
             raise ConfigError(
-                f"{table.source}: `machines.{router.machine}.address` is missing; the router `{name}` listens there"
+                f"{table.source}: `machines.{router.machine}.address` is missing; the router `{name}` listens there",
+                code="lab/invalid-file",
             )
     listening = [(router.machine, router.port) for router in file.routers.values()]
     for (name, router), place in zip(file.routers.items(), listening, strict=True):
         if listening.count(place) > 1:
-            raise ConfigError(f"{table.source}: `routers.{name}.port` = {router.port} has another router, too")
+            raise ConfigError(
+                f"{table.source}: `routers.{name}.port` = {router.port} has another router, too",
+                code="lab/invalid-file",
+            )
     for name, robot in file.robots.items():
         if name == ALL:
-            raise ConfigError(f"{table.source}: `robots.{ALL}`: this name stands for every robot; choose another")
+            raise ConfigError(
+                f"{table.source}: `robots.{ALL}`: this name stands for every robot; choose another",
+                code="lab/invalid-file",
+            )
         _known(table, f"robots.{name}.machine", robot.machine, file.machines)
     _check_roles(file, table)
 
@@ -149,17 +159,24 @@ def _check_roles(file: LabFile, table: Table) -> None:
         _known(table, f"{at}.machine", grant.machine, file.machines)
         _known(table, f"{at}.robot", grant.robot, [*file.robots, ALL])
         if grant.role == Role.GNC and grant.robot == ALL:
-            raise ConfigError(f"{table.source}: `{at}.robot` = 'all': a gnc commands one robot; name it")
+            raise ConfigError(
+                f"{table.source}: `{at}.robot` = 'all': a gnc commands one robot; name it", code="lab/invalid-file"
+            )
         if (entry := (grant.machine, grant.role, grant.robot)) in seen:
-            raise ConfigError(f"{table.source}: `{at}` grants {' '.join(entry)} a second time; leave one out")
+            raise ConfigError(
+                f"{table.source}: `{at}` grants {' '.join(entry)} a second time; leave one out", code="lab/invalid-file"
+            )
         seen.add(entry)
         for service in grant.services:
             if service == "hal":
-                raise ConfigError(f"{table.source}: `{at}.services` = 'hal': only the robot itself is that")
+                raise ConfigError(
+                    f"{table.source}: `{at}.services` = 'hal': only the robot itself is that", code="lab/invalid-file"
+                )
 
 
 def _known(table: Table, field: str, name: str, among: Sequence[str] | dict[str, Machine]) -> None:
     if name not in among:
         raise ConfigError(
-            f"{table.origin_of(field)}: `{field}` = {shorten(name)!r} is not in this file; it has {', '.join(among)}"
+            f"{table.origin_of(field)}: `{field}` = {shorten(name)!r} is not in this file; it has {', '.join(among)}",
+            code="lab/invalid-file",
         )

@@ -78,5 +78,6 @@ def check(arguments: argparse.Namespace) -> None:
     namespace = arguments.ros_namespace
     if namespace is not None and not re.fullmatch(ROS_NAMESPACE, namespace, re.ASCII):
         raise ConfigError(
-            f"--ros-namespace {shorten(namespace)!r}: give a name such as planar13 or lab/planar13: letters, digits, _"
+            f"--ros-namespace {shorten(namespace)!r}: give a name such as planar13 or lab/planar13: letters, digits, _",
+            code="network/invalid-address",
         )

@@ -95,7 +95,9 @@ class _Operator:
         """Arm the robot that the host describes at present."""
         robot = self._session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
         if robot is None:
-            raise NotConnectedError(f"{self._link.namespace} publishes no description; is its HAL host running?")
+            raise NotConnectedError(
+                f"{self._link.namespace} publishes no description; is its HAL host running?", code="network/no-robot"
+            )
         # If it does not become ready, the host's answer to the request gives the reason.
         self._session.latest(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
         return self._request(make_arm_request(robot, REQUESTER), "armed")

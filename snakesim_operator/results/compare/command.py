@@ -34,7 +34,10 @@ def compare(
         ConfigError: A run cannot be read, the runs cannot be compared, or the page cannot be written.
     """
     if within_percent is not None and not 0 <= within_percent < float("inf"):
-        raise ConfigError(f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10")
+        raise ConfigError(
+            f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10",
+            code="command/invalid-option",
+        )
     difference = differ(RunRecord.load(run_a.resolve()), RunRecord.load(run_b.resolve()))
     check = None
     if within_percent is not None:
@@ -42,13 +45,14 @@ def compare(
         if check is None:
             raise ConfigError(
                 f"--within {within_percent:g}: {run_a} and {run_b} have no common measure of the distance moved; "
-                "give the robot a pose sensor, or leave --within away"
+                "give the robot a pose sensor, or leave --within away",
+                code="recording/not-comparable",
             )
     path = out or _default_path(run_b)
     try:
         write_text(path, page(difference, check))
     except ConfigError as error:
-        raise ConfigError(f"{error}; name another file with --out FILE.html") from None
+        raise ConfigError(f"{error}; name another file with --out FILE.html", code="file/not-writable") from None
     if as_json:
         print_json({**for_scripts(difference), "page": str(path), "within": check})
     else:

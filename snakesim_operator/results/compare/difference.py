@@ -212,13 +212,15 @@ def _check_comparable(a: RunRecord, b: RunRecord) -> None:
             raise ConfigError(
                 f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed "
                 f"({record.host.reason}); {record.folder / 'host.log'} may say more. "
-                "Run it again, until the summary has a time"
+                "Run it again, until the summary has a time",
+                code="recording/never-armed",
             )
     if a.description.layout != b.description.layout:
         robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]
         raise ConfigError(
             f"{', '.join(robots)}: their names, order or axes are not the same, so there is no joint to compare with "
-            "which. Compare runs of one robot file"
+            "which. Compare runs of one robot file",
+            code="recording/not-comparable",
         )
     for record in (a, b):
         _check_shapes(record)
@@ -236,10 +238,14 @@ def _check_shapes(record: RunRecord) -> None:
         if array.shape != shape or array.dtype.kind not in "fiu":
             raise ConfigError(
                 f"{record.folder / BLACK_BOX}: `{name}` holds {array.dtype} {array.shape}, wanted are numbers {shape}: "
-                f"{ticks} ticks, {joints} joints. It is damaged, or not of this run; repeat the run"
+                f"{ticks} ticks, {joints} joints. It is damaged, or not of this run; repeat the run",
+                code="recording/not-readable",
             )
     if not np.isfinite(record.time_s).all() or (np.diff(record.time_s) <= 0).any():
-        raise ConfigError(f"{record.folder / BLACK_BOX}: `time_s` does not grow from tick to tick; repeat the run")
+        raise ConfigError(
+            f"{record.folder / BLACK_BOX}: `time_s` does not grow from tick to tick; repeat the run",
+            code="recording/not-readable",
+        )
 
 
 def _compare_targets(aligned: Aligned, same_mode: NDArray[np.bool_]) -> list[Gap]:

@@ -46,7 +46,10 @@ def teleop(where: RobotSelection, fastest_m_s: float, joystick: Path | None) -> 
         SnakesimError: no robot, no joystick or no terminal, or the speed is out of range.
     """
     if not 0 < fastest_m_s <= MAX_FASTEST_M_S:
-        raise ConfigError(f"--fastest {fastest_m_s:g}: give a speed above 0, and at most {MAX_FASTEST_M_S} m/s")
+        raise ConfigError(
+            f"--fastest {fastest_m_s:g}: give a speed above 0, and at most {MAX_FASTEST_M_S} m/s",
+            code="command/invalid-option",
+        )
     with contextlib.ExitStack() as opened:
         stick: Joystick | None = None
         if joystick is not None:

@@ -52,7 +52,7 @@ class Keyboard:
         """Raises ConfigError, with what is wanted, when stdin is no terminal."""
         self._handle = sys.stdin.fileno()
         if not os.isatty(self._handle):
-            raise ConfigError(wanted)
+            raise ConfigError(wanted, code="command/invalid-option")
         self._before = termios.tcgetattr(self._handle)
         self.gone = False  # the terminal was closed
         self.late = False  # whether the keys of the last look may be old

@@ -19,6 +19,7 @@ from snakesim_can_backend.bus.load import ReportSchedule, bus_load, busiest_peri
 from snakesim_can_backend.emulator.bus_time import BusTime
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id
 from snakesim_hal.base.errors import BackendError, ConfigError, SnakesimError
+from snakesim_testing.messages import raises_error
 
 STATE = Frame(frame_id(Opcode.JOINT_STATE, 3), bytes(8))
 
@@ -59,20 +60,20 @@ def test_only_what_is_asked_for_is_received_with_nothing_left_behind(channel: st
 
 
 @pytest.mark.parametrize(
-    ("channel", "why"),
+    "channel",
     [
-        ("slacn:/dev/ttyACM0", "python-can has no interface 'slacn'; did you mean `slcan`?"),
-        ("slcan:", "give INTERFACE:CHANNEL"),
-        ("can7", "channel 'can7'"),
+        "slacn:/dev/ttyACM0",
+        "slcan:",
+        "can7",
     ],
 )
-def test_a_wrong_channel_is_wrong_input(channel: str, why: str) -> None:
-    with pytest.raises(ConfigError, match=why.replace("?", r"\?")):
+def test_a_wrong_channel_is_wrong_input(channel: str) -> None:
+    with raises_error(ConfigError, code=("bus/invalid-channel", "bus/not-available")):
         check_channel(channel)
 
 
 def test_an_adapter_that_is_not_there_is_named() -> None:
-    with pytest.raises(BackendError, match="slcan:/dev/none: cannot be opened: "):
+    with raises_error(BackendError, code="bus/cannot-open"):
         open_wire("slcan:/dev/none")
 
 
@@ -91,9 +92,7 @@ def test_an_interface_whose_library_or_adapter_is_missing_is_an_error_with_the_w
 
 
 def test_a_bus_is_named_once() -> None:
-    with pytest.raises(
-        ConfigError, match=r"channels: 'virtual:a' and 'virtual:a' are the same bus; name each bus once"
-    ):
+    with raises_error(ConfigError, code="bus/invalid-channel", field="virtual:a"):
         check_channels(["virtual:a", "virtual:b", "virtual:a"])
     check_channels(["virtual:a", "virtual:b"])
 

@@ -18,6 +18,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_testing.can.driver_loop import Loop, armed, cleared_and_armed_again, config, loop
+from snakesim_testing.messages import raises_error
 
 
 def inject(run: Loop, text: str, *, begins: bool = True) -> None:
@@ -34,23 +35,23 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
         faulty.inject(parse_injection("wrong:joint_2@0=0.4"), begins=True)
         reported = faulty.sample(3, 3 * run.config.period_ns).joints.angle_rad
         assert reported == pytest.approx([0.0, 0.4, 0.0, 0.0], abs=0.02)
-        with pytest.raises(ConfigError, match="no joint_9"):
+        with raises_error(ConfigError, code="injection/unknown-target", field="joint_9"):
             faulty.inject(parse_injection("leak:joint_9@0"), begins=True)
-        with pytest.raises(ConfigError, match="there is no bus_2; this robot has bus_1 to bus_1"):
+        with raises_error(ConfigError, code="injection/unknown-target", field="bus_2"):
             faulty.inject(parse_injection("cut:bus_2@0"), begins=True)
 
 
 @pytest.mark.parametrize(
-    ("settings", "text", "words"),
+    ("settings", "text"),
     [
-        (CanSettings(), "diverge:simulator@1", "its modules support mute, freeze"),
-        (CanSettings(), "cut:bus_2@1", "this run has bus_1 to bus_1"),
-        (CanSettings(channels=["vcan0"]), "leak:joint_1@1", "its modules are not the driver's own"),
-        (CanSettings(channels=["vcan0"], emulators="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
+        (CanSettings(), "diverge:simulator@1"),
+        (CanSettings(), "cut:bus_2@1"),
+        (CanSettings(channels=["vcan0"]), "leak:joint_1@1"),
+        (CanSettings(channels=["vcan0"], emulators="process"), "full:bus_1@1"),
     ],
 )
-def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSettings, text: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSettings, text: str) -> None:
+    with raises_error(ConfigError, code=("injection/not-supported", "injection/unknown-target")):
         CanBackend.check(config(faults=[text]), settings)
 
 
@@ -130,14 +131,14 @@ def test_one_end_of_a_virtual_bus() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    "given",
     [
-        (("lo0", "full"), "tc qdisc add dev lo0"),
-        (("nothere0", "cut"), "`ip link set nothere0 down`"),
-        (("can7", "bus_off"), "error frames can only be sent on virtual interfaces"),
+        ("lo0", "full"),
+        ("nothere0", "cut"),
+        ("can7", "bus_off"),
     ],
 )
-def test_what_cannot_be_done_to_an_interface_is_told(given: Any, words: str) -> None:
+def test_what_cannot_be_done_to_an_interface_is_told(given: Any) -> None:
     channel, kind = given
-    with pytest.raises(ConfigError, match=words):
+    with raises_error(ConfigError, code=("injection/not-supported", "machine/not-permitted")):
         inject_into_interface(channel, kind, begins=True)

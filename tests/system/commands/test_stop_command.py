@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
@@ -12,6 +10,7 @@ from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.robot_commands import command, stop
 from snakesim_testing.hal.local_network import Follower, following, running
 from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.command import snakesim
 
 
@@ -47,6 +46,6 @@ def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
             impostor.on_query(
                 keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))
             )
-            with pytest.raises(RefusedError, match="NOT CONFIRMED"):
+            with raises_error(RefusedError, code="robot/not-confirmed"):
                 command.disarm(RobotSelection(run.link.endpoint, "lab/other"))
         assert run.status.lifecycle == "armed"

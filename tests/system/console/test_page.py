@@ -20,6 +20,7 @@ from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.server import serve_pages
 from snakesim_testing.hal.small_robots import description, status
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.viewer import watch
 
 
@@ -37,7 +38,7 @@ def test_a_page_is_of_the_same_host_and_port_or_refused():
 
 
 def test_a_port_that_is_taken_is_an_error_and_no_other_port():
-    with open_port(None) as first, pytest.raises(NotConnectedError, match="another program listens"):
+    with open_port(None) as first, raises_error(NotConnectedError, code="network/port-in-use"):
         open_port(first.getsockname()[1])
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from deploy.vm import cpio, kernel, machine, with_vcan
 from deploy.vm.packages import PreparationError
+from snakesim_testing.messages import raises_error
 
 KERNEL = kernel.Kernel(
     version="6.1-test",
@@ -44,7 +45,7 @@ def test_a_module_comes_after_what_it_depends_on_and_what_is_built_in_is_not_loa
 
 
 def test_a_kernel_without_the_module_is_named() -> None:
-    with pytest.raises(PreparationError, match=r"6\.1-test has no module flexcan"):
+    with raises_error(PreparationError):
         kernel.load_order(["flexcan"], KERNEL)
 
 

@@ -13,6 +13,7 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config
 
 HEAD = keys.depth_key("head")
@@ -135,27 +136,27 @@ def test_in_lockstep_a_late_image_is_waited_for(tmp_path):
 
 def test_a_model_that_breaks_is_an_error_of_the_backend(tmp_path):
     run = run_with(slow(tmp_path, 0, "Broken"))
-    with pytest.raises(OSError, match="lens cap on"):
+    with raises_error(OSError):
         arrivals(run, 10)
     run.sim.close()
 
 
 @pytest.mark.parametrize(
-    ("camera", "why"),
+    "camera",
     [
-        ({"model": "radar"}, r"no sensor called 'radar' is installed.*snakesim\.sensors"),
-        ({"model": "./nothing.py:Radar"}, r"sensor './nothing.py:Radar' cannot be loaded"),
-        ({"settings": {"gain": 2}}, r"sensor 'head' of the robot file: unknown field `settings.gain`"),
+        {"model": "radar"},
+        {"model": "./nothing.py:Radar"},
+        {"settings": {"gain": 2}},
     ],
 )
-def test_a_model_that_cannot_be_is_refused_before_anything_is_opened(camera, why):
+def test_a_model_that_cannot_be_is_refused_before_anything_is_opened(camera):
     config = make_config({"sensors": {"depth": [{**CAMERA, **camera}]}})
-    with pytest.raises(ConfigError, match=why):
+    with raises_error(ConfigError, code=("config/unknown-key", "plugin/not-found", "plugin/not-loadable")):
         SimBackend.check(config, SimSettings())
 
 
 def test_a_model_that_makes_something_else_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"does not make a DepthImage, which is what sensor/depth/head carries"):
+    with raises_error(ConfigError, code="plugin/not-loadable"):
         run_with(slow(tmp_path, 0, "Mute"))
     with pytest.raises(ConfigError, match=r"Plain' is not derived from `SensorModel` in snakesim_hal/model/sensor_mod"):
         run_with(slow(tmp_path, 0, "Plain"))

@@ -22,6 +22,7 @@ from snakesim_hal.wire.messages import Description, make_arm_request
 from snakesim_testing.hal.local_network import Follower, following, running
 from snakesim_testing.hal.small_robots import description, run_config
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
 
 
 def test_a_description_is_proven_by_the_runs_key_alone() -> None:
@@ -132,7 +133,7 @@ def test_of_two_runs_that_start_at_once_each_has_an_endpoint_of_its_own() -> Non
     second, other_port = meeting_point(None, None, "worm")
     with its_port, other_port:
         assert first != second
-        with pytest.raises(NotConnectedError, match="Another run may hold the port"):
+        with raises_error(NotConnectedError, code="network/port-in-use"):
             meeting_point(first.endpoint, None, "worm")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", int(first.endpoint.rpartition(":")[2])))

@@ -12,6 +12,7 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.run.folder import LOCK, default_folder, locked_folder
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
 
 HOLD = """
 import sys, time
@@ -37,7 +38,7 @@ def test_a_folder_is_held_and_let_go(tmp_path: Path) -> None:
     out, said = tmp_path / "deep" / "run", list[str]()
     with locked_folder(out, said.append) as held:
         assert held == out and content(out) == {LOCK: str(os.getpid())}
-        with pytest.raises(ConfigError, match=rf"another run is writing there, process {os.getpid()}"):
+        with raises_error(ConfigError, code="file/in-use"):
             locked_folder(out, said.append).__enter__()
     assert content(out) == {} and said == []
 
@@ -84,7 +85,7 @@ def test_a_second_process_is_refused_before_it_touches_anything_and_a_killed_one
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"
         leave(out, config_json="of the holder")
         before = content(out)
-        with pytest.raises(ConfigError, match=rf"--out {out}: .*process {holder.pid}; choose another folder"):
+        with raises_error(ConfigError, code="file/in-use", field="--out"):
             locked_folder(out, pytest.fail).__enter__()
         assert content(out) == before and list(tmp_path.iterdir()) == [out]
         holder.send_signal(signal.SIGKILL)
@@ -138,7 +139,7 @@ def test_nothing_is_written_into_a_folder_that_was_just_moved_aside(
 @pytest.mark.parametrize("out", ["file", "file/run", "/proc/run"])
 def test_what_cannot_be_a_folder_is_wrong_input(tmp_path: Path, out: str) -> None:
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ConfigError, match=rf"--out {tmp_path / out}: .*; choose another folder"):
+    with raises_error(ConfigError, code="file/not-writable", field="--out"):
         locked_folder(tmp_path / out, pytest.fail).__enter__()
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -146,7 +147,7 @@ def test_what_cannot_be_a_folder_is_wrong_input(tmp_path: Path, out: str) -> Non
 def test_the_folder_that_one_is_in_is_not_moved_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leave(tmp_path, config_json="x")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match="you are in it; choose another folder"):
+    with raises_error(ConfigError, code="file/already-exists"):
         locked_folder(Path(), pytest.fail).__enter__()
     assert content(tmp_path) == {"config.json": "x"}
 

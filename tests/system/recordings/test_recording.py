@@ -33,6 +33,7 @@ from snakesim_testing.hal.small_robots import PERIOD_NS, description
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.file_size import max_file_size
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.clock_samples import clock
 
 
@@ -166,7 +167,7 @@ def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monk
 def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
     """What is damaged: tests/system/recordings/test_damaged_recordings.py."""
     (tmp_path / "bad.mcap").write_bytes(b"no recording at all")
-    with pytest.raises(ConfigError, match=r"bad\.mcap is not a recording"):
+    with raises_error(ConfigError, code="recording/not-readable", field="bad.mcap"):
         recover_recording(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
     assert not (tmp_path / "copy.mcap").exists()
 

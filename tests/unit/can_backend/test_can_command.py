@@ -19,6 +19,7 @@ from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 from snakesim_testing.can.frames import health, heartbeat
+from snakesim_testing.messages import raises_error
 
 TRIPLET = load_scenario("triplet").config
 
@@ -43,7 +44,7 @@ def test_load_takes_the_settings_of_the_backend(capsys: pytest.CaptureFixture[st
     assert main(["load", "triplet", *flags]) == 0
     said = capsys.readouterr().out
     assert "can0: 7 joints" in said and "can1: 6 joints" in said and "Contact" not in said
-    with pytest.raises(ConfigError, match=r"backends\.can\.imu_rate_hz"):
+    with raises_error(ConfigError, code="config/out-of-range"):
         main(["load", "triplet", "--set", "backend.imu_rate_hz=-1"])
 
 
@@ -81,7 +82,7 @@ def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureF
 
 def test_expand_needs_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"file/all\.dbc: cannot be written: its folder is a file"):
+    with raises_error(ConfigError, code="file/not-writable", field="all.dbc"):
         main(["expand", "--out", str(tmp_path / "file" / "all.dbc")])
 
 
@@ -137,7 +138,7 @@ def test_scan_of_an_empty_bus_is_a_failure(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_scan_of_an_interface_that_is_not_there() -> None:
-    with pytest.raises(ConfigError, match="nocan7"):
+    with raises_error(ConfigError, code="bus/not-available"):
         main(["scan", "nocan7"])
 
 

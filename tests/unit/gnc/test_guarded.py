@@ -12,6 +12,7 @@ from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_testing.gnc.stage import make_stage
+from snakesim_testing.messages import raises_error
 
 STAGE = make_stage(3)
 OBSERVATION = STAGE.observe(0, 0.3)
@@ -56,50 +57,35 @@ def test_a_good_answer_passes_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "words"),
+    "answer",
     [
-        (None, r"update\(\) returned None, must return a ControllerCommand"),
-        (
-            GOOD,
-            r"update\(\) returned RequestedSetpoints\(.*\.\.\. \(RequestedSetpoints\), must return a ControllerCommand",
-        ),
-        (made_of([0.0] * 3), r"ControllerCommand.setpoints is \[0.0, 0.0, 0.0\] \(list\), must be RequestedSetpoints"),
-        (made_of(GOOD, "moving"), r"ControllerCommand.telemetry is 'moving', must be Telemetry"),
-        (
-            points(target=[0.0] * 2),
-            r"RequestedSetpoints.target has 2 values, must have 3: one a joint, joint_1 to joint_3",
-        ),
-        (points(mode=[Mode.POSITION] * 4), "RequestedSetpoints.mode has 4 values, must have 3"),
-        (points(torque_limit_nm=[]), "RequestedSetpoints.torque_limit_nm has 0 values"),
-        (
-            points(target=np.zeros(3)),
-            r"RequestedSetpoints.target is array\(.*\(ndarray\), must be a list; use .tolist\(\)",
-        ),
-        (
-            points(target=[0.0, math.nan, 0.0]),
-            r"RequestedSetpoints.target\[1\] \(joint_2\) is nan, must be a finite number",
-        ),
-        (points(target=[0.0, 0.0, -math.inf]), r"RequestedSetpoints.target\[2\] \(joint_3\) is -inf"),
-        (points(target=[2e5, 0.0, 0.0]), r".* is 200000.0, must be .* of rad, rad/s or N·m from -100000 to 100000"),
-        (points(target=[np.float64(1), 0.0, 0.0]), r".* is .*1.0.* \(float64\), must be a plain float"),
-        (points(target=[True, 0.0, 0.0]), r".* is True \(bool\), must be a plain float"),
-        (points(target=["1", 0.0, 0.0]), ".* is '1', must be a plain float"),
-        (points(torque_limit_nm=[7.0, -1.0, 7.0]), r".*_limit_nm\[1\] \(joint_2\) is -1.0, must be .* N·m from 0"),
-        (
-            points(mode=[1, 1, 1]),
-            r"RequestedSetpoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION",
-        ),
-        (points(mode=[Mode.POSITION, 7, "x"]), r"RequestedSetpoints.mode\[1\] \(joint_2\) is 7"),
-        (reported(reason=None), "Telemetry.reason is None, must be a str"),
-        (reported(usable_push_points="3"), "Telemetry.usable_push_points is '3'"),
-        (reported(propulsion_joint=3), "Telemetry.propulsion_joint is 3, must be None or an int from 0 to 2"),
-        (ZeroDivisionError, r"update\(\) raised ZeroDivisionError: as planned \(test_guarded.py line \d+\)"),
-        (SystemExit, r"update\(\) raised SystemExit: as planned"),
-        (ValueError("no such robot"), r"__init__\(\) raised ValueError: no such robot"),
+        None,
+        GOOD,
+        made_of([0.0] * 3),
+        made_of(GOOD, "moving"),
+        points(target=[0.0] * 2),
+        points(mode=[Mode.POSITION] * 4),
+        points(torque_limit_nm=[]),
+        points(target=np.zeros(3)),
+        points(target=[0.0, math.nan, 0.0]),
+        points(target=[0.0, 0.0, -math.inf]),
+        points(target=[2e5, 0.0, 0.0]),
+        points(target=[np.float64(1), 0.0, 0.0]),
+        points(target=[True, 0.0, 0.0]),
+        points(target=["1", 0.0, 0.0]),
+        points(torque_limit_nm=[7.0, -1.0, 7.0]),
+        points(mode=[1, 1, 1]),
+        points(mode=[Mode.POSITION, 7, "x"]),
+        reported(reason=None),
+        reported(usable_push_points="3"),
+        reported(propulsion_joint=3),
+        ZeroDivisionError,
+        SystemExit,
+        ValueError("no such robot"),
     ],
 )
-def test_a_wrong_one_is_named(answer: Any, words: str) -> None:
-    with pytest.raises(ControllerError, match=WHO + words):
+def test_a_wrong_one_is_named(answer: Any) -> None:
+    with raises_error(ControllerError, code="controller/failed"):
         update(answer)
 
 

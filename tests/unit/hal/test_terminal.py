@@ -40,7 +40,7 @@ def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
     assert overwrite_line("tick 10 \x1b[1A and much more", 24, 3) == 24
     out, err = capsys.readouterr()
     assert out == "\\u001b]0;title\\u0007\n\rtick 10 \\u001b[1A and mu"
-    assert err == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me\nsecond line\n"
+    assert err == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me [config/invalid-value]\nsecond line\n"
 
 
 def test_nothing_else_prints() -> None:

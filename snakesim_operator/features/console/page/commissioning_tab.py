@@ -94,15 +94,15 @@ class Commissioning:
             RefusedError: A step runs already, or the step cannot be started from this page.
         """
         if self.robot_file is None:
-            raise RefusedError("the console was started without --commission FILE")
+            raise RefusedError("the console was started without --commission FILE", code="commissioning/not-possible")
         if verb == "jog" and not joint:
-            raise RefusedError("jog moves one joint: give its number")
+            raise RefusedError("jog moves one joint: give its number", code="commissioning/not-possible")
         joint_names: list[str] = []
         if joint and verb != "zero":
             joint_names.append(f"joint_{joint}")
         with self._lock:
             if self._step is not None and self._step.is_running:
-                raise RefusedError(f"{self._step.verb} is under way: end it first")
+                raise RefusedError(f"{self._step.verb} is under way: end it first", code="commissioning/not-possible")
             robot_flags = shlex.split(flags_of(self._link, None))
             self._step = JointStep([verb, str(self.robot_file), *joint_names, *options, *robot_flags])
             self._viewer = viewer

@@ -14,6 +14,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Pose
 from snakesim_testing.can.driver_loop import armed, config, loop
 from snakesim_testing.can.recorded_wire import DISARMED, WIRES, is_action, module_of, words
+from snakesim_testing.messages import raises_error
 
 # --- closing -----------------------------------------------------------------------------------------------
 
@@ -30,7 +31,7 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
         run.backend.close()
         assert wire.closed == 1
         for call in (lambda: run.backend.sample(99, 0), run.backend.advance):
-            with pytest.raises(BackendError, match="closed"):
+            with raises_error(BackendError, code="backend/closed"):
                 call()
         run.backend.enact(run.staying(run.samples[-1]), "armed")
         assert run.backend.faults() == [] and len(wire.sent) == sent
@@ -58,7 +59,7 @@ def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_poses_need_a_delay_that_somebody_has_stated() -> None:
-    with pytest.raises(ConfigError, match=r"pose_listen.*\[sensors\.pose\].*delay_s"):
+    with raises_error(ConfigError, code="config/missing-key"):
         CanBackend.check(config(), CanSettings(pose_listen="127.0.0.1:0"))
     CanBackend.check(config(robot__sensors__pose__delay_s=0.02), CanSettings(pose_listen="127.0.0.1:0"))
 
@@ -92,7 +93,7 @@ def test_what_is_wrong_is_told_even_when_the_bus_no_longer_takes_the_stop() -> N
             return False
 
         wire.refuses = breaks
-        with pytest.raises(BackendError, match="the bus is broken"):  # by the next tick, which tries again
+        with raises_error(BackendError, code="backend/failed"):  # by the next tick, which tries again
             run.run(3, run.waving)
         reported = {fault.what: fault.cause for fault in run.faults}
         assert "leak" in reported["module_leak"] and reported["stop_not_sent"] == "the bus is broken"

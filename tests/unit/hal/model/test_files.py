@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, Table, decode, find_file, leaves, list_shipped, read_table
+from snakesim_testing.messages import raises_error
 
 
 class Part(FileStruct, frozen=True):
@@ -70,7 +71,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
 
 def test_a_section_of_a_larger_file_names_its_place_there() -> None:
     table = Table({"size_m": 5}, "my.toml", {"box.size_m": "--set box.size_m=5"})
-    with pytest.raises(ConfigError, match=r"^--set box\.size_m=5: `box\.size_m` = 5 m is not allowed"):
+    with raises_error(ConfigError, code="config/out-of-range", field="--set", value=5):
         decode(table, Part, "box")
 
 
@@ -78,17 +79,17 @@ def test_the_error_names_the_file_in_which_the_field_should_stand() -> None:
     table = Table({}, "outer.toml")
     table.put("parts", [], "outer.toml")
     table.put("part", {"many": 2, "typo": {"x": 1}}, "inner.toml")
-    with pytest.raises(ConfigError, match=r"^inner\.toml: unknown field `part\.typo`"):
+    with raises_error(ConfigError, code="config/unknown-key", field="inner.toml"):
         decode(table, Whole)
     del table.values["part"]["typo"]
-    with pytest.raises(ConfigError, match=r"^inner\.toml: field `part\.size_m` is missing"):
+    with raises_error(ConfigError, code="config/missing-key", field="inner.toml"):
         decode(table, Whole)
     table.put("part.size_m", 7, "--set part.size_m=7")
-    with pytest.raises(ConfigError, match=r"^--set part\.size_m=7: `part\.size_m` = 7 m"):
+    with raises_error(ConfigError, code="config/out-of-range", field="--set", value=7):
         decode(table, Whole)
     table.put("part.size_m", 1, "--set part.size_m=1")
     table.put("part.sise_m", 7, "--set part.sise_m=7")
-    with pytest.raises(ConfigError, match=r"^--set part\.sise_m=7: unknown field `part\.sise_m`"):
+    with raises_error(ConfigError, code="config/unknown-key", field="--set"):
         decode(table, Whole)
 
 
@@ -212,7 +213,7 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: byte
 
 def test_a_file_that_is_not_there_is_named_and_so_are_those_that_are(tmp_path: Path) -> None:
     (tmp_path / "elsewhere.toml").touch()
-    with pytest.raises(ConfigError, match=r"a\.toml: no such file; in .* are elsewhere\.toml"):
+    with raises_error(ConfigError, code="file/not-found", field="a.toml"):
         read_table(tmp_path / "a.toml")
 
 
@@ -261,7 +262,7 @@ def test_putting_into_lists() -> None:
             table.put(dotted, 1, f"--set {dotted}=1")
         assert str(caught.value).startswith(f"--set {dotted}=1: ") and words in str(caught.value)
     table.values["parts"] = []
-    with pytest.raises(ConfigError, match="the list is empty"):
+    with raises_error(ConfigError, code="config/unknown-key"):
         table.put("parts.0.size_m", 1, "--set")
 
 

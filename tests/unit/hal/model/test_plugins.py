@@ -19,6 +19,7 @@ from snakesim_hal.model.plugins import (
     offer_plugin,
     plugin_settings,
 )
+from snakesim_testing.messages import raises_error
 
 WAVE = """\
 import msgspec
@@ -86,24 +87,23 @@ def test_looking_at_a_file_runs_none_of_it(tmp_path: Path) -> None:
 
 
 BROKEN = {
-    "no such class": (WAVE, "Wove", "the file has no 'Wove', as in .*wave.py:Wave; the classes in it are Wave$"),
-    "not Python": ("class Wave(:\n", "Wave", "SyntaxError"),
-    "import that fails": ("import no_such_module_anywhere\n", "Wave", "no_such_module_anywhere"),
-    "name that is not there": ("x = undefined_thing\n", "Wave", "undefined_thing"),
-    "exception of its own": ("x = 1 / 0\n", "Wave", "ZeroDivisionError: division by zero"),
-    "exit": ("raise SystemExit(0)\n", "Wave", "SystemExit"),
-    "deep": ("x = " + "(" * 100_000, "Wave", "too many nested parentheses"),
-    "NUL": ("x = 1\0", "Wave", "null bytes"),
+    "no such class": (WAVE, "Wove"),
+    "not Python": ("class Wave(:\n", "Wave"),
+    "import that fails": ("import no_such_module_anywhere\n", "Wave"),
+    "name that is not there": ("x = undefined_thing\n", "Wave"),
+    "exception of its own": ("x = 1 / 0\n", "Wave"),
+    "exit": ("raise SystemExit(0)\n", "Wave"),
+    "deep": ("x = " + "(" * 100_000, "Wave"),
+    "NUL": ("x = 1\0", "Wave"),
 }
 
 
 @pytest.mark.parametrize("broken", BROKEN)
 def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) -> None:
-    text, name, words = BROKEN[broken]
+    text, name = BROKEN[broken]
     (tmp_path / "wave.py").write_text(text)
-    with pytest.raises(ConfigError, match=words) as caught:
+    with raises_error(ConfigError, code=("plugin/not-found", "plugin/not-loadable")):
         find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:{name}")
-    assert "controller '" in str(caught.value)
 
 
 def test_a_program_may_offer_what_a_name_stands_for() -> None:
@@ -111,7 +111,7 @@ def test_a_program_may_offer_what_a_name_stands_for() -> None:
     with offer_plugin(CONTROLLERS, "hold", Plugin), offer_plugin(CONTROLLERS, "mine", Plugin):
         assert find_plugin(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "mine") is Plugin
     assert find_plugin(CONTROLLERS, "hold") is installed_one
-    with pytest.raises(ConfigError, match="no controller called 'mine'"):
+    with raises_error(ConfigError, code="plugin/not-found", field="mine"):
         find_plugin(CONTROLLERS, "mine")
 
 
@@ -122,16 +122,16 @@ class Plugin:
 
 def test_settings_are_checked_by_the_plugins_own_struct_and_name_file_or_flag() -> None:
     assert plugin_settings(Plugin, {}, "a.toml", "controllers.p").gain == 1.0
-    with pytest.raises(ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"):
+    with raises_error(ConfigError, code="config/unknown-key", field="a.toml"):
         plugin_settings(Plugin, {"gian": 1}, "a.toml", "controllers.p")
     origin = {"controllers.p.gain": "--set control.gain=x"}
-    with pytest.raises(ConfigError, match=r"^--set control\.gain=x: `controllers\.p\.gain` = 'x'"):
+    with raises_error(ConfigError, code="config/invalid-value", field="--set"):
         plugin_settings(Plugin, {"gain": "x"}, "a.toml", "controllers.p", origin)
 
 
 def test_a_plugin_without_settings_is_told_to_state_them() -> None:
     for bad in (object(), type("Bare", (), {}), type("Odd", (), {"Settings": dict})):
-        with pytest.raises(ConfigError, match="has no `Settings` Struct"):
+        with raises_error(ConfigError, code="plugin/not-loadable", field="Settings"):
             plugin_settings(bad, {}, "a.toml", "x")
 
 
@@ -144,7 +144,7 @@ def test_two_packages_with_a_plugin_of_one_name_are_refused_by_name(
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
         (metadata / "entry_points.txt").write_text(f"[snakesim.controllers]\nwave = {package}:Wave\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ConfigError, match="controller 'wave' is in several installed packages: ") as raised:
+    with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as raised:
         find_plugin(CONTROLLERS, "wave")
     assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(re.split(": | and |; ", str(raised.value)))
     assert find_plugin(CONTROLLERS, "hold").__name__ == "Hold"

@@ -11,6 +11,7 @@ from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import OwnSample
 from snakesim_hal.wire.own_sample import make_message_schema, parse_custom_message
 from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
+from snakesim_testing.messages import raises_error
 
 
 def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_reads_where_and_when() -> None:
@@ -76,7 +77,7 @@ class Empty(OwnSample, frozen=True, kw_only=True):
     ],
 )
 def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message: Any, words: str) -> None:
-    with pytest.raises(ConfigError, match="sensor 'skin': model x") as caught:
+    with raises_error(ConfigError, code="plugin/not-loadable", field="skin") as caught:
         make_message_schema(message, "sensor 'skin': model x")
     assert words in str(caught.value)
 

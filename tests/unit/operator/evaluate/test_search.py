@@ -16,6 +16,7 @@ from snakesim_hal.model.textfiles import read_text
 from snakesim_operator.features.evaluate import optimize as search
 from snakesim_operator.features.evaluate.case import Case, CaseOutcome
 from snakesim_operator.features.evaluate.optimize import SearchRequest, optimize
+from snakesim_testing.messages import raises_error
 
 PROPULSION = "control.propulsion_n"
 FIRST = {
@@ -100,7 +101,7 @@ def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> N
     searched(tmp_path / "search.db", scenario=str(scenario))
     assert "rate_hz = 100" in text
     scenario.write_text(text.replace("rate_hz = 100", "rate_hz = 50"))
-    with pytest.raises(ConfigError, match="the same command gives another configuration"):
+    with raises_error(ConfigError, code="evaluation/other-search"):
         searched(tmp_path / "search.db", scenario=str(scenario))
 
 
@@ -108,7 +109,7 @@ def test_a_file_that_does_not_say_of_which_search_it_is_stays_as_it_is(tmp_path:
     storage = tmp_path / "search.db"
     study = optuna.create_study(storage=f"sqlite:///{storage}", study_name="triplet path_distance_m")
     study.add_trial(optuna.trial.create_trial(value=1.0))
-    with pytest.raises(ConfigError, match="does not say with which command") as error:
+    with raises_error(ConfigError, code="evaluation/other-search") as error:
         searched(storage)
     assert "choose another file" in str(error.value) and len(study.get_trials()) == 1
 
@@ -126,7 +127,7 @@ def test_any_file_name_will_do(tmp_path: Path, name: str, capsys: pytest.Capture
 def test_what_is_no_search_is_named(tmp_path: Path, what: str) -> None:
     storage = tmp_path / "search.db"
     storage.mkdir() if what == "folder" else storage.write_text("mine\n" * 1000)
-    with pytest.raises(ConfigError, match=r"search\.db: .*choose another file"):
+    with raises_error(ConfigError, code="file/not-writable", field="search.db"):
         searched(storage)
 
 

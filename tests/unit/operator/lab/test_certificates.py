@@ -11,6 +11,7 @@ from snakesim_operator.cli import main
 from snakesim_operator.features.lab.certificates import issue, make_authority, read_certificate, write_certificates
 from snakesim_operator.features.lab.identities import identities
 from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
+from snakesim_testing.messages import raises_error
 
 LAB = load_lab(EXAMPLE)
 
@@ -54,5 +55,5 @@ def test_certificates_of_another_authority_are_replaced(tmp_path: Path) -> None:
 def test_an_authority_without_its_key_is_not_replaced_in_silence(tmp_path: Path) -> None:
     states(tmp_path)
     (tmp_path / "authority" / "authority.key").unlink()
-    with pytest.raises(ConfigError, match=r"authority\.key"):
+    with raises_error(ConfigError, code="certificate/invalid-authority", field="authority.key"):
         states(tmp_path)

@@ -15,6 +15,7 @@ from snakesim_operator.features.lab.check import Findings, check_what_moves
 from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
 from snakesim_operator.features.lab.render import rendered
 from snakesim_testing.hal.small_robots import description
+from snakesim_testing.messages import raises_error
 
 BY_ID = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT4-if00-port0"
 ROBOTS = {
@@ -144,7 +145,7 @@ def test_a_bus_is_of_one_robot(tmp_path: Path) -> None:
     second = '\n[robots.second]\nmachine = "robot1"\nscenario = "triplet"\nbackend = "odrive"\ncan = ["can0"]\n'
     path = tmp_path / "lab.toml"
     path.write_text(lab_text(ROBOTS["can"]) + second)
-    with pytest.raises(ConfigError, match="can0 of machine 'robot1' has the robot 'planar13', too"):
+    with raises_error(ConfigError, code="lab/invalid-file", field="robot1"):
         load_lab(path)
 
 

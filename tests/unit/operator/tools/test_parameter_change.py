@@ -11,6 +11,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState
 from snakesim_operator.robot_commands import parameters
 from snakesim_testing.hal.small_robots import description
+from snakesim_testing.messages import raises_error
 
 CLOCK = Clock(
     tick=7,
@@ -78,5 +79,5 @@ def test_a_value_that_ends_control_is_named_with_the_reason(gone: bool) -> None:
 
 
 def test_settings_that_vanish_without_a_reason_are_not_confirmed() -> None:
-    with pytest.raises(RefusedError, match="NOT CONFIRMED"):
+    with raises_error(RefusedError, code="robot/not-confirmed"):
         parameters.change_parameters(Control(None, gone=True).operator, CHANGES, "ada")
