@@ -23,7 +23,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.plugins import CONTROLLERS, list_installed
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.programs.preflight import check_plugins
-from tests.unit.hal.rig import description, state
+from snakesim_testing.hal.small_robots import description, state
 
 SHIPPED = list_installed(CONTROLLERS)
 DECLARED = {name for name in vars(Controller) if not name.startswith("_")}

@@ -30,11 +30,8 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.can.driver_loop import JOINTS
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.driver_loop import loop
-from snakesim_testing.can.frames import read
-from snakesim_testing.messages import raises_error
+from snakesim_testing.can.driver_loop import JOINTS, config, loop
+from snakesim_testing.can.frames import (
     DISARMED,
     EMERGENCY,
     WIRES,
@@ -42,8 +39,10 @@ from snakesim_testing.messages import raises_error
     go,
     is_action,
     is_set_point,
+    read,
     words,
 )
+from snakesim_testing.messages import raises_error
 
 # --- opening -----------------------------------------------------------------------------------------------
 
