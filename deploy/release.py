@@ -8,7 +8,8 @@ Into `build/release/`:
     env/         an environment made from nothing but the wheel, in which the checks run
     run/         the run of the main job in that environment
 
-The exit code is 0 only if every step passed. Packages that the vulnerability service did not judge are reported as UNKNOWN.
+The exit code is 0 only if every step passed. Packages that the vulnerability service did not
+judge are reported as UNKNOWN.
 """
 
 import argparse
