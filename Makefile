@@ -25,7 +25,7 @@ packages := snakesim $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs lock clean FORCE
+.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs release lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -91,7 +91,7 @@ kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear
 soak: $(stamp) ## A long run with faults at random, and an operator who recovers (MINUTES=30, ARGS="--backend can --seed 2")
 	$(bin)/python -m verification.soak --minutes $(MINUTES) $(ARGS)
 
-check: $(stamp) ## Lint, format, types and import rules, without changing anything
+check: $(stamp) ## Lint, format, types, import rules and English, without changing anything
 	$(bin)/ruff check
 	$(bin)/ruff format --check
 	$(bin)/basedpyright
@@ -100,6 +100,7 @@ check: $(stamp) ## Lint, format, types and import rules, without changing anythi
 	    { echo "check: add $$package to root_packages under [tool.importlinter] in pyproject.toml"; exit 1; }; \
 	done
 	$(bin)/lint-imports
+	$(bin)/zizmor --quiet --offline .github
 
 bench: $(stamp) ## Measure the ratios in benchmarks/
 	$(bin)/python -m benchmarks $(ARGS)
@@ -123,6 +124,9 @@ schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key sp
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py
+
+release: $(stamp) ## Build and check what a release publishes, into build/release
+	$(bin)/python deploy/release.py $(ARGS)
 
 lock: ## Resolve the lock files again (UPGRADE=1 for newer versions)
 	$(bootstrap) lock $(if $(UPGRADE),--upgrade)

@@ -83,11 +83,10 @@ def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 @needs_uv
-@pytest.mark.parametrize("section", README, ids=named)
-def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
-    """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule.
+def test_the_readme_as_printed(tmp_path: Path) -> None:
+    """All blocks of the README, in a fresh clone with an environment of its own from the lock.
 
-    The tests, which this is one of, are only collected there.
+    The tests, of which this is one, are only collected there. Downloads come from uv's cache, as a rule.
     """
     origin = tmp_path / "origin"
     git = ["git", "-c", "user.name=x", "-c", "user.email=x@example.org"]
@@ -96,12 +95,16 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
         subprocess.run([*git, "-C", str(origin), *arguments], check=True)
     clone = tmp_path / "snakesim"
     subprocess.run([*git, "clone", "-q", str(origin), str(clone)], check=True)
-    printed = documents.script(section)
+    install, quick_start = README
+    for name, content in quick_start.files.items():
+        (clone / name).write_text(content, encoding="utf-8")
+    printed = documents.script(install)
     assert "\nmake demo" in printed and "\nmake test" in printed
     script = printed.replace("\nmake test", "\nmake test-unit WORKERS=0 ARGS='--collect-only -q'")
-    said = typed(script, clone, [])
-    assert "report:" in said and (clone / "runs" / "demo" / "report.html").is_file()
-    assert "tests collected" in said
+    output = typed(script + "\n" + documents.script(quick_start), clone, [])
+    assert "report:" in output and (clone / "runs" / "demo" / "report.html").is_file()
+    assert "tests collected" in output
+    assert (clone / "first.html").is_file()
 
 
 def test_the_documents_ask_for_something() -> None:
