@@ -79,6 +79,7 @@ def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureF
 # --- expand ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_expand_needs_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"file/all\.dbc: cannot be written: its folder is a file"):
