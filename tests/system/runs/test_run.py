@@ -69,9 +69,10 @@ def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_
     assert "; lease of control expired: " in ended and f"fault: {TOO_SLOW}" in run.said()
 
 
-@pytest.mark.parametrize("clock_mode", [pytest.param("realtime", marks=pytest.mark.slow), "free"])
+@pytest.mark.quiet
+@pytest.mark.parametrize("clock_mode", ["realtime", "free"])
 def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
-    """Or the computer is found to be too slow, by measuring it: in these paces a lease is one of the wall clock."""
+    """In these clock modes a lease is one of the wall clock."""
     # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
     arguments = [
         "triplet",
@@ -88,11 +89,8 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
         arguments.append("--no-record")
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
     assert summary.clock_mode == clock_mode
-    if ended.code:
-        assert summary.ended.startswith(TOO_SLOW), ended.out + ended.err
-    else:
-        assert summary.ticks == 100
-    if clock_mode == "realtime" and not ended.code:
+    assert ended.code == 0 and summary.ticks == 100, ended.out + ended.err
+    if clock_mode == "realtime":
         assert summary.overruns or summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
         assert summary.tick_times.keys() == {"cycle", "late", "read", "write"}
