@@ -65,6 +65,7 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     assert "drop:guidance/world@" in said and "begins" in said
 
 
+@pytest.mark.slow  # a row of the fault table
 def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
     flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
@@ -72,6 +73,7 @@ def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path)
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
 
 
+@pytest.mark.slow  # the attack on it is in verification/attack
 def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
     """A backend that does not say that it is emulated counts as real."""
     (tmp_path / "bench.py").write_text(

@@ -97,6 +97,7 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
         assert summary.tick_times["read"].count == 100 and summary.tick_times["cycle"].median_us > 15_000
 
 
+@pytest.mark.slow  # in one process: test_advance.py
 def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
     short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--clock-mode", "lockstep"]
     ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)

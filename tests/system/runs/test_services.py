@@ -114,6 +114,7 @@ class Lost(MotionCapture):
 """
 
 
+@pytest.mark.slow  # the decoders' errors: tests/unit/hal/wire
 @pytest.mark.parametrize(
     ("clock_mode", "wrong"),
     [
