@@ -1,5 +1,7 @@
 """Every test runs with a state folder of its own and tries the same examples each time. A failure is shown at once."""
 
+import random
+
 import pytest
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
@@ -21,6 +23,16 @@ class FailuresAtOnce:
             return
         reasons = [line for line in report.longreprtext.splitlines() if line.startswith("E ")] or [""]
         terminal.write_line(f"\nFAILED {report.nodeid}: {reasons[0][1:].strip()}", red=True)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run the tests in a random order")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    seed = config.getoption("--shuffle")
+    if seed is not None:
+        random.Random(seed).shuffle(items)
 
 
 def pytest_configure(config: pytest.Config) -> None:
