@@ -13,6 +13,7 @@ from snakesim_testing.runs.in_process_command import tell
 pytestmark = pytest.mark.e2e
 
 
+@pytest.mark.slow  # rows of the fault table
 @pytest.mark.parametrize(
     ("backend", "clock_mode"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
 )

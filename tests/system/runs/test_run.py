@@ -50,6 +50,7 @@ def starved(pid: int) -> Iterator[None]:
             process.wait()
 
 
+@pytest.mark.slow  # it takes a core from every other test
 def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_path: Path) -> None:
     arguments = [
         "triplet",
