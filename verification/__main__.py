@@ -37,9 +37,24 @@ PARTS = {
     "contracts": Part(
         "tools of the campaign, and the rules of who may import whom",
         1,
-        (*PYTEST, "verification/test_import_contracts.py", "verification/soak/test_judgement.py", "verification/fuzz"),
+        (
+            *PYTEST,
+            "verification/test_import_contracts.py",
+            "verification/test_docstring_names.py",
+            "verification/soak/test_judgement.py",
+            "verification/fuzz",
+        ),
     ),
-    "slow": Part("the long forms of the tests", 15, (*PYTEST, "tests", "--ignore", "tests/system/can", "-m", "slow")),
+    "quiet": Part(
+        "robots in real time, one test after the other",
+        4,
+        (*PYTEST, "tests", "--ignore", "tests/system/can", "-m", "quiet"),
+    ),
+    "slow": Part(
+        "the long forms of the tests",
+        15,
+        (*PYTEST, "tests", "--ignore", "tests/system/can", "-n", "2", "-m", "slow and not quiet"),
+    ),
     "can": Part(
         "all CAN tests and the contract on a kernel's bus",
         8,

@@ -4,6 +4,6 @@ He has `schemas/`, a Zenoh client, MessagePack and sockets, and nothing of ours:
 here imports a `snakesim_` package. What he is up against is the `snakesim` command in processes of its own; only
 `data/` is the robot's side. The numbers in the tests' names are those of docs/safety.md.
 
-    make test      each attack once
-    make attack    all of it: more repetitions, longer floods, more connections
+    make attack                    all of it: more repetitions, longer floods, more connections
+    pytest verification/attack     each attack once
 """

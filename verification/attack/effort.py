@@ -1,4 +1,4 @@
-"""How hard to try: each attack once in `make test`; SNAKESIM_ATTACK=full, as in `make attack`, repeats and prolongs."""
+"""How hard to try: each attack once; SNAKESIM_ATTACK=full, as in `make attack`, repeats and prolongs."""
 
 import os
 from collections.abc import Callable

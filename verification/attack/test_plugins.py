@@ -33,7 +33,7 @@ BY_BACKEND = {
     "interrupts": "by ",  # SIGINT, or its handler in the host if that comes first
 }
 QUICK = {("controller", "hangs"), ("controller", "closes"), ("backend", "exits")}
-# What `hangs` does is in make test, too: tests/system/runs/test_faults_in_processes.py, test_beside.py.
+# What `hangs` does is in `make test`, too: tests/system/runs/test_faults_in_processes.py, test_beside.py.
 SLOW = {("controller", "hangs")}
 DEEDS = [
     pytest.param(who, deed, words, id=f"{who}-{deed}", marks=[pytest.mark.slow] * ((who, deed) in SLOW))

@@ -14,7 +14,6 @@ from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.checked_robot import make_checked_folder
 from snakesim_testing.runs.command import background, running
 from snakesim_testing.runs.hand_turned_robot import robot
-from snakesim_testing.runs.in_process_command import snakesim
 from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, stopped, told
 
 pytestmark = pytest.mark.e2e
@@ -67,6 +66,7 @@ def console(home: Path, endpoint: str) -> Iterator[str]:
         yield process.stdout.readline().split()[1]
 
 
+@pytest.mark.quiet
 def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench: Path) -> None:
     with host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
         asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
@@ -94,10 +94,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         assert robot(home).joint_table[0].drive.zero_rad == pytest.approx(0.0, abs=1e-3)
 
         await viewer.choose("Step", "jog")
-        while not await moved_and_stood(viewer, relay, home):
-            why = snakesim("status", "--endpoint", endpoint, cwd=home).out
-            assert "lease of control expired" in why, why  # this computer was busy for longer than a lease
-            assert snakesim("clear", "--endpoint", endpoint, cwd=home).code == 0
+        assert await moved_and_stood(viewer, relay, home)
         await armed(viewer, home)
     await watching  # the page is closed
     await until(lambda: told(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")

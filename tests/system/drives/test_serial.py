@@ -14,9 +14,8 @@ from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
-ATTEMPTS = 5  # a computer that stutters stops a robot now and then
 # A sync write of 1 to the register `torque enable` (64): instruction, address, size, and servos with what they get.
 ENABLES = re.compile(r" out .* 83 40 00 01 00( [0-9a-f]{2} 01)+ [0-9a-f]{2} [0-9a-f]{2}$", re.MULTILINE)
 
@@ -60,10 +59,8 @@ def run(folder: Path, pose: str, *arguments: str) -> Ended:
 def test_servos_of_another_program_are_found_and_driven_in_real_time(pose: str, folder: Path) -> None:
     found = snakesim("serial", "scan", "servos", "--baud", "1000000", cwd=folder)
     assert found.code == 0 and found.out.count("XM540-W270 (1120)") == 13, found.said
-    ended = [run(folder, pose, "--duration", "2")]
-    while ended[-1].code and len(ended) < ATTEMPTS:
-        ended.append(run(folder, pose, "--duration", "2"))
-    assert ended[-1].code == 0, ended[-1].said
+    ended = run(folder, pose, "--duration", "2")
+    assert ended.code == 0, ended.said
     again = snakesim("serial", "scan", "servos", "--baud", "1000000", cwd=folder)
     assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, "current-based position is kept"
 
@@ -71,13 +68,9 @@ def test_servos_of_another_program_are_found_and_driven_in_real_time(pose: str, 
 def test_servos_that_stop_while_the_host_is_frozen_are_reported_and_stay_off(pose: str, folder: Path) -> None:
     """The host's process gets SIGSTOP for 1 s; the clause for every drive type is in the contract suite."""
     frozen = ("--fault", "freeze:host@0.5-1.5", "--duration", "5", "--set", "backend.log=bytes.log")
-    attempts = 0
-    while True:
-        attempts, out = attempts + 1, folder / f"frozen-{attempts}"
-        ended = run(folder, pose, *frozen, "--out", str(out))
-        record = RunRecord.load(out).host
-        if record.armed_ticks > 10 or attempts == ATTEMPTS:  # it was armed when it was frozen
-            break
+    ended = run(folder, pose, *frozen, "--out", str(folder / "frozen"))
+    record = RunRecord.load(folder / "frozen").host
+    assert record.armed_ticks > 10, "it was armed when it was frozen"
     assert ended.code == 1 and record.lifecycle == "fault", ended.said
     stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
     assert len(stopped) == 13, record.faults

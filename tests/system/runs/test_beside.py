@@ -25,6 +25,7 @@ def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
     assert ended.code == 0 and beside.command_digest == apart.command_digest
 
 
+@pytest.mark.slow  # tests/unit/gnc/test_guarded.py, and a stop while it hangs below
 @pytest.mark.parametrize(
     ("backend", "deed", "words"),
     [
@@ -50,6 +51,7 @@ def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
         assert "estop" in command.tell(run, "status", "--json").out
 
 
+@pytest.mark.slow
 def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "raises"))
     with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:

@@ -43,6 +43,7 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
     assert told_later.code == 1 and "lease of control expired" in told_later.out
 
 
+@pytest.mark.slow  # tests/unit/gnc/test_guarded.py has each wrong answer
 @pytest.mark.parametrize("clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
 def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""

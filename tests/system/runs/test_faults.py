@@ -18,26 +18,26 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
     ("backend", "fault", "what"),
     [
         ("sim", "mute:joint_3@1", "state_invalid"),
-        ("sim", "nan:joint_3@1", "state_invalid"),
-        ("sim", "diverge:simulator@1", "backend_failed"),
+        slow("sim", "nan:joint_3@1", "state_invalid"),
+        slow("sim", "diverge:simulator@1", "backend_failed"),
         ("can", "mute:joint_3@1", "module_silent"),
-        ("can", "leak:joint_3@1", "module_leak"),
-        ("can", "cut:bus_1@1-1.3", "interface_down"),
-        ("odrive", "mute:joint_3@1", "drive_silent"),
+        slow("can", "leak:joint_3@1", "module_leak"),
+        slow("can", "cut:bus_1@1-1.3", "interface_down"),
+        slow("odrive", "mute:joint_3@1", "drive_silent"),
         slow("odrive", "reboot:joint_3@1", "drive_silent"),  # as dynamixel
-        ("odrive", "overheat:joint_3@1", "drive_fault"),
+        slow("odrive", "overheat:joint_3@1", "drive_fault"),
         slow("odrive", "cut:bus_1@1-1.3", "interface_down"),  # as can
         slow("moteus", "mute:joint_3@1", "drive_silent"),  # as odrive
         slow("moteus", "reboot:joint_3@1", "drive_silent"),  # as odrive
         slow("moteus", "overheat:joint_3@1", "drive_fault"),  # as odrive
         slow("moteus", "cut:bus_1@1-1.3", "interface_down"),  # as odrive
         slow("dynamixel", "mute:joint_3@1", "drive_silent"),  # as odrive
-        ("dynamixel", "reboot:joint_3@1", "drive_silent"),
+        slow("dynamixel", "reboot:joint_3@1", "drive_silent"),
         slow("dynamixel", "overheat:joint_3@1", "drive_fault"),  # as odrive
-        ("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
+        slow("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
         ("dynamixel", "cut:bus_1@1-1.3", "interface_down"),
         slow("mixed", "reboot:joint_12@1", "drive_silent"),  # as dynamixel
-        ("mixed", "cut:bus_2@1-1.3", "interface_down"),
+        slow("mixed", "cut:bus_2@1-1.3", "interface_down"),
     ],
 )
 def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
@@ -52,7 +52,7 @@ def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
     assert record.lifecycle == "fault"
 
 
-@pytest.mark.parametrize("backend", ["sim", "can", slow("odrive"), slow("moteus"), "dynamixel"])
+@pytest.mark.parametrize("backend", ["sim", "can", slow("odrive"), slow("moteus"), slow("dynamixel")])
 def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
     flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "1.5", "--set", MAY_LOSE_ONE]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)

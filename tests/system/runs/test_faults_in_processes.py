@@ -13,6 +13,7 @@ from snakesim_testing.runs.in_process_command import tell
 pytestmark = pytest.mark.e2e
 
 
+@pytest.mark.slow  # rows of the fault table
 @pytest.mark.parametrize(
     ("backend", "clock_mode"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
 )
@@ -65,6 +66,7 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     assert "drop:guidance/world@" in said and "begins" in said
 
 
+@pytest.mark.slow  # a row of the fault table
 def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
     flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
@@ -72,6 +74,7 @@ def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path)
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
 
 
+@pytest.mark.slow  # the attack on it is in verification/attack
 def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
     """A backend that does not say that it is emulated counts as real."""
     (tmp_path / "bench.py").write_text(

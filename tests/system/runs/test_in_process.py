@@ -91,7 +91,7 @@ def test_a_controller_that_does_not_return_ends_the_run_in_a_safe_stop(
     assert result.record.host.lifecycle == "fault"
 
 
-@pytest.mark.parametrize("controller", ["Endless", "Compiled"])
+@pytest.mark.parametrize("controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)])
 def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS)
     typed = [*SNAKESIM, "run", "triplet", "--in-process", "--controller", f"./endless.py:{controller}", "--out", "run"]

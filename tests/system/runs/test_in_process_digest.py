@@ -70,6 +70,7 @@ def test_so_does_a_robot_with_a_camera_like_the_robot_without(tmp_path: Path) ->
     assert len(read) == 10 and all(tick == of for tick, of in read)
 
 
+@pytest.mark.slow
 def test_so_do_joint_modules_behind_their_bus(tmp_path: Path) -> None:
     same_both_ways(tmp_path / "run", "triplet", "--duration", "1", "--backend", "can")
 

@@ -58,6 +58,7 @@ class Listener:
             self.foreign[namespace] += joints(message) != ROBOTS[namespace][2]
 
 
+@pytest.mark.slow  # tests/system/lab keeps robots apart
 @pytest.mark.parametrize(
     "form", ["quick", pytest.param("a million messages", marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )

@@ -45,6 +45,7 @@ def robot(tmp_path: Path) -> str:
     return f"robot=./examples/{ROBOT.name}"
 
 
+@pytest.mark.slow  # docs/your-sensor.md is typed in verification/documents
 def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robot: str) -> None:
     run = ("peg_row", "--set", robot, "--duration", "600", "--stay", "--clock-mode", "realtime")
     with running(tmp_path / "run", *run) as started:
@@ -110,6 +111,7 @@ def suite(folder: Path, robot: str, clause: str) -> Ended:
     return call(typed, folder, environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
 
 
+@pytest.mark.slow
 def test_the_contract_suite_accepts_it_and_refuses_it_when_it_lies(tmp_path: Path, robot: str) -> None:
     clauses = " or ".join([*SAID, "sensor_listed", "description"])
     honest = suite(tmp_path, robot, clauses)

@@ -53,6 +53,7 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 
 
+@pytest.mark.slow
 def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     (endpoint,) = read_session(lab.session).endpoints
     monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))

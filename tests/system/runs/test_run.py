@@ -50,6 +50,7 @@ def starved(pid: int) -> Iterator[None]:
             process.wait()
 
 
+@pytest.mark.slow  # it takes a core from every other test
 def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_path: Path) -> None:
     arguments = [
         "triplet",
@@ -69,9 +70,10 @@ def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_
     assert "; lease of control expired: " in ended and f"fault: {TOO_SLOW}" in run.said()
 
 
-@pytest.mark.parametrize("clock_mode", [pytest.param("realtime", marks=pytest.mark.slow), "free"])
+@pytest.mark.quiet
+@pytest.mark.parametrize("clock_mode", ["realtime", "free"])
 def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
-    """Or the computer is found to be too slow, by measuring it: in these paces a lease is one of the wall clock."""
+    """In these clock modes a lease is one of the wall clock."""
     # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
     arguments = [
         "triplet",
@@ -88,17 +90,15 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
         arguments.append("--no-record")
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
     assert summary.clock_mode == clock_mode
-    if ended.code:
-        assert summary.ended.startswith(TOO_SLOW), ended.out + ended.err
-    else:
-        assert summary.ticks == 100
-    if clock_mode == "realtime" and not ended.code:
+    assert ended.code == 0 and summary.ticks == 100, ended.out + ended.err
+    if clock_mode == "realtime":
         assert summary.overruns or summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
         assert summary.tick_times.keys() == {"cycle", "late", "read", "write"}
         assert summary.tick_times["read"].count == 100 and summary.tick_times["cycle"].median_us > 15_000
 
 
+@pytest.mark.slow  # in one process: test_advance.py
 def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
     short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--clock-mode", "lockstep"]
     ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)

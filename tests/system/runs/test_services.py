@@ -96,6 +96,7 @@ def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
     assert "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture" in shown.out
 
 
+@pytest.mark.slow
 def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path) -> None:
     """It waits for a host, of which there is none, and says under which name."""
     for name in ("./lab/mocap.py:MotionCapture", "sensor"):
@@ -123,6 +124,7 @@ class Lost(MotionCapture):
 """
 
 
+@pytest.mark.slow  # the decoders' errors: tests/unit/hal/wire
 @pytest.mark.parametrize(
     ("clock_mode", "wrong"),
     [
@@ -151,6 +153,7 @@ def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
     assert all(said.search(text) for text in (log, summary.ended, ended.out)), f"{log}\n{summary.ended}\n{ended.out}"
 
 
+@pytest.mark.slow
 def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
     lost = LOST.replace("{}", "position_w=1 / 0")
     (home / "lab" / "lost.py").write_text(f"import msgspec\n{SERVICE}{lost}")

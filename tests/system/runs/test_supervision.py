@@ -60,9 +60,7 @@ class Robot:
         wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
 
     def is_commanded(self, times: int) -> bool:
-        """Armed, too; again, where this computer was busy for longer than a lease."""
-        if self.status().lifecycle == "fault":
-            self.tell("clear")
+        """Arm a robot that is disarmed; whether it has then accepted so many commands."""
         if self.status().lifecycle == "disarmed":
             self.tell("arm")
         return self.status().lifecycle == "armed" and self.status().commands_accepted > times
@@ -81,7 +79,7 @@ def interrupt(run: Running) -> RunSummary:
     return summary_of(run.out)
 
 
-@pytest.mark.parametrize("clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
 def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
     with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
@@ -120,6 +118,7 @@ def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_pat
     assert summary.ended == "interrupted" and "go on with `snakesim clear`" in run.said()
 
 
+@pytest.mark.slow  # a row of the fault table
 def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
@@ -140,12 +139,14 @@ def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: 
         interrupt(run)
 
 
+@pytest.mark.slow
 def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1 and "guidance was ended by SIGKILL" in run.said()
 
 
+@pytest.mark.slow  # rows of the fault table
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:

@@ -1,5 +1,6 @@
 """Whole runs: a snake that moves can be told apart from one that does not, whatever its size, world and files."""
 
+import pytest
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from snakesim_operator.run.in_process import simulate
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 
+@pytest.mark.slow
 def test_the_control_experiment_stays_where_it_is(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--controller", "hold")
     assert ended.code == 0, ended.out + ended.err
@@ -71,6 +73,7 @@ def test_without_a_pose_sensor_a_controller_of_joints_runs_alone_and_any_other_b
     assert wrong.code == 2 and "contact" in wrong.err and not (tmp_path / "wrong").exists()
 
 
+@pytest.mark.slow
 def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) -> None:
     near = ["--set", "mission.goal.distance_m=0.4", "--duration", "6"]
     ended, _ = run_to_summary(tmp_path / "run", "surveyed_clutter", *near)
@@ -83,6 +86,7 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
     assert np.abs(record.torque_nm[-1]).max() < 0.5
 
 
+@pytest.mark.slow
 def test_the_report_shows_a_perceived_map_and_the_planned_paths_beside_the_truth(tmp_path: Path) -> None:
     film = playback(simulate(load("clutter", [parse_set("duration_s=1")]).config, tmp_path / "run").record)
     assert film is not None and film.data["maps"] and film.data["paths"]

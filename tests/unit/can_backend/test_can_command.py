@@ -80,6 +80,7 @@ def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureF
 # --- expand ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_expand_needs_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with raises_error(ConfigError, code="file/not-writable", field="all.dbc"):

@@ -70,6 +70,7 @@ def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) 
     assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
 
 
+@pytest.mark.slow
 def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_with_the_fast_one() -> None:
     stage, controller = searching(among_pegs=True, shape_nm_per_rad=0.0)
     for tick in range(100):

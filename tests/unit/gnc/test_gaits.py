@@ -27,7 +27,7 @@ def moved_m(record: RunRecord) -> np.ndarray:
     return (last - first).mean(axis=0)[:2]
 
 
-@pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), (-0.2, 1.0)])
+@pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), pytest.param(-0.2, 1.0, marks=pytest.mark.slow)])
 def test_sidewinding_travels_sideways_and_to_the_side_that_is_asked_for(pitch_rad: float, side: float) -> None:
     along, across = moved_m(on_flat_ground("duration_s=5", f"control.pitch_rad={pitch_rad}").record)
     assert side * across > 0.8 and abs(along) < 0.6 * abs(across)
@@ -38,6 +38,7 @@ def test_rolling_travels_sideways() -> None:
     assert np.hypot(*moved_m(record)) > 0.4
 
 
+@pytest.mark.slow
 def test_a_raised_head_is_level_above_the_ground_and_looks_around() -> None:
     record = on_flat_ground("controller=raised_head", "duration_s=7").record
     shapes = [record.nodes_w(k) for k in range(400, 650)]

@@ -64,6 +64,7 @@ def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
     return references(ObstacleAided(stage.robot, parameters), stage, 300)
 
 
+@pytest.mark.slow
 def test_a_scaled_push_is_turned_round() -> None:
     still = pushed(0.0)
     forward, back = (pushed(scale)[-1] - still[-1] for scale in (1.0, -1.0))

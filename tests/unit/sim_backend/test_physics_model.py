@@ -242,7 +242,7 @@ def test_a_motor_that_bends_the_snake_between_three_pegs_feels_the_moment_of_the
     assert physics_model.shaft_torque_nm() == pytest.approx(firmware.torque_nm, abs=0.01)
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize("friction", [pytest.param(0.0, marks=pytest.mark.slow), 0.4])
 def test_loads_are_the_sums_of_the_true_touches(friction):
     """Jammed between walls and pegs, links are touched at several places at once."""
     walls = [{"from_m": [-1, y], "to_m": [3, y], "friction": friction} for y in (0.09, -0.09)]

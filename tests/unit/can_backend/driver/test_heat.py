@@ -72,7 +72,7 @@ def pushes_nm(rig: Rig, limit_nm: float) -> float:
 
 
 @pytest.mark.parametrize("curve", CURVES)
-@pytest.mark.parametrize("over", [-0.2, 0.48, 0.96])
+@pytest.mark.parametrize("over", [0.48, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.2, 0.96))])
 @pytest.mark.parametrize("backend", ["sim", "can"])
 def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
     """over: how far the winding is from `derate_from_c` to `stop_at_c`."""

@@ -101,6 +101,7 @@ def test_what_does_not_fit_is_refused_in_words(layout: MessageLayout, signal: Si
 # --- against cantools --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(any_layout, st.data(), nodes)
 @often
 def test_cantools_writes_the_same_bytes(layout: MessageLayout, data: st.DataObject, node: int) -> None:

@@ -40,6 +40,7 @@ def test_points_lie_on_what_stands_there(ground, eye, median_m, max_m):
     assert len(off) > 20 and np.median(off) < median_m and off.max() < max_m
 
 
+@pytest.mark.slow
 @given(st.floats(-0.6, 0.6), st.floats(-0.1, 0.15), st.floats(-0.15, 0.15))
 def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
     scan = look(SCENE, turned(yaw, pitch, roll))

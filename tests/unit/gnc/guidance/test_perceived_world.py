@@ -31,6 +31,7 @@ def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
     return total
 
 
+@pytest.mark.slow  # a lidar maps the same below
 def test_a_field_is_mapped_to_millimetres():
     total = scored(Drive(random_field(1)), 200)
     assert len(total.position_m) > 30 and total.visible > 20
@@ -77,6 +78,7 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     assert after.depth_timestamp_ns == before.depth_timestamp_ns and len(after.obstacles) == len(before.obstacles)
 
 
+@pytest.mark.slow
 def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     drive = Drive(random_field(1))
     list(drive.turns(60))

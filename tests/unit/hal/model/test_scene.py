@@ -166,6 +166,7 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
         assert np.hypot(*(dense - center).T).min() - peg.radius_m >= route_clearance_m - 1e-5
 
 
+@pytest.mark.slow  # the overlap with the snake is tested for each block
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=4)
 def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:

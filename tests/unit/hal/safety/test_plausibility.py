@@ -373,6 +373,7 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied 
         yield seen, targets(target) if rng.random() < 0.9 else None
 
 
+@pytest.mark.slow
 def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
     rng = random.Random(5)
     for _ in range(300):

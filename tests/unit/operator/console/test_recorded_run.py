@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from pytest import approx
 
 from snakesim_hal.model.scenario import load, parse_set
@@ -27,6 +28,7 @@ def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> Non
     assert len(moving.log) < len(over.log)  # what came later is not known yet
 
 
+@pytest.mark.slow
 def test_cameras_rates_and_charts_are_those_of_the_instant(tmp_path: Path) -> None:
     simulate(load("clutter", [parse_set("duration_s=1.5")]).config, tmp_path / "run")
     recorded = RecordedRun(tmp_path / "run")

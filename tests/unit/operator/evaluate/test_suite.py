@@ -67,7 +67,12 @@ def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
     assert {case.id for case in make_cases(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
 
 
-@pytest.mark.parametrize("name", list_shipped("suites"))
+QUICK = {"pushing"}  # the others are tried by `make verify`
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in list_shipped("suites")]
+)
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title

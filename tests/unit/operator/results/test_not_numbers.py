@@ -172,6 +172,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [path] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
+@pytest.mark.slow  # the black box is read with the same checks
 @given(data=st.data())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:

@@ -21,6 +21,7 @@ def record() -> RunRecord:
     return simulate(load("surveyed_clutter", [parse_set(f"duration_s={SECONDS}")]).config).record
 
 
+@pytest.mark.slow
 def test_forces_are_told_along_the_body(record: RunRecord) -> None:
     reported = pushing(record)
     assert reported is not None and reported.map_errors is None  # the map was known

@@ -98,6 +98,7 @@ def test_a_controller_without_push_points(record: RunRecord) -> None:
     assert re.search("measured contacts?, in sum", page.text)
 
 
+@pytest.mark.slow
 def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
     lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
@@ -132,12 +133,14 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
     assert [mark["line"].get("color") for mark in marks].count("--bad") == 2 + 12 + 3
 
 
+@pytest.mark.slow
 def test_a_run_that_jammed(record: RunRecord) -> None:
     page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
     assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
     assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
 
 
+@pytest.mark.slow
 def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
     stuck = [
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")

@@ -145,6 +145,7 @@ def test_an_alternating_snake_in_millimetres_has_the_inertia_that_mujoco_reads(t
     np.testing.assert_allclose(hinge_inertia(ours(found, tmp_path)), theirs, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "order", "scenario", "controller"),
     [

@@ -5,7 +5,7 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[1]
 MEMBER = re.compile(r"`(?:\w+\.)*([A-Z]\w+)\.(\w+)(?:\([^`]*\))?`")
 
 
