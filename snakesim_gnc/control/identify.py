@@ -65,10 +65,9 @@ class Identify(Controller[IdentifyParameters]):
     Targets stay within the joint's limits of angle and speed.
     """
 
+    Parameters = IdentifyParameters
     needs_world = False
     required_measurements = ("torque",)
-
-    Parameters = IdentifyParameters
 
     def __init__(self, robot: Description, parameters: IdentifyParameters) -> None:
         super().__init__(robot, parameters)

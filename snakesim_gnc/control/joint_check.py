@@ -42,9 +42,8 @@ class JointCheckParameters(FileStruct, frozen=True):
 class JointCheck(Controller[JointCheckParameters]):
     """Moves each joint away from its nearer limit until its encoder shows the motion, and back; then the other way."""
 
-    needs_world = False
-
     Parameters = JointCheckParameters
+    needs_world = False
 
     def __init__(self, robot: Description, parameters: JointCheckParameters) -> None:
         super().__init__(robot, parameters)

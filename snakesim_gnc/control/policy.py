@@ -107,10 +107,9 @@ class PolicyParameters(FileStruct, frozen=True, kw_only=True):
 class Policy(Controller[PolicyParameters]):
     """Runs the model every `snakesim.frame_skip` ticks, and repeats its targets in between."""
 
+    Parameters = PolicyParameters
     needs_world = False
     uses_sensors = True
-
-    Parameters = PolicyParameters
 
     def __init__(self, robot: Description, parameters: PolicyParameters) -> None:
         """Load the model. Raises ConfigError if it does not fit the robot."""

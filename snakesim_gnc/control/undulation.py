@@ -162,9 +162,8 @@ class CompliantUndulation(HeadSteeredUndulation):
     Source: body-shape compliance, Travers et al. 2018.
     """
 
-    required_measurements = ("torque",)
-
     Parameters = CompliantUndulationParameters
+    required_measurements = ("torque",)
 
     def __init__(self, robot: Description, parameters: CompliantUndulationParameters) -> None:
         super().__init__(robot, parameters)

@@ -4,7 +4,7 @@
 `contacts`    where the path passes obstacles, and which of these places the body covers
 `selection`   the choice of three contacts and a joint
 `stall`       detects that the body stands still, and explains why
-`settings`    the controller's parameters
+`parameters`  the controller's parameters
 `telemetry`   what it reports
 `controller`  combines these; the entry point `obstacle_triplet`
 

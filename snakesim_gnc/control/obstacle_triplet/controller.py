@@ -62,9 +62,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
     Source: section IV of the SnakeSIM paper, with the correction that `statics` describes.
     """
 
+    Parameters = TripletParameters
     required_modes = (Mode.POSITION, Mode.TORQUE)
     required_measurements = ("torque",)
-    Parameters = TripletParameters
 
     def __init__(self, robot: Description, parameters: TripletParameters) -> None:
         super().__init__(robot, parameters)

@@ -172,7 +172,7 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
 
 def change_settings(tab: Tab, run: Running) -> None:
     """Of the controller, while it runs, by typing one into the page."""
-    tab.click("Settings")
+    tab.click("Parameters")
     tab.wait_for("amplitude_rad, rad")
     tab.type("amplitude_rad, rad", "0.4")
     tab.click("Apply")

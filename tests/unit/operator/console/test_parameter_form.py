@@ -1,4 +1,4 @@
-"""The form of a controller's settings, from the schema that control publishes."""
+"""The form of a controller's parameters, from the schema that control publishes."""
 
 import pytest
 
@@ -15,12 +15,12 @@ SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
 VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": true, "names": ["x"]}'
 
 
-def settings(values: str, schema: str) -> ControlParameters:
+def in_force(values: str, schema: str) -> ControlParameters:
     return ControlParameters(tick=0, timestamp_ns=0, controller="any", parameters=values, schema=schema)
 
 
 def test_each_setting_has_an_input_within_its_bounds():
-    push, share, bend, mode, on = list_input_fields(settings(VALUES, SCHEMA))
+    push, share, bend, mode, on = list_input_fields(in_force(VALUES, SCHEMA))
     assert push == InputField("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N")
     assert (share.low, share.high) == (0.0, 1.0)
     assert (bend.low, bend.high) == (-0.8, 0.8)
@@ -29,4 +29,4 @@ def test_each_setting_has_an_input_within_its_bounds():
 
 @pytest.mark.parametrize("schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000])
 def test_a_schema_that_cannot_be_read_gives_no_form(schema: str):
-    assert list_input_fields(settings(VALUES, schema)) == []
+    assert list_input_fields(in_force(VALUES, schema)) == []

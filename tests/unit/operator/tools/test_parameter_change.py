@@ -1,4 +1,4 @@
-"""`change`: new settings of a controller that runs, and of one that cannot go on with them."""
+"""`change`: new parameters of a controller that runs, and of one that cannot go on with them."""
 
 import pytest
 
@@ -28,10 +28,10 @@ WHY = "controller obstacle_triplet (class ObstacleTriplet): update() raised Zero
 
 
 class Control:
-    """The control service as far as its settings go: it reports its state after every request."""
+    """The control service as far as its parameters go: it reports its state after every request."""
 
     def __init__(self, reported: ControlState | None, *, gone: bool = False) -> None:
-        """reported: after a request; None: it is silent. gone: it publishes no settings after it."""
+        """reported: after a request; None: it is silent. gone: it publishes no parameters after it."""
         self._network = LocalNetwork()
         session = self._network.session()
         self._settings = LiveParameters(Client(session, "control"), load("triplet", []).config)
