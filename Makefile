@@ -121,6 +121,7 @@ schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key sp
 	$(bin)/snakesim schemas --write schemas
 	$(bin)/python -m docs.site.kinds_table
 	$(bin)/python -m tests.error_pages
+	$(bin)/python -m tests.configuration_page
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

@@ -61,21 +61,28 @@ def _find_inner_keys(keys: Mapping[str, Key], table: str) -> list[Key]:
 
 def _unknown_key_error(keys: Mapping[str, Key], name: str, full_name: str) -> ConfigError:
     """Return the error for a key that does not exist, with a similar key or those of the same table."""
+    problem = f"--explain {shorten(name)}: there is no such key"
     *parents, last = full_name.split(".")
-    nearest = find_nearest_word(full_name, keys) or find_nearest_word(last, [key.rpartition(".")[2] for key in keys])
-    same_end = [key for key in keys if key.rpartition(".")[2] in (last, nearest)]
-    if same_end:
-        nearest = find_nearest_word(full_name, same_end) or same_end[0]
-    if nearest is not None:
-        return ConfigError(f"--explain {shorten(name)}: there is no such key; did you mean `{nearest}`?")
     while parents and ".".join(parents) not in keys:
         parents.pop()
     table = ".".join(parents)
-    inner = _find_inner_keys(keys, table) if table else [key for key in keys.values() if "." not in key.name]
-    known = ", ".join(key.name for key in inner)
-    return ConfigError(
-        f"--explain {shorten(name)}: there is no such key; known are {shorten(known, MAX_KEYS_IN_ERROR)}"
-    )
+    siblings = _find_inner_keys(keys, table) if table else [key for key in keys.values() if "." not in key.name]
+    nearest = _find_nearest_key(last, siblings) if table else None
+    if nearest is None:
+        nearest = _find_nearest_key(last, list(keys.values()))
+    if nearest is None and not table:
+        nearest = keys.get(find_nearest_word(full_name, keys) or "")
+    if nearest is not None:
+        return ConfigError(f"{problem}; did you mean `{nearest.name}`?")
+    known = ", ".join(key.doc.name for key in siblings)
+    where = f"`{table}` has" if table else "the tables and keys at the top are"
+    return ConfigError(f"{problem}; {where} {shorten(known, MAX_KEYS_IN_ERROR)}")
+
+
+def _find_nearest_key(last_part: str, keys: Sequence[Key]) -> Key | None:
+    """Return the key whose last part is most similar; None if none is similar."""
+    nearest = find_nearest_word(last_part, [key.doc.name for key in keys])
+    return next((key for key in keys if key.doc.name == nearest), None)
 
 
 def _as_json(key: Key, inner_keys: Sequence[Key]) -> dict[str, Any]:

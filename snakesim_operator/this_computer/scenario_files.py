@@ -39,7 +39,7 @@ def print_shipped_files(*, as_json: bool) -> int:
 def show_config(loaded: Loaded, *, as_json: bool) -> int:
     """Print every value of a scenario, and the file or flag that it came from. Raises ConfigError."""
     check_plugins(loaded.config, loaded.table, run_files=False)
-    rows = _find_values(loaded)
+    rows = list_values(loaded)
     if as_json:
         print_json({key: {"value": value, "origin": origin} for key, value, origin in rows})
         return 0
@@ -69,7 +69,7 @@ def _print_unchecked(config: RunConfig) -> None:
             print_line(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
 
 
-def _find_values(loaded: Loaded) -> list[Row]:
+def list_values(loaded: Loaded) -> list[Row]:
     """Return all values of the scenario, with every setting of the chosen controller and backend."""
     config = loaded.config
     table = loaded.table
