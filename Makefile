@@ -64,7 +64,7 @@ again = --last-failed --last-failed-no-failures none
 here = $(bin)/python -m pytest --ignore tests/vcan $(if $(QUICK),-m "not slow") $(ARGS)
 on_vcan = $(bin)/python -m pytest -o cache_dir=build/pytest-vcan tests/vcan tests/contract $(if $(QUICK),-m "not slow") --timeout 900 $(ARGS)
 
-faults: $(stamp) ## Measure the fault table and write docs/faults.md (ARGS="--rows NAME --trials 3")
+faults: $(stamp) ## Measure the fault table and write docs/faults.md and its CSV (ARGS="--rows NAME --trials 3")
 	$(bin)/python -m tests.faults --write $(ARGS)
 
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
