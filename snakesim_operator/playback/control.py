@@ -41,8 +41,8 @@ from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import CONFIG
-from snakesim_operator.results.recording_contents import Contents, read_recording
+from snakesim_operator.results.recording_contents import RecordingContents, read_recording
+from snakesim_operator.results.run_reader import CONFIG
 
 SERVICE_OUTPUTS = {
     "guidance": (keys.WORLD,),
@@ -99,7 +99,7 @@ def same(a: JointCommand, b: JointCommand) -> bool:
     return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (b.arm_session, b.mode, b.target, b.torque_limit_nm)
 
 
-def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
+def config_of(contents: RecordingContents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
     """Return the configuration of a recording, with changes.
 
     Args:
@@ -164,14 +164,14 @@ class Replay:
             ConfigError: The recording cannot be replayed.
         """
         contents = read_recording(path, (keys.DESCRIPTION, keys.CONFIG, keys.CLOCK))
-        self.lacks = contents.lacks
+        self.missing = contents.missing
         self.config = config_of(contents, overrides, run_recorded_code=run_recorded_code)
         self.changed = bool(overrides) and self.config != config_of(contents, [], run_recorded_code=True)
         if contents.description is None:
             raise ConfigError(f"{path}: holds no hal/description")
         self.robot: Description = contents.description
         self.clock_mode = self.config.clock_mode
-        self.stopped = ""  # why it did not reach the end of a recording that lacks something
+        self.stopped = ""  # why it did not reach the end of an incomplete recording
         self.comparison = Comparison()
 
         # What is replayed.
@@ -225,7 +225,7 @@ class Replay:
                 self._replay_messages()
                 self.comparison.ignore_unanswered(self._last_tick)
             except SnakesimError as error:
-                if not self.lacks:
+                if not self.missing:
                     raise
                 self.stopped = str(error)  # a service waits for a message that is lost
                 self.comparison.ignore_after(max(self.comparison.replayed, default=-1))
@@ -368,9 +368,9 @@ def replay_control(
     elif not comparison.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}")
     are_same = _print_comparison(comparison, replay, say)
-    if are_same or replay.changed or replay.lacks:
-        return exit_code(path, replay.lacks)
-    return exit_code(path, replay.lacks, 1)
+    if are_same or replay.changed or replay.missing:
+        return exit_code(path, replay.missing)
+    return exit_code(path, replay.missing, 1)
 
 
 def _print_comparison(comparison: Comparison, replay: Replay, say: PrintLine) -> bool:

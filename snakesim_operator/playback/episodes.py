@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.playback.demonstrations import EPISODES, EpisodeLabel
-from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.pictures import Pictures, read_pictures
 from snakesim_operator.results.metrics.advance import Advance
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import find_recording
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _episodes_of(run: Path, task: str | None, success: bool | None, *, images: b
         reward_m = _reward_m(record, advance)
         if success is None and advance.goal_m is not None:
             success = advance.crossed_s is not None
-    pictures = read_pictures(recording_of(run)) if images else {}
+    pictures = read_pictures(find_recording(run)) if images else {}
     stretches = record.stretches or [np.arange(0)]  # of a run that was never armed: no row
     episodes: list[Episode] = []
     for number, rows in enumerate(stretches):

@@ -31,10 +31,10 @@ from snakesim_operator.playback.lerobot_statistics import (
     join_picture_statistics,
     picture_statistics,
 )
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 VERSION = "v3.0"
-LACKS = "meta/lacks.json"  # of each episode that lacks something; not a file of LeRobot's
+MISSING = "meta/missing.json"  # of each incomplete episode; LeRobot knows no such file
 FILES_A_CHUNK = 1000
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA = f"data/{FILE}"
@@ -162,9 +162,9 @@ class _Dataset:
         for camera, parts in self._picture_statistics.items():
             statistics[IMAGES + camera] = join_picture_statistics(parts)
         self._write_json("meta/stats.json", statistics)
-        lacks = {number: record.lacks for number, record in enumerate(self._records) if record.lacks}
-        if lacks:
-            self._write_json(LACKS, lacks)
+        missing = {number: record.missing for number, record in enumerate(self._records) if record.missing}
+        if missing:
+            self._write_json(MISSING, missing)
         totals = {
             "total_episodes": len(self.rows),
             "total_frames": self.frame_count,

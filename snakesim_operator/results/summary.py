@@ -16,7 +16,7 @@ from snakesim_operator.results.metrics.estimates import Estimates
 from snakesim_operator.results.metrics.force_tracking import force_tracking
 from snakesim_operator.results.metrics.motion import Motion, motion_of
 from snakesim_operator.results.metrics.propulsion import count_hand_overs, propulsion_periods
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
 
@@ -174,7 +174,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
     restarts: Annotated[list[Restart], Meta(description="processes that ended and were restarted")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
-    lacks: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
+    missing: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
     own_arithmetic: Annotated[
         list[str],
         Meta(description="what rounds otherwise than on most computers with NumPy 2.2 to 2.4: then the digest differs"),
@@ -258,7 +258,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         hosts=hosts,
         restarts=list(restarts),
         ended=ended,
-        lacks=record.lacks,
+        missing=record.missing,
         own_arithmetic=find_differing_parts(record.description.arithmetic),
         config=msgspec.to_builtins(config),
     )

@@ -37,8 +37,9 @@ from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.base import extras
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.metrics.advance import GoalWatch
-from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.recording_contents import SERVICE_STREAMS
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, note_reasons, write_results
 from snakesim_operator.run.ending import Ending, interruptible

@@ -25,7 +25,7 @@ from snakesim_hal.programs.preflight import check_plugins
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
-from snakesim_operator.results.record import CONFIG
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import default_folder, locked_folder

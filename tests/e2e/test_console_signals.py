@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
 from tests.browser import CHROMIUM, MISSING, Browser, Tab, chromium

@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from snakesim_hal.run_log.host_record import HOST_RECORD
-from snakesim_operator.results.record import REPORT
+from snakesim_operator.results.run_reader import REPORT
 from tests.e2e.command import SNAKESIM, Ended, background, environment, run_to_summary, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until

@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.e2e.command import armed_run, run_to_summary, snakesim, summary_of
 from tests.harness.wait import wait_until
 

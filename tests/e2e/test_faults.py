@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.e2e.command import armed_run, run_to_summary, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until

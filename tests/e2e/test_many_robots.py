@@ -11,7 +11,7 @@ from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.e2e.test_programs import Lab, lab
 from tests.harness.wait import wait_until
 from tests.whole import command

@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.session_file import read_session
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.e2e.command import SNAKESIM, Ended, environment
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.record import REPORT
+from snakesim_operator.results.run_reader import REPORT
 from tests.e2e.command import TOO_SLOW, armed_run, run_to_summary, summary_of
 
 pytestmark = pytest.mark.e2e

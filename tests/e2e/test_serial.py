@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.harness.command import SNAKESIM, Ended, environment, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until

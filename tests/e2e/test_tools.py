@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.e2e.command import SNAKESIM, Running, armed_run, call, environment, snakesim
 from tests.harness.endpoint import free_endpoint
 from tests.harness.processes import nothing_left

@@ -31,7 +31,7 @@ from snakesim_hal.network.stop_port import REQUEST, open_stop_port, request_stop
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import EstopRequest, Pose
 from snakesim_operator.results.last_run import recall
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.e2e.command import snakesim
 from tests.fuzz.texts import LARGEST, TextMaker
 

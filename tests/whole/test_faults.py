@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.whole.command import run_to_summary, snakesim
 
 MAY_LOSE_ONE = "robot.safety.max_isolated_joints=1"

@@ -8,7 +8,7 @@ import pytest
 from tests.harness.command import snakesim as started
 from tests.whole.command import run_to_summary, snakesim
 
-pytest.importorskip("matplotlib", reason="needs the extra `plot`")
+pytest.importorskip("matplotlib", reason="needs the extra `report`")
 SVG = "{http://www.w3.org/2000/svg}"
 
 

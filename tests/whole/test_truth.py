@@ -8,9 +8,11 @@ from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
-from snakesim_operator.results.record import RECORDING, REPORT, RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT
 from snakesim_operator.results.summary import summarise
 from tests.whole.command import run_to_summary
 

@@ -98,11 +98,11 @@ def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: 
 
     run = RecordedRun(folder)
     log = PageLog()
-    for missing in run.record.lacks:
-        log.write(f"the record lacks {missing}")
+    for missing in run.record.missing:
+        log.write(f"the record is incomplete: {missing}")
     if run.history.image_decimation > 1:
         log.write(f"of {run.history.image_decimation} camera images one is kept")
-    code = exit_code(folder, run.record.lacks)
+    code = exit_code(folder, run.record.missing)
     signals_page = SignalsPage(RecordedSignals(run))
     with serve_pages(listening, print_line, answer_first=signals_page.answer) as (server, address):
         page = Page(server, Surroundings(run.record.config), None, log, recorded=folder.name)

@@ -14,8 +14,8 @@ from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned,
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
 from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_periods
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
+from snakesim_operator.results.run_log import RunRecord
 
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
 MAX_HAND_OVERS_NAMED = 12

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_operator.results.metrics.advance import Advance
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import Interval, end_s, zero_s
 
 RESTING_M = 0.4 * MOVING_M  # so near to where it then stands, a body has come to rest

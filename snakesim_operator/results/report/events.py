@@ -7,11 +7,11 @@ import numpy as np
 
 from snakesim_operator.results.metrics.motion import motion_of
 from snakesim_operator.results.metrics.propulsion import propulsion_periods
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant, balanced_instants, count_unmeasured, instant_at
 from snakesim_operator.results.report.timeline import jam_bands
 from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.results.time_axis import end_s
 

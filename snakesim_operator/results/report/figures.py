@@ -7,7 +7,6 @@ import numpy as np
 from snakesim_operator.results.metrics.motion import MOVING, STANDING, motion_of
 from snakesim_operator.results.metrics.propulsion import Propulsion
 from snakesim_operator.results.page.charts import Bar, Figure, Floats, Line, Mark, bars, joint_map, lines
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import (
     Series,
     commanded_torque_nm,
@@ -16,6 +15,7 @@ from snakesim_operator.results.report.timeline import (
     reference_rad,
     state_bands,
 )
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import SATURATED_FROM, largest
 from snakesim_operator.results.time_axis import end_s, zero_s
 

@@ -16,13 +16,13 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, motion_of
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, element, figure
 from snakesim_operator.results.report.timeline import in_words
 from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view, nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import end_s, zero_s
 
 MessageT = TypeVar("MessageT", ControlState, World)

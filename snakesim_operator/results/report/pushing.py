@@ -11,8 +11,8 @@ from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score
 from snakesim_operator.results.metrics.motion import motion_of
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import longest_reason, state_bands
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import end_s, reported_at_s, reported_spans, zero_s
 
 MAX_OBSTACLES = 24  # that get a row of their own: those with the largest impulse

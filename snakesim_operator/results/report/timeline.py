@@ -10,7 +10,7 @@ from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.metrics.motion import Motion
 from snakesim_operator.results.metrics.propulsion import Propulsion
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import arc_position_m
 from snakesim_operator.results.time_axis import Interval, merge_reports, reported_at_s, reported_spans, zero_s
 

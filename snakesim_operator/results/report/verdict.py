@@ -9,7 +9,6 @@ from snakesim_hal.model.checked import CHECK
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Fault
 from snakesim_operator.results.metrics.motion import Motion, motion_of
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.phrases import (
     MOVED_M,
     as_sentence,
@@ -24,6 +23,7 @@ from snakesim_operator.results.report.phrases import (
 )
 from snakesim_operator.results.report.timeline import longest_reason
 from snakesim_operator.results.run_ending import COMPLETE
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 from snakesim_operator.results.time_axis import end_s, reported_at_s
 

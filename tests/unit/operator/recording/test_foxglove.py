@@ -31,7 +31,7 @@ from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.state_messages import StateMessages
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from tests.unit.hal.rig import description
 from tests.unit.hal.rig import state as joint_state
@@ -237,7 +237,7 @@ def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_image
     whole = shown(tmp_path / "whole.mcap")
     assert count > 500 and len(whole[f"{ROBOT}/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
-    assert len(alone.time_s) > 20 and alone.lacks == [f"recording: before it was copied: {lacks[0]}"]
+    assert len(alone.time_s) > 20 and alone.missing == [f"recording: before it was copied: {lacks[0]}"]
 
 
 def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:

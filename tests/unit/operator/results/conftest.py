@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.unit.operator.results.recorded import triplet
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from snakesim_operator.results.metrics.motion import motion_of
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.verdict import verdict
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import print_summary
 from tests.unit.operator.results.recorded import SECONDS, changed

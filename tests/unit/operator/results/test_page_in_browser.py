@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from tests.browser import CHROMIUM, MISSING, chromium
 from tests.unit.operator.results.recorded import Reader, read
 

@@ -15,7 +15,6 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.metrics.propulsion import propulsion_intervals
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, find_events
 from snakesim_operator.results.report.instants import balanced_instants
@@ -23,6 +22,7 @@ from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
 from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, summarise
 from tests.unit.operator.results.recorded import LOST, SECONDS, Reader, changed, read
 

@@ -15,9 +15,9 @@ from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
 from snakesim_operator.results.metrics.propulsion import propulsion_intervals
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.verdict import Verdict, verdict
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
