@@ -100,7 +100,7 @@ def _record(arguments: argparse.Namespace) -> int:
     if arguments.task is not None:
         raise ConfigError("--task is for --episodes DIR; add it, or leave --task out")
     if arguments.foxglove is not None:
-        extras.require("foxglove", "--foxglove")
+        extras.require("console", "--foxglove")
     from snakesim_operator.playback.record_command import record_robot
 
     return record_robot(
