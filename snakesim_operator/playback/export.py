@@ -19,7 +19,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import PrintLine, escape_invisible
 from snakesim_hal.model.textfiles import exported
 from snakesim_hal.wire.own_sample import find_custom_messages
-from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
+from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.results.missing_data import exit_code
@@ -107,7 +107,7 @@ def export_dataset(
     episodes = read_episodes(runs, task, images=images)
     with exported(path) as partial:
         size = write_lerobot(episodes, partial, write_parquet, fps)
-    for sentence in gaps_in_words(episodes):
+    for sentence in describe_gaps(episodes):
         say(sentence)
     say(f"{size.episodes} episodes, {size.frames} frames: {path}")
     return max(exit_code(episode.record.folder, episode.record.missing) for episode in episodes)

@@ -14,8 +14,8 @@ from snakesim_operator.results.metrics.advance import Advance, body_center_w, en
 from snakesim_operator.results.metrics.effort import Directions, Effort
 from snakesim_operator.results.metrics.estimates import Estimates
 from snakesim_operator.results.metrics.force_tracking import force_tracking
-from snakesim_operator.results.metrics.motion import Motion, motion_of
-from snakesim_operator.results.metrics.propulsion import count_hand_overs, propulsion_periods
+from snakesim_operator.results.metrics.motion import Motion, measure_motion
+from snakesim_operator.results.metrics.propulsion import count_hand_overs, find_propulsion_periods
 from snakesim_operator.results.run_log import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -208,7 +208,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     duration_s = host.ticks * config.period_ns * 1e-9
     path_m, net_m, known_s = _distances(record)
     moved_m = path_m if path_m is not None else net_m
-    motion = motion_of(record)
+    motion = measure_motion(record)
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
     advance = Advance.of(record)
     last_report = record.control[-1] if record.control else None
@@ -269,7 +269,7 @@ def _reported_numbers(record: RunRecord, motion: Motion | None, last_report: Con
     propulsion_joints = None
     hand_overs = None
     if record.control:
-        periods = propulsion_periods(record)
+        periods = find_propulsion_periods(record)
         propulsion_joints = [record.description.joints[period.joint].name for period in periods]
         hand_overs = count_hand_overs(periods)
     last_state, last_reason = last_state_of(motion, last_report)

@@ -67,7 +67,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
         if loss and loss not in missing:
             missing.append(loss)
     _print_end(files, ending, outcome, missing, verdict)
-    last_run.remember(str(files.folder or "no folder"), _describe_ending(ending))
+    last_run.save_last_run(str(files.folder or "no folder"), _describe_ending(ending))
     return _exit_code(ending, host, missing)
 
 

@@ -107,7 +107,7 @@ def simulate(
     """Run a configuration in this process, and return what was recorded.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
-    the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before
+    the run is computed in a child process, so that its digest is the same. `snakesim.use_common_arithmetic()` before
     the first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest
     may be its computer's own (`summary.own_arithmetic`).
 

@@ -13,7 +13,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
-from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_periods
+from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_periods
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
 from snakesim_operator.results.run_log import RunRecord
 
@@ -340,7 +340,7 @@ def _describe_unreported(a: RunRecord, b: RunRecord) -> str:
 
 def _hand_overs_until(record: RunRecord, until_s: float) -> list[Propulsion]:
     """Return the hand-overs within the common time."""
-    return [period for period in propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
+    return [period for period in find_propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
 
 
 def _find_divergence(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:

@@ -8,7 +8,7 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
-from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
 from snakesim_operator.results.page.html import render
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import Event, drawn_instants, find_events, select_listed
@@ -37,7 +37,7 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_
 def page(record: RunRecord, summary: RunSummary) -> str:
     """Return the whole page as HTML."""
     events = find_events(record, summary)
-    all_intervals = propulsion_intervals(record)
+    all_intervals = find_propulsion_intervals(record)
     intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
     joints: list[tuple[int, list[Propulsion]]] = []
     for joint in most_used_joints(intervals):

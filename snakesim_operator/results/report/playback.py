@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, motion_of
+from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, measure_motion
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, element, figure
@@ -60,7 +60,7 @@ def playback(record: RunRecord) -> Playback | None:
     maps, map_numbers = _perceived_maps(record, view, rows)
     paths, path_numbers = _planned_paths(record, view, rows)
     names = [joint.name for joint in record.description.joints]
-    motion = motion_of(record)
+    motion = measure_motion(record)
     captions: list[str] = []
     frames: list[list[Any]] = []
     with_desired = False
@@ -116,7 +116,7 @@ def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -
     reported = "control reported nothing" if state is None else f"{in_words(state.state)}: {state.reason}"
     if motion is None:
         return reported
-    stands = motion.stands_at(time_s)
+    stands = motion.is_stationary_at(time_s)
     measured = STANDING if stands else MOVING
     if state is None or state.reason == STANDING_STILL:  # control's own measure, which looks back for a window
         return measured

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.metrics.propulsion import propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.report import page as report_page
@@ -201,7 +201,7 @@ def test_the_page_says_how_to_repeat_the_run(page: Reader, record: RunRecord) ->
 
 
 def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
-    intervals = propulsion_intervals(record)
+    intervals = find_propulsion_intervals(record)
     assert [one.joint for one in intervals] == list(INTERVALS_S)
     for one in intervals:
         assert (one.start_s, one.end_s) == pytest.approx(INTERVALS_S[one.joint], abs=0.051)
