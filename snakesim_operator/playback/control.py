@@ -39,7 +39,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_operator.playback.play import in_robot_order
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.recording_contents import RecordingContents, read_recording
 from snakesim_operator.results.run_reader import CONFIG
@@ -189,7 +189,7 @@ class Replay:
         self._publishers: dict[str, Publisher[Any]] = {}
         self._loops: list[ServiceLoop] = []
         self._joined = False
-        self._recording = Recording(out, self.config.robot.name) if out is not None else None
+        self._recording = RecordingWriter(out, self.config.robot.name) if out is not None else None
 
         # Commands.
         self._now_ns = 0

@@ -9,7 +9,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import ABOUT, COPIED
+from snakesim_operator.recording.writer import ABOUT, COPIED
 
 FLUSH_BYTES = 4 * 1024 * 1024  # bounds the memory that waiting messages take
 

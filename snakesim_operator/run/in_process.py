@@ -49,7 +49,7 @@ from snakesim_operator.run.run import check_recorder, opened_files
 from snakesim_operator.run.run_files import RunFiles
 
 if TYPE_CHECKING:
-    from snakesim_operator.recording.recording import Recording
+    from snakesim_operator.recording.writer import RecordingWriter
 
 LOG_FILE = "run.log"  # gets what the parts of the run print to stderr
 POLL_TICKS = 50  # between two looks at the progress, the goal and the recording
@@ -283,7 +283,7 @@ def _run_to_end(
 @contextlib.contextmanager
 def _recording(
     session: Session, files: RunFiles, recorded_keys: Iterable[str], shown_as: str | None
-) -> "Iterator[Recording | None]":
+) -> "Iterator[RecordingWriter | None]":
     """Record the messages at these keys for as long as the context lives.
 
     Yields None when there are no keys, or when no file can be created.
@@ -291,9 +291,9 @@ def _recording(
     recording = None
     try:
         if files.folder is not None and recorded_keys:
-            from snakesim_operator.recording.recording import Recording  # needs the extra `record`
+            from snakesim_operator.recording.writer import RecordingWriter  # needs the extra `record`
 
-            recording = Recording(files.folder / RECORDING, shown_as)
+            recording = RecordingWriter(files.folder / RECORDING, shown_as)
             for key in recorded_keys:
                 session.on_latched_arrival(key, recording.write_arrival)
     except OSError as error:

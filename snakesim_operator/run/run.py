@@ -248,7 +248,7 @@ class _RunProcesses:
             self.supervisor.start(name, arguments, may_restart=service.restart)
 
     def _start_recorder(self, folder: Path) -> None:
-        arguments = ["snakesim_operator.recording.process", *self.common_arguments, "--out", str(folder)]
+        arguments = ["snakesim_operator.recording.recorder_process", *self.common_arguments, "--out", str(folder)]
         if self.request.raw_only:
             arguments.append("--raw-only")
         self.supervisor.start(RECORDER, arguments, vital=False)

@@ -17,7 +17,7 @@ from snakesim_hal.wire import keys
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from tests.whole.command import snakesim
@@ -53,7 +53,7 @@ def test_a_run_tells_of_ticks_that_never_came_to_its_recorder(run: Path, tmp_pat
     for file in run.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / RECORDING).unlink()
-    recording = Recording(tmp_path / RECORDING)
+    recording = RecordingWriter(tmp_path / RECORDING)
     for message in RecordingReader(run / RECORDING).read_messages():
         if not 0.5e9 < message.time_ns < 1.5e9:
             recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_ns))

@@ -28,9 +28,9 @@ from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.state_messages import StateMessages
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from tests.unit.hal.rig import description
@@ -221,7 +221,7 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
 def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
     """As one that was killed: test_recording.py kills one."""
     torn = tmp_path / "torn.mcap"
-    recording = Recording(torn, "planar13_camera")
+    recording = RecordingWriter(torn, "planar13_camera")
     for number, one in enumerate(RecordingReader(run / RECORDING).read_messages()):
         recording.write_arrival(Arrival(one.key, one.payload, one.encoding, one.wall_ns))
         if number % 100 == 0:

@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from tests.unit.operator.results.recorded import triplet
+from tests.unit.operator.results.triplet_run import triplet
 
 
 @pytest.fixture(scope="session")

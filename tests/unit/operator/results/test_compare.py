@@ -22,7 +22,7 @@ from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
 from snakesim_operator.results.run_log import RunRecord
-from tests.unit.operator.results.recorded import finished
+from tests.unit.operator.results.triplet_run import finished
 
 JOINTS = 13
 SPEED_M_S = 0.1

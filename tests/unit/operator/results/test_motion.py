@@ -11,7 +11,7 @@ from snakesim_operator.results.report.verdict import verdict
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import print_summary
-from tests.unit.operator.results.recorded import SECONDS, changed
+from tests.unit.operator.results.triplet_run import SECONDS, changed
 
 
 def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:

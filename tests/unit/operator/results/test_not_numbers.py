@@ -21,7 +21,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
 from snakesim_operator.playback.export import arrays
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.compare import page as compare_page
 from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.table import table
@@ -29,7 +29,7 @@ from snakesim_operator.results.report import page
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.results.recorded import Reader, triplet
+from tests.unit.operator.results.triplet_run import Reader, triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST
@@ -76,7 +76,7 @@ def write_record(folder: Path, record: RunRecord) -> None:
 def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int) -> None:
     """A recording with these messages, and the setpoints of so many ticks, of which only the number is read."""
     (folder / RECORDING).unlink(missing_ok=True)
-    recording = Recording(folder / RECORDING)
+    recording = RecordingWriter(folder / RECORDING)
     for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
         message = keys.find_message(key)
         assert message is not None

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_operator.results.run_log import RunRecord
 from tests.browser import CHROMIUM, MISSING, chromium
-from tests.unit.operator.results.recorded import Reader, read
+from tests.unit.operator.results.triplet_run import Reader, read
 
 DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
 OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"

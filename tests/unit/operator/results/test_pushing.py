@@ -10,7 +10,7 @@ from snakesim_operator.results.report.pushing import pushing
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
-from tests.unit.operator.results.recorded import Reader, changed
+from tests.unit.operator.results.triplet_run import Reader, changed
 
 SECONDS = 1.5
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")

@@ -24,7 +24,7 @@ from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.results.recorded import LOST, SECONDS, Reader, changed, read
+from tests.unit.operator.results.triplet_run import LOST, SECONDS, Reader, changed, read
 
 HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
 INTERVALS_S = {9 - k: interval for k, interval in enumerate(itertools.pairwise(HAND_OVERS_S))}  # 9 is joint_10

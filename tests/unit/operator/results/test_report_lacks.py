@@ -21,7 +21,7 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
-from tests.unit.operator.results.recorded import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
+from tests.unit.operator.results.triplet_run import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
 
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 

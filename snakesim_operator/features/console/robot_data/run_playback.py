@@ -24,7 +24,7 @@ CHART_SAMPLES = 200  # in CHART_HISTORY_S
 MessageT = TypeVar("MessageT", ControlState, World, Trajectory)
 
 
-class RecordedRun:
+class RunPlayback:
     """A recorded run, by robot time in s."""
 
     def __init__(self, path: Path) -> None:
