@@ -72,7 +72,7 @@ compiled: .venv/.compiled
 
 pytest = $(bin)/python -m pytest
 
-faults: $(stamp) ## Measure the fault table and write docs/faults.md (ARGS="--rows NAME --trials 3")
+faults: $(stamp) ## Measure the fault table and write docs/faults.md and its CSV (ARGS="--rows NAME --trials 3")
 	$(bin)/python -m verification.faults --write $(ARGS)
 
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed

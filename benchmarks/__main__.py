@@ -79,7 +79,7 @@ def main() -> int:
     say("\n## CAN\n")
     tell_bus(say)
     say("\n## Size\n\n| installed | MB, without SnakeSIM's own | the largest |\n|---|---|---|")
-    for extra in ("", "can", "sim", "record", "report", "console", "evaluate", "all"):
+    for extra in ("", "can", "sim", "record", "report", "console", "train", "all"):
         sizes = install_mb(extra)
         largest = sorted(sizes.items(), key=lambda item: -item[1])[:6]
         listed = ", ".join(f"{name} {size:.0f}" for name, size in largest)

@@ -19,8 +19,8 @@ from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
 from snakesim_operator.results.page.charts import Line, lines
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.run_ending import COMPLETE
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, distance_m
 
 PLAYBACK_PX = 580
@@ -182,7 +182,7 @@ class Result:
             The path of the file.
 
         Raises:
-            ConfigError: The run has no pose, or the extra `video` is not installed.
+            ConfigError: The run has no pose, or the extra `report` is not installed.
         """
         from snakesim_operator.playback.video import film
 
@@ -215,7 +215,7 @@ class Result:
         """The record; if its folder is gone, one whose pages link to no files in the folder."""
         if self.record.folder.exists():
             return self.record
-        return dataclasses.replace(self.record, alone=True)
+        return dataclasses.replace(self.record, config_path=None)
 
     def _figure(self, name: str) -> dict[str, Any]:
         """Return the figure of a signal over time."""

@@ -40,7 +40,7 @@ from snakesim_hal.wire.own_sample import find_message_type
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots
-from snakesim_operator.recording.process import record_to_file
+from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.robot_commands.command import request_while_driving
 from snakesim_operator.robot_commands.parameters import (
     Parameter,

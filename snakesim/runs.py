@@ -15,7 +15,8 @@ from snakesim.result import Result
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, shorten
 from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import Override, RunConfig
-from snakesim_operator.results.record import SUMMARY, RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.in_process import simulate

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pdoc
 
-import snakesim  # before NumPy
+import snakesim
 from snakesim_hal.base.process import child_environment, python_command
 from snakesim_operator.cli import parser
 

@@ -59,10 +59,8 @@ def _train(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from snakesim_operator.base import extras
 
-    for extra in ("train", "gym", "plot", "policy"):
+    for extra in ("train", "gym", "report", "policy"):
         extras.require(extra, "`snakesim train`")
-    if arguments.cluster:
-        extras.require("evaluate", "`snakesim train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import train
     from snakesim_hal.model.drawn import parse_draw

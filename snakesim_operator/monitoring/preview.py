@@ -35,7 +35,7 @@ QUEUED_IMAGES = 4  # a few invalid images do not displace the valid one
 
 def preview(where: RobotSelection, hz: float, width: int) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    extras.require("preview", "`snakesim preview`")
+    extras.require("console", "`snakesim preview`")
     if not MIN_HZ <= hz <= MAX_HZ:
         raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz", code="command/invalid-option")
     if not MIN_WIDTH_PX <= width <= MAX_WIDTH_PX:

@@ -102,7 +102,7 @@ def _record(arguments: argparse.Namespace) -> int:
             "--task is for --episodes DIR; add it, or leave --task out", code="command/conflicting-options"
         )
     if arguments.foxglove is not None:
-        extras.require("foxglove", "--foxglove")
+        extras.require("console", "--foxglove")
     from snakesim_operator.playback.record_command import record_robot
 
     return record_robot(

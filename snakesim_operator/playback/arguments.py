@@ -55,7 +55,7 @@ def _add_replay(commands: Any) -> None:
         "replay",
         help="play a recording on Zenoh, or its sensors into guidance, navigation and control",
         epilog="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed; 1 otherwise. "
-        "3: done, but the recording lacks something.",
+        "3: done, but the recording is incomplete.",
     )
     _add_recording(replay)
     replay.add_argument(
@@ -142,17 +142,17 @@ def _info(arguments: argparse.Namespace) -> int:
 def _report(arguments: argparse.Namespace) -> int:
     from snakesim_hal.model.textfiles import write_text
     from snakesim_operator.results.missing_data import exit_code
-    from snakesim_operator.results.record import REPORT, RunRecord
     from snakesim_operator.results.report import page
-    from snakesim_operator.results.run_ending import ended
+    from snakesim_operator.results.run_log import RunRecord
+    from snakesim_operator.results.run_reader import REPORT
     from snakesim_operator.results.summary import summarise
 
     given: Path = arguments.recording
     record = RunRecord.load(given)
     out = arguments.out or (given / REPORT if given.is_dir() else given.with_suffix(".html"))
-    write_text(out, page(record, summarise(record, ended(record))))
+    write_text(out, page(record, summarise(record, record.ending)))
     print_line(str(out))
-    return exit_code(given, record.lacks)
+    return exit_code(given, record.missing)
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -177,7 +177,7 @@ def _export(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
     if arguments.format in ("parquet", "lerobot"):
-        extras.require("export", f"--format {arguments.format}")
+        extras.require("report", f"--format {arguments.format}")
     from snakesim_operator.playback.export import export, export_dataset
 
     if arguments.format == "lerobot":
@@ -194,10 +194,10 @@ def _export(arguments: argparse.Namespace) -> int:
 def _replay(arguments: argparse.Namespace) -> int:
     from snakesim_hal.model.scenario import Override, parse_set
     from snakesim_operator.playback.control import replay_control
-    from snakesim_operator.playback.info import recording_of
     from snakesim_operator.playback.play import play
+    from snakesim_operator.results.run_reader import find_recording
 
-    path = recording_of(arguments.recording)
+    path = find_recording(arguments.recording)
     if arguments.control:
         overrides = [parse_set(text) for text in arguments.set]
         if arguments.controller is not None:

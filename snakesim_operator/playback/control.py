@@ -39,10 +39,10 @@ from snakesim_hal.wire.messages import (
 from snakesim_operator.playback.play import in_robot_order
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import CONFIG
-from snakesim_operator.results.recording_contents import Contents, read_recording
+from snakesim_operator.results.recording_contents import RecordingContents, read_recording
+from snakesim_operator.results.run_reader import CONFIG
 
 SERVICE_OUTPUTS = {
     "guidance": (keys.WORLD,),
@@ -99,7 +99,7 @@ def same(a: JointCommand, b: JointCommand) -> bool:
     return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (b.arm_session, b.mode, b.target, b.torque_limit_nm)
 
 
-def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
+def config_of(contents: RecordingContents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
     """Return the configuration of a recording, with changes.
 
     Args:
@@ -168,14 +168,14 @@ class Replay:
             ConfigError: The recording cannot be replayed.
         """
         contents = read_recording(path, (keys.DESCRIPTION, keys.CONFIG, keys.CLOCK))
-        self.lacks = contents.lacks
+        self.missing = contents.missing
         self.config = config_of(contents, overrides, run_recorded_code=run_recorded_code)
         self.changed = bool(overrides) and self.config != config_of(contents, [], run_recorded_code=True)
         if contents.description is None:
             raise ConfigError(f"{path}: holds no hal/description", code="recording/missing-data")
         self.robot: Description = contents.description
         self.clock_mode = self.config.clock_mode
-        self.stopped = ""  # why it did not reach the end of a recording that lacks something
+        self.stopped = ""  # why it did not reach the end of an incomplete recording
         self.comparison = Comparison()
 
         # What is replayed.
@@ -193,7 +193,7 @@ class Replay:
         self._publishers: dict[str, Publisher[Any]] = {}
         self._loops: list[ServiceLoop] = []
         self._joined = False
-        self._recording = Recording(out, self.config.robot.name) if out is not None else None
+        self._recording = RecordingWriter(out, self.config.robot.name) if out is not None else None
 
         # Commands.
         self._now_ns = 0
@@ -229,7 +229,7 @@ class Replay:
                 self._replay_messages()
                 self.comparison.ignore_unanswered(self._last_tick)
             except SnakesimError as error:
-                if not self.lacks:
+                if not self.missing:
                     raise
                 self.stopped = str(error)  # a service waits for a message that is lost
                 self.comparison.ignore_after(max(self.comparison.replayed, default=-1))
@@ -377,9 +377,9 @@ def replay_control(
     elif not comparison.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
     are_same = _print_comparison(comparison, replay, say)
-    if are_same or replay.changed or replay.lacks:
-        return exit_code(path, replay.lacks)
-    return exit_code(path, replay.lacks, 1)
+    if are_same or replay.changed or replay.missing:
+        return exit_code(path, replay.missing)
+    return exit_code(path, replay.missing, 1)
 
 
 def _print_comparison(comparison: Comparison, replay: Replay, say: PrintLine) -> bool:

@@ -21,7 +21,7 @@ from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.session import Link
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, only_robot
-from snakesim_operator.recording.process import record_to_file
+from snakesim_operator.recording.recorder_process import record_to_file
 
 EPISODES = "episodes.jsonl"
 SUCCESS_BY_KEY = {"s": True, "f": False, "d": None}  # None: the episode is dropped

@@ -1,4 +1,4 @@
-"""`snakesim info`: what a recording holds, and what it lacks."""
+"""`snakesim info`: what a recording holds, and what is missing in it."""
 
 import contextlib
 import json
@@ -14,17 +14,16 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arithmetic import find_differing_parts, format_digest
-from snakesim_hal.base.errors import ConfigError, WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import ControlParameters, Status
 from snakesim_operator.recording.losses import LossGap
-from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.missing_data import describe_undecodable, exit_code
-from snakesim_operator.results.record import GIVE
-from snakesim_operator.results.recording_contents import ALL, Contents
+from snakesim_operator.results.recording_contents import ALL, RecordingContents
+from snakesim_operator.results.run_reader import find_recording
 from snakesim_operator.robot_commands.parameters import PREFIX, find_changed_parameters
 
 # Published on a change too, so that nothing is missing there.
@@ -61,7 +60,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     file: str
     size_bytes: int
     finished: bool
-    lacks: list[str]
+    missing: list[str]
     gaps: list[LossGap]  # what of it is lost in between, by time and key
     robot: str | None
     backend: str | None
@@ -79,18 +78,10 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     keys: dict[str, dict[str, float]]
 
 
-def recording_of(given: Path) -> Path:
-    """Return the recording of a run's folder, or the file itself. Raises ConfigError if there is none."""
-    path = given / RECORDING if given.is_dir() else given
-    if not path.is_file():
-        raise ConfigError(f"{path}: there is no such recording; {GIVE}", code="file/not-found")
-    return path
-
-
 def inspect_recording(path: Path) -> RecordingInfo:
     """Read a recording once, and describe it. Raises ConfigError for a file that is no recording."""
     reader = RecordingReader(path)
-    contents = Contents(path)
+    contents = RecordingContents(path)
     by_key: dict[str, KeyInfo] = {}
     parameters_in_force: list[ControlParameters] = []
     parameters_decoder = Decoder(ControlParameters)
@@ -113,8 +104,8 @@ def inspect_recording(path: Path) -> RecordingInfo:
         irregular.append(keys.IMU)
     host = None
     if robot is not None and status is not None:
-        host = contents.host(contents.columns(robot))
-    lacks = [
+        host = contents.make_host_record(contents.make_columns(robot))
+    missing = [
         *reader.missing,
         *_describe_skipped(by_key, reader.losses.lost_by_key, irregular),
         *describe_undecodable(contents.refused),
@@ -126,7 +117,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         file=str(path),
         size_bytes=path.stat().st_size,
         finished=reader.finished,
-        lacks=lacks,
+        missing=missing,
         gaps=[gap for gap in reader.losses.gaps if gap.lost],
         robot=None if robot is None else robot.robot,
         backend=None if robot is None else robot.backend,
@@ -191,16 +182,16 @@ def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
 
 def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
     """Print what a recording holds, and return the exit code: 3 if it is incomplete."""
-    info = inspect_recording(recording_of(given))
+    info = inspect_recording(find_recording(given))
     if as_json:
         say(msgspec.json.encode(info).decode())
-        return exit_code(given, info.lacks)
+        return exit_code(given, info.missing)
     say(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
     say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}")
     say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     say(f"  ended     {info.lifecycle or 'unknown'}")
     digest = format_digest(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
-    of_what = " of these ticks alone" if info.lacks else ""
+    of_what = " of these ticks alone" if info.missing else ""
     say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
     for change in info.parameter_changes:
         said = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
@@ -209,9 +200,9 @@ def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]
         say(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
-    for lack in info.lacks:
-        say(f"  lacks: {lack}")
-    return exit_code(given, info.lacks)
+    for sentence in info.missing:
+        say(f"  missing: {sentence}")
+    return exit_code(given, info.missing)
 
 
 def _describe_skipped(by_key: dict[str, KeyInfo], lost: Counter[str], irregular: Sequence[str]) -> list[str]:

@@ -36,7 +36,7 @@ class LiveServer:
         Raises:
             NotConnectedError: The port is in use.
         """
-        import foxglove  # needs the extra `foxglove`
+        import foxglove  # needs the extra `console`
 
         self._channel_type = foxglove.Channel
         self._schema_type = foxglove.Schema

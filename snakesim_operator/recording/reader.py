@@ -20,8 +20,7 @@ from snakesim_hal.wire.keys import find_row_key
 from snakesim_operator.recording.chunks import DamagedError, parse_chunk, parse_record, unpack_chunk
 from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, Losses
 from snakesim_operator.recording.mcap_file import PROFILE
-from snakesim_operator.recording.message import RecordedMessage
-from snakesim_operator.recording.record_search import (
+from snakesim_operator.recording.mcap_records import (
     CUT,
     READ_OPCODES,
     RawRecord,
@@ -29,7 +28,8 @@ from snakesim_operator.recording.record_search import (
     read_record,
     read_summary,
 )
-from snakesim_operator.recording.recording import ABOUT, COPIED
+from snakesim_operator.recording.message import RecordedMessage
+from snakesim_operator.recording.writer import ABOUT, COPIED
 
 LATEST_NS = 2**62  # 146 years: no robot time is later
 NO_SCHEMA = 0  # MCAP's number for a channel without a schema

@@ -67,7 +67,7 @@ def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
 
 def _print_no_robot(where: RobotSelection) -> None:
     """Print how the last run on this computer ended, and how to start another."""
-    last = last_run.recall()
+    last = last_run.read_last_run()
     ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
     print_line(f"no robot answers on {', '.join(where.endpoints())}{ending}")
     print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")

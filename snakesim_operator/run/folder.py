@@ -12,7 +12,7 @@ from snakesim_hal.base.atomic_write import PARTIAL
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY
+from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
 
 LOCK = "run.lock"  # holds the process id of the run that is writing here
 OLDER = ("telemetry.jsonl", "blackbox.npz")  # of older versions

@@ -25,7 +25,7 @@ from snakesim_hal.programs.preflight import check_plugins
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
-from snakesim_operator.results.record import CONFIG
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import default_folder, locked_folder
@@ -252,7 +252,7 @@ class _RunProcesses:
             self.supervisor.start(name, arguments, may_restart=service.restart)
 
     def _start_recorder(self, folder: Path) -> None:
-        arguments = ["snakesim_operator.recording.process", *self.common_arguments, "--out", str(folder)]
+        arguments = ["snakesim_operator.recording.recorder_process", *self.common_arguments, "--out", str(folder)]
         if self.request.raw_only:
             arguments.append("--raw-only")
         self.supervisor.start(RECORDER, arguments, vital=False)

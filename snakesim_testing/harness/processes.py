@@ -10,7 +10,7 @@ SERVICE = re.compile(r"snakesim_hal\.programs\.service_program\0(\w+)\0")
 PROGRAMS = {
     "snakesim_hal.programs.host_program": "host",
     "snakesim_hal.programs.router_program": "router",
-    "snakesim_operator.recording.process": "recorder",
+    "snakesim_operator.recording.recorder_process": "recorder",
     "snakesim_can_backend.emulator": "emulators",
 }
 

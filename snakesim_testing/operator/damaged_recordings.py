@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.recording import mcap_file, recording
+from snakesim_operator.recording import mcap_file, writer
 from snakesim_operator.recording.chunks import HEAD
 from snakesim_operator.run.in_process import simulate
 
@@ -49,7 +49,7 @@ def recorded(out: Path, duration_s: float, chunk_bytes: int) -> Path:
     """A short run, in many small chunks as a long recording has them."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(mcap_file, "CHUNK_BYTES", chunk_bytes)
-        patched.setattr(recording, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
+        patched.setattr(writer, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
         simulate(load("peg_row", [parse_set(f"duration_s={duration_s}")]).config, out)
     return out
 

@@ -12,8 +12,8 @@ import msgspec
 from snakesim_hal.model.scenario import load
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.command import LIMIT_S, SNAKESIM, Ended, Running, call, environment, running, snakesim
 from snakesim_testing.harness.endpoint import free_endpoint

@@ -5,7 +5,7 @@ import io
 from pathlib import Path
 
 from snakesim_operator.cli import main
-from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.runs.command import Ended, Running, summary_of
 

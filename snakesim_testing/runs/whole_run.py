@@ -13,7 +13,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, load_controller
 from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 
 

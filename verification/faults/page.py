@@ -1,141 +1,196 @@
-"""docs/faults.md, made from the raw results."""
+"""Writes the fault table from the raw results: all measurements as CSV, and a page that summarizes them."""
 
-from collections.abc import Iterator
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from verification.faults.results import ROOT, Store
 from verification.faults.row import TRIALS, Result, Row, judge
-from verification.faults.table import HEADINGS, LEASE_MS, PERIOD_MS
+from verification.faults.table import HEADINGS, LEASE_MS, PERIOD_MS, Heading
 
 PAGE = ROOT / "docs" / "faults.md"
-COLUMNS = ("fault", "backend", "expected", "deadline", "median", "worst", "trials", "retried", "result", "recovery")
+TABLE_NAME = "fault-table.csv"  # beside the page
+COLUMNS = (
+    "row",
+    "fault",
+    "backend",
+    "expected",
+    "deadline",
+    "limit",
+    "unit",
+    "median",
+    "worst",
+    "trials",
+    "trials_wanted",
+    "retried",
+    "result",
+    "recovered",
+    "max_step_rad",
+    "max_first_rad",
+    "notes",
+    "when",
+    "took_s",
+    "load_before",
+    "machine",
+)
 
 INTRODUCTION = """\
 # The fault table
 
-Made by `make faults`{when}; do not edit. Raw results of every trial: [`faults.json`](faults.json). One row again:
-`python -m verification.faults --rows NAME --write`.
+`make faults` writes this page{days}; do not edit it. It summarizes
+[fault-table.csv]({table}), which has deadline, median, worst value, recovery, machine and notes of each
+measurement. [faults.json](faults.json) has every trial.
 
-**How.** Each row injects a fault, measures, and asserts, at least 20 times on each backend. The robot is the 13-joint
-snake of the shipped scenario `triplet` at 100 Hz in real time (T = {period:.0f} ms, lease {lease:.0f} ms), with host,
-guidance, navigation and control as processes of their own; `can` is the CAN driver with emulated joint modules on a
-virtual bus, if nothing else is said. The host is the product's own process in every row but those that say so.
+**{met} of {wanted} measurements met**, {failed} not met, {left} not run. A measurement is met if the robot reacted as
+expected within the deadline in its worst trial.
 
-**What the times are.** Upper bounds: from just before the injection until an observer has received the first setpoints
-that are the host's own stop mode (`hal/applied` without a sequence). The observer is a process of its own, with
-real-time priority where the system allows it. The lease counts from the last good command, and is looked at once a
-period; so what must be done within the lease is done at most one period after its end.
-
-**Retried.** How often a trial, or the arming that begins it, was made again because the robot had stopped by itself
-before anything was injected: a machine that is busy, or emulated, misses leases. A dash: measured before this was
-counted.
-
-**Recovery.** After each trial an operator's `clear` and `arm` bring the robot back; a trial counts as recovered when
-the controller's commands are applied again. *Step*: the largest change of an applied angle target from one tick to the
-next in the 0.3 s after it (allowed: the speed limit times T, {speed:.3f} rad, or what keeps the target within
-`max_step_rad` of the measured angle). *First*: the largest distance of a first angle target from the measured angle
-(allowed: `max_step_rad`, {max_step} rad).
-
-**Machines.** {machines}
+Each row injects a fault at least {trials} times on each backend. The robot is the 13-joint snake of the scenario
+`triplet` at 100 Hz in real time (T = {period:.0f} ms, lease {lease:.0f} ms); `can` has emulated joint modules on a
+virtual bus.
 """
+
+EXPLANATION = """\
+* **Times are upper bounds**, from just before the injection until an observer process has received the first setpoints
+  of the host's own stop mode. The host checks the lease once a period.
+* **Recovery.** After each trial an operator resets the fault and arms the robot. `max_step_rad` is the largest change
+  of an angle target in one tick after that, `max_first_rad` the largest distance of a first target from the measured
+  angle (allowed: 0.35 rad).
+* **Retried.** A trial is repeated if the robot had stopped before the injection, as on a busy machine.
+
+Measure one row again with `python -m tests.faults --rows NAME --write`.
+"""
+
+Results = Mapping[tuple[str, str], Result]
 
 
 def write(store: Store, page: Path = PAGE) -> Path:
-    """Write it; returns where."""
-    page.write_text("\n".join(_lines(store.read())) + "\n", encoding="utf-8")
+    """Write the page, and the table beside it. Return the path of the page."""
+    results = store.read()
+    page.with_name(TABLE_NAME).write_text(_format_table(results), encoding="utf-8")
+    page.write_text("\n".join(_page_lines(results)), encoding="utf-8")
     return page
 
 
-def _lines(results: dict[tuple[str, str], Result]) -> Iterator[str]:
-    known = [r for (name, _), r in sorted(results.items())]
-    machines = sorted({result.machine for result in known})
-    days = sorted({result.when.split()[0] for result in known})
+def _page_lines(results: Results) -> Iterator[str]:
+    wanted = [pair for heading in HEADINGS for pair in _measurable(heading)]
+    done = [pair for pair in wanted if _key(pair) in results]
+    met = sum(_is_met(pair, results) for pair in done)
     yield INTRODUCTION.format(
-        when=f", {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "",
+        days=_format_days(list(results.values())),
+        table=TABLE_NAME,
+        met=met,
+        wanted=len(wanted),
+        failed=len(done) - met,
+        left=len(wanted) - len(done),
+        trials=TRIALS,
         period=PERIOD_MS,
         lease=LEASE_MS,
-        speed=7.5 * PERIOD_MS / 1000,
-        max_step=0.35,
-        machines="; ".join(machines) + "." if machines else "None yet.",
     )
-    yield from _summary(results)
+    yield "| fault | expected behavior | met |"
+    yield "|---|---|---|"
     for heading in HEADINGS:
-        yield f"## {heading.fault}\n"
-        yield f"Safe behavior: {heading.expected}. Deadline: {heading.deadline}.\n"
-        yield f"| {' | '.join(COLUMNS)} |"
-        yield f"|{'---|' * len(COLUMNS)}"
+        pairs = _measurable(heading)
+        count = sum(_is_met(pair, results) for pair in pairs)
+        text = f"{count} of {len(pairs)}"
+        if count < len(pairs):
+            text = f"**{text}**"
+        yield f"| {heading.fault} | {heading.expected} | {text} |"
+    yield ""
+    yield EXPLANATION
+
+
+def _format_days(results: Sequence[Result]) -> str:
+    """Return when the results were measured."""
+    days = sorted({result.when.split()[0] for result in results})
+    if not days:
+        return ""
+    if len(days) == 1:
+        return f", measured on {days[0]}"
+    return f", measured from {days[0]} to {days[-1]}"
+
+
+def _measurable(heading: Heading) -> list[tuple[Row, str]]:
+    """Return row and backend of each measurement; a row that does not apply to a backend is left out."""
+    pairs: list[tuple[Row, str]] = []
+    for row in heading.rows:
+        for backend, measure in row.on.items():
+            if not isinstance(measure, str):
+                pairs.append((row, backend))
+    return pairs
+
+
+def _key(pair: tuple[Row, str]) -> tuple[str, str]:
+    row, backend = pair
+    return row.name, backend
+
+
+def _is_met(pair: tuple[Row, str], results: Results) -> bool:
+    result = results.get(_key(pair))
+    return result is not None and judge(pair[0], result).met
+
+
+def _format_table(results: Results) -> str:
+    """Return the table of all measurements as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    for heading in HEADINGS:
         for row in heading.rows:
             for backend, measure in row.on.items():
+                cells: dict[str, object] = {
+                    "row": row.name,
+                    "fault": row.fault,
+                    "backend": "sim and can" if backend == "both" else backend,
+                    "expected": row.expected,
+                    "deadline": row.deadline,
+                    "limit": f"{row.limit:g}",
+                    "unit": row.unit,
+                }
+                result = results.get((row.name, backend))
                 if isinstance(measure, str):
-                    yield _line(row, backend, "-", "-", "-", "-", f"not applicable: {measure}", "-")
+                    cells["result"] = f"not applicable: {measure}"
+                elif result is None:
+                    cells["result"] = "not run"
                 else:
-                    yield _measured(row, backend, results.get((row.name, backend)))
-        yield ""
-        for row in heading.rows:
-            yield from _notes(row, results)
-        yield ""
-    yield from _when(known)
+                    cells |= _measured_cells(row, result)
+                writer.writerow(cells)
+    return text.getvalue()
 
 
-def _summary(results: dict[tuple[str, str], Result]) -> Iterator[str]:
-    wanted = [(row, b) for h in HEADINGS for row in h.rows for b, m in row.on.items() if not isinstance(m, str)]
-    done = [(row, results[row.name, b]) for row, b in wanted if (row.name, b) in results]
-    met = sum(judge(row, result).met for row, result in done)
-    others = f"{len(done) - met} not met, {len(wanted) - len(done)} not run"
-    yield f"**{met} of {len(wanted)} measurements met**, {others}.\n"
-
-
-def _measured(row: Row, backend: str, result: Result | None) -> str:
-    if result is None:
-        return _line(row, backend, "-", "-", "0", "-", "**not run**", "-")
+def _measured_cells(row: Row, result: Result) -> dict[str, object]:
+    """Return the cells of a measurement that was made."""
     verdict = judge(row, result)
-    median = "-" if verdict.median is None else f"{verdict.median:.3g} {row.unit}"
-    worst = "-" if verdict.worst is None else f"{verdict.worst:.3g} {row.unit}"
-    outcome = "met" if verdict.met else f"**not met**: {_escaped(verdict.why[:300])}"
-    trials = str(len(result.trials))
-    trials += "" if len(result.trials) >= max(TRIALS, row.least) else f" of {max(TRIALS, row.least)}"
-    retried = "-" if result.retried is None else str(result.retried)
-    return _line(row, backend, median, worst, trials, retried, outcome, _recovery(result))
+    return {
+        "median": _format_number(verdict.median),
+        "worst": _format_number(verdict.worst),
+        "trials": len(result.trials),
+        "trials_wanted": max(TRIALS, row.least),
+        "retried": result.retried,
+        "result": "met" if verdict.met else f"not met: {verdict.why}",
+        **_recovery_cells(result),
+        "notes": "; ".join(result.notes),
+        "when": result.when,
+        "took_s": f"{result.took_s:.0f}",
+        "load_before": f"{result.load:g}",
+        "machine": result.machine,
+    }
 
 
-def _notes(row: Row, results: dict[tuple[str, str], Result]) -> Iterator[str]:
-    """What belongs beside a row, with the backend where they differ."""
-    said: dict[str, list[str]] = {}
-    for (name, backend), result in sorted(results.items()):
-        if name == row.name:
-            for note in result.notes:
-                said.setdefault(note, []).append(backend)
-    everywhere = sum(name == row.name for name, _ in results)
-    for note, backends in said.items():
-        where = "" if len(backends) == everywhere else f" on {' and '.join(backends)}"
-        yield f"* `{row.name}`{where}: {note}."
-
-
-def _recovery(result: Result) -> str:
+def _recovery_cells(result: Result) -> dict[str, object]:
+    """Return the cells about the recovery; none if there was nothing to recover from."""
     tried = [trial for trial in result.trials if trial.recovered is not None]
     if not tried:
-        return "nothing to recover from"
-    back = sum(trial.recovered is True for trial in tried)
-    steps = [trial.step_rad for trial in tried if trial.step_rad is not None]
-    firsts = [trial.first_rad for trial in tried if trial.first_rad is not None]
-    text = f"{back} of {len(tried)}"
-    return text + (f"; step {max(steps):.3f}, first {max(firsts):.3f} rad" if steps and firsts else "")
+        return {}
+    recovered = sum(trial.recovered is True for trial in tried)
+    steps_rad = [trial.step_rad for trial in tried if trial.step_rad is not None]
+    firsts_rad = [trial.first_rad for trial in tried if trial.first_rad is not None]
+    return {
+        "recovered": f"{recovered} of {len(tried)}",
+        "max_step_rad": _format_number(max(steps_rad, default=None)),
+        "max_first_rad": _format_number(max(firsts_rad, default=None)),
+    }
 
 
-def _line(row: Row, backend: str, *cells: str) -> str:
-    where = "sim and can" if backend == "both" else backend
-    return f"| {' | '.join((f'{row.fault} (`{row.name}`)', where, row.expected, row.deadline, *cells))} |"
-
-
-def _escaped(text: str) -> str:
-    return text.replace("|", "/").replace("\n", " ")
-
-
-def _when(known: list[Result]) -> Iterator[str]:
-    yield "## When each was measured\n"
-    yield "| row | backend | when | took | load before |"
-    yield "|---|---|---|---|---|"
-    for result in sorted(known, key=lambda r: (r.row, r.backend)):
-        yield f"| `{result.row}` | {result.backend} | {result.when} | {result.took_s:.0f} s | {result.load:g} |"
-    if known:
-        yield f"\nNewest measurement: {max(result.when for result in known)}."
+def _format_number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"

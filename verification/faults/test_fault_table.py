@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults.page import PAGE, TABLE_NAME
 from verification.faults.__main__ import main
 from verification.faults.page import write
 from verification.faults.results import Store
@@ -18,6 +19,12 @@ def test_no_row_is_missing_and_every_row_stands_on_both_backends_or_says_why_not
         assert any(not isinstance(measure, str) for measure in row.on.values()), row.name
 
 
+def test_the_page_is_short_and_is_made_of_the_raw_results(tmp_path: Path) -> None:
+    page = write(Store(), tmp_path / "faults.md").read_text()
+    assert page == PAGE.read_text() and len(page.replace("|", "").split()) <= 600
+    assert (tmp_path / TABLE_NAME).read_text() == PAGE.with_name(TABLE_NAME).read_text()
+
+
 @pytest.mark.e2e
 @pytest.mark.slow
 def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
@@ -30,9 +37,10 @@ def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
     silent = results["host_silent", "can"]
     assert [trial.value for trial in silent.trials] == pytest.approx([100.0, 100.0], abs=1.0)
     page = write(Store(raw), tmp_path / "faults.md").read_text()
-    assert "**2 of " in page and "**not run**" in page and "not applicable: " in page
+    table = (tmp_path / "fault-table.csv").read_text()
+    assert "**2 of " in page and "not run" in table and "not applicable: " in table
     for heading in HEADINGS:
-        assert f"## {heading.fault}\n" in page
+        assert f"| {heading.fault} |" in page
 
 
 def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() -> None:

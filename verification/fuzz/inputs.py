@@ -30,8 +30,8 @@ from snakesim_hal.network.router import router_settings
 from snakesim_hal.network.stop_port import REQUEST, open_stop_port, request_stop, serve_stops
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import EstopRequest, Pose
-from snakesim_operator.results.last_run import recall
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.last_run import read_last_run
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.runs.command import snakesim
 from verification.fuzz.texts import LARGEST, TextMaker
 
@@ -246,7 +246,7 @@ def written(folder: Path) -> list[Input]:
         Input("config.json", [config], file("x.json", lambda p: scenario.load(str(p)))),
         Input("router.json5", [files.ROUTER.read_bytes()], file("router.json5", router_settings)),
         Input(ESTOP, [b'{"requester":"a person","tick":7}'], file(ESTOP, latch)),
-        Input(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: recall())),
+        Input(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: read_last_run())),
         Input("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),
     ]
 

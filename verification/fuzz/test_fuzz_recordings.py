@@ -8,7 +8,7 @@ import pytest
 from verification.fuzz.recordings import COMMANDS, DAMAGES, fuzz, table
 
 pytest.importorskip("viser", reason="needs the extra `console`")
-pytest.importorskip("pyarrow", reason="needs the extra `export`")
+pytest.importorskip("pyarrow", reason="needs the extra `report`")
 PEAK_MB, CPU_S = 700, 20.0  # MuJoCo's renderer takes 260 MB; what a bomb may unpack to takes a few seconds
 
 

@@ -201,7 +201,7 @@ def at_work(command: Path, home: Path, **more: str) -> Run:
 def stops_and_arms(snakesim: Run) -> None:
     """Host and controller with a backend from a file, and a person at it."""
     ran = snakesim("run", *WORKBENCH, "--no-record", "--out", "run", "--endpoint", free_endpoint())
-    assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[report]" in ran.out, ran
+    assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[record]" in ran.out, ran
     at = ("--endpoint", free_endpoint())
     stays = threading.Thread(
         target=snakesim,
@@ -253,20 +253,22 @@ def test_what_an_extra_is_for_works_with_that_extra_alone(extra: str, wheel: Pat
     JOBS[extra](snakesim)
 
 
-NEEDS: dict[str, tuple[str, ...]] = {
-    "sim": ("run", "triplet"),
-    "record": ("run", *WORKBENCH),
-    "report": ("report", "run"),
-    "can": ("can", "load", "triplet"),
-    "console": ("console", "run"),
-    "export": ("export", "run", "--format", "parquet"),
-    "evaluate": ("evaluate", "clutter"),
-    "foxglove": ("record", "--foxglove", "0"),
-    "lab": ("deploy", "render", "lab.toml", "--out", "lab"),
-    "preview": ("preview",),
-    "ros2": ("ros2",),
-    "video": ("video", "run", "--out", "film.mp4"),
-}
+NEEDS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("sim", ("run", "triplet")),
+    ("record", ("run", *WORKBENCH)),
+    ("record", ("report", "run")),
+    ("can", ("can", "load", "triplet")),
+    ("serial", ("serial", "scan", "/dev/ttyUSB0")),
+    ("console", ("console", "run")),
+    ("console", ("record", "--foxglove", "0")),
+    ("console", ("preview",)),
+    ("report", ("export", "run", "--format", "parquet")),
+    ("report", ("plot", "run")),
+    ("report", ("video", "run", "--out", "film.mp4")),
+    ("train", ("evaluate", "clutter")),
+    ("lab", ("deploy", "render", "lab.toml", "--out", "lab")),
+    ("ros2", ("ros2",)),
+)
 
 
 @needs_uv
@@ -278,9 +280,10 @@ def test_the_core_alone_drives_a_robot_and_every_command_says_which_extra_it_lac
     assert completed.code == 0 and not completed.err
     stops_and_arms(snakesim)
     with ThreadPoolExecutor(4) as side_by_side:
-        said = dict(zip(NEEDS, side_by_side.map(lambda words: snakesim(*words), NEEDS.values()), strict=True))
-    unsaid = {extra: done for extra, done in said.items() if f"-m pip install 'snakesim[{extra}]'" not in done.err}
-    assert not unsaid and {(done.code, done.err.count("\n")) for done in said.values()} == {(2, 1)}, said
+        said = list(side_by_side.map(lambda need: snakesim(*need[1]), NEEDS))
+    for (extra, words), done in zip(NEEDS, said, strict=True):
+        assert f"-m pip install 'snakesim[{extra}]'" in done.err, (words, done)
+        assert (done.code, done.err.count("\n")) == (2, 1), (words, done)
     assert "--no-record" in snakesim("run", *WORKBENCH).err
 
 

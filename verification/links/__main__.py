@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from verification.links.lab import Lab, lab
 
 PAGE = Path(__file__).parents[2] / "docs" / "lab-links.md"

@@ -19,7 +19,7 @@ from snakesim_hal.network.stop_port import request_stop
 from snakesim_hal.run_log.host_record import HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
-from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.command import running
 from snakesim_testing.harness.processes import parts_of, processes_with

@@ -15,7 +15,7 @@ from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointV
 from snakesim_operator.features.commissioning.measured import COLUMNS, collect_measurements, read_imus, tick_numbers
 from snakesim_operator.features.commissioning.robot_edit import joints_on_drives, must_be_own, write_checked
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from snakesim_operator.features.commissioning.identification import (
 from snakesim_operator.features.commissioning.identified_page import render_page
 from snakesim_operator.features.commissioning.least_squares import Estimate
 from snakesim_operator.features.commissioning.measured import arrange_by_tick, read_imus, tick_numbers
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 PAGE = "identified.html"
 CONTROLLER = "identify"

@@ -239,7 +239,7 @@ def _repeat_option(option: str, values: list[str]) -> list[str]:
 
 
 def _check_extra() -> None:
-    """Raise an error that names the extra `evaluate` if it is not installed."""
+    """Raise an error that names the extra `train` if it is not installed."""
     from snakesim_operator.base import extras
 
-    extras.require("evaluate", "this command")
+    extras.require("train", "this command")

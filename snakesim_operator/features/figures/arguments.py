@@ -16,7 +16,7 @@ def add_commands(commands: Any) -> None:
         "plot",
         help="figures of a run for a paper: signals over time, or those of the SnakeSIM paper",
         epilog="Signals are named as in `snakesim export`. A comma puts several of one unit on one pair of axes: "
-        "angle_rad.joint_7,target.joint_7. Exit code: 0; 2 wrong input; 3 made, but the recording lacks something.",
+        "angle_rad.joint_7,target.joint_7. Exit code: 0; 2 wrong input; 3 made, but the recording is incomplete.",
     )
     plot.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
     plot.add_argument("signals", nargs="*", metavar="SIGNAL", help="a pair of axes each (default: angle_rad torque_nm)")
@@ -35,7 +35,7 @@ def add_commands(commands: Any) -> None:
 def _plot(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
-    extras.require("plot", "`snakesim plot`")
+    extras.require("report", "`snakesim plot`")
     from snakesim_operator.features.figures.inherited import import_matplotlib
 
     import_matplotlib()

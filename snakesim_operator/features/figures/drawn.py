@@ -19,7 +19,7 @@ from snakesim_operator.features.figures.lines import STYLE, Floats, plot_over_ti
 from snakesim_operator.features.figures.paper import draw_paper_figures
 from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import zero_s
 
 FORMATS = (".pdf", ".svg", ".png")
@@ -71,7 +71,7 @@ def plot(
                     f"--out {path}: give a file that ends in {', '.join(FORMATS)}", code="command/invalid-option"
                 )
             write_figure(draw_signals(record, names, width_in, span_s), path)
-    return exit_code(run, record.lacks)
+    return exit_code(run, record.missing)
 
 
 def _write_paper_figures(record: RunRecord, folder: Path, width_in: float, span_s: tuple[float, float]) -> None:

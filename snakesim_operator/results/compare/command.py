@@ -10,7 +10,7 @@ from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 PAGE = "compare.html"
 
@@ -28,7 +28,7 @@ def compare(
         as_json: Print JSON instead of a table.
 
     Returns:
-        The exit code. 1: the distances differ by more than `within_percent`; 3: a record lacks something; else 0.
+        The exit code. 1: the distances differ by more than `within_percent`; 3: a record is incomplete; else 0.
 
     Raises:
         ConfigError: A run cannot be read, the runs cannot be compared, or the page cannot be written.
@@ -62,8 +62,8 @@ def compare(
         if check is not None:
             print_line(check.words)
     code = 0 if check is None or check.holds else 1
-    code_a = exit_code(run_a, difference.a.lacks, code)
-    code_b = exit_code(run_b, difference.b.lacks, code)
+    code_a = exit_code(run_a, difference.a.missing, code)
+    code_b = exit_code(run_b, difference.b.missing, code)
     return max(code_a, code_b)
 
 

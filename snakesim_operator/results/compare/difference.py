@@ -13,9 +13,9 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
-from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_periods
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_periods
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
+from snakesim_operator.results.run_log import RunRecord
 
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
 MAX_HAND_OVERS_NAMED = 12
@@ -347,7 +347,7 @@ def _describe_unreported(a: RunRecord, b: RunRecord) -> str:
 
 def _hand_overs_until(record: RunRecord, until_s: float) -> list[Propulsion]:
     """Return the hand-overs within the common time."""
-    return [period for period in propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
+    return [period for period in find_propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
 
 
 def _find_divergence(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:

@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from snakesim_hal.run_log.host_record import HOST_RECORD
-from snakesim_operator.results.record import REPORT
+from snakesim_operator.results.run_reader import REPORT
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import SNAKESIM, Ended, background, environment, run_to_summary, snakesim

@@ -8,7 +8,7 @@ import pytest
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
-pytest.importorskip("matplotlib", reason="needs the extra `plot`")
+pytest.importorskip("matplotlib", reason="needs the extra `report`")
 SVG = "{http://www.w3.org/2000/svg}"
 
 

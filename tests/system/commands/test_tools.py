@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.processes import nothing_left
 from snakesim_testing.harness.wait import wait_until

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snakesim_operator.features.console.robot_data.recorded_run import RecordedRun
+from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
 from snakesim_operator.features.console.scene.drawing import Surroundings, draw
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -58,7 +58,7 @@ def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) ->
 
 
 def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
-    recorded = RecordedRun(run)
+    recorded = RunPlayback(run)
     record = recorded.record
     begin_s, end_s = recorded.span_s
     assert end_s - begin_s == pytest.approx(0.99, abs=0.03)

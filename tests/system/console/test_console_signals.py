@@ -12,8 +12,8 @@ import pytest
 
 from docs.site.screenshots import recording
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.wait import wait_until

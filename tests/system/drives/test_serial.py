@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snakesim
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until

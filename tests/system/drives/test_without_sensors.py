@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.record import REPORT, RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT
 from snakesim_testing.runs.in_process_command import snakesim
 
 SCRIPT = Path(__file__).parents[3] / "examples" / "without_sensors.py"

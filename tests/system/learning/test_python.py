@@ -219,6 +219,29 @@ def test_importing_it_loads_neither_numpy_nor_a_simulator() -> None:
     assert done.stdout == "[]\n"
 
 
+def test_importing_it_changes_no_environment_variable() -> None:
+    code = "import os; before = dict(os.environ); import snakesim; print(before == dict(os.environ))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    assert done.stdout == "True\n"
+
+
+def test_a_process_computes_as_snakesim_run_does_after_one_call_before_numpy() -> None:
+    code = (
+        "import snakesim; snakesim.use_common_arithmetic()\n"
+        "from snakesim_hal.base.arithmetic import common_environment, is_pinned\n"
+        "import os, numpy; print(common_environment().items() <= os.environ.items(), is_pinned())\n"
+        "snakesim.use_common_arithmetic()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    assert done.stdout == "True True\n"
+
+
+def test_a_call_that_comes_too_late_is_an_error() -> None:
+    code = "import numpy, snakesim\nsnakesim.is_pinned = lambda: False\nsnakesim.use_common_arithmetic()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    assert done.returncode == 1 and "before NumPy is imported" in done.stderr
+
+
 FIRST_EXAMPLES = [("first-controller.md", "Wave"), ("tutorial.md", "Wave"), ("python.md", "wave"), ("python.md", "Nod")]
 
 

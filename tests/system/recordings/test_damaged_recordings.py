@@ -21,7 +21,7 @@ from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.playback.pictures import Pictures
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_testing.operator.damaged_recordings import chunks, flipped, packed, recorded, spans, written
 from snakesim_testing.runs.in_process_command import snakesim
@@ -104,10 +104,10 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
     ended = snakesim(*command, cwd=tmp_path)
     assert ended.code == INCOMPLETE, ended
     said = [line for line in ended.err.splitlines() if "update() took" not in line]  # a busy computer
-    assert len(said) == 1 and said[0].startswith("snakesim: incomplete: a.mcap lacks ")
+    assert len(said) == 1 and said[0].startswith("snakesim: a.mcap is incomplete: ")
     assert ("breaks off at" if damage == "halved" else "actuator/joints") in ended.err
     if "--json" in command:
-        assert json.loads(ended.out)["lacks"]["a"] and not json.loads(ended.out)["lacks"]["b"]
+        assert json.loads(ended.out)["missing"]["a"] and not json.loads(ended.out)["missing"]["b"]
 
 
 def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole: bytes, tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole:
         errors = [line for line in ended.err.splitlines() if "update() took" not in line]  # by a busy computer
         assert ended.code == 0 and not errors, ended
     page = (tmp_path / "a.html").read_text()
-    assert "The run ended early" not in page and "The record lacks" not in page
+    assert "The run ended early" not in page and "The record is incomplete" not in page
     # What repeats the run names a file that can be.
     assert "snakesim run config.json --backend sim" in page and "a.mcap/config.json" not in page
     assert "Save the effective configuration below as <code>config.json</code>" in page
@@ -145,22 +145,22 @@ def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> N
         assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
         rows = list(csv.DictReader(file))
     with np.load(tmp_path / "a.npz") as arrays:
-        assert "its end" in str(arrays["lacks"][0]) and len(arrays["time_s"]) == len(rows) > 20
+        assert "its end" in str(arrays["missing"][0]) and len(arrays["time_s"]) == len(rows) > 20
 
 
 def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form, out in (("parquet", "a.parquet"), ("lerobot", "set")):
         assert snakesim("export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
-    assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.lacks"]
-    assert "its end" in json.loads((tmp_path / "set" / "meta" / "lacks.json").read_text())["0"][0]
+    assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.missing"]
+    assert "its end" in json.loads((tmp_path / "set" / "meta" / "missing.json").read_text())["0"][0]
 
 
 @pytest.mark.parametrize("fps", [None, 50.0])
 def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: Path, fps: float | None) -> None:
     """No frame gets a time that it did not have, and no reward is earned while nothing was recorded."""
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     damaged = chunks(whole)[len(chunks(whole)) // 2]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     (intact,), parts = read_episodes([run], None, images=False), read_episodes([path], None, images=False)
@@ -187,7 +187,7 @@ def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: P
 
 def test_an_episode_after_a_gap_begins_with_a_picture_of_its_own(whole: bytes, tmp_path: Path) -> None:
     """What a camera showed before the gap is not what the robot saw behind it."""
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     damaged = chunks(whole)[len(chunks(whole)) // 2]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     before, after = read_episodes([path], None, images=False)
@@ -220,7 +220,7 @@ def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: byt
     snakesim("report", "a.mcap", cwd=tmp_path)
     page = (tmp_path / "a.html").read_text()
     assert "How the run ended is not known: the recording breaks off after 0." in page and "ended early" not in page
-    assert "The record lacks something. recording: its end" in page
+    assert "The record is incomplete. recording: its end" in page
     compared = snakesim("compare", "whole.mcap", "a.mcap", cwd=tmp_path)
     assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
     assert "in what both records hold: " in compared.out and "for all of their" not in compared.out

@@ -108,7 +108,7 @@ def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
 
 @pytest.mark.slow
 def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     given = ("export", str(demos / "demos"), "--format", "lerobot", "--images")
     refused = snakesim(*given, "--fps", "7", "--out", "no", cwd=tmp_path)
     assert refused.code == 2 and "--fps 7: of a robot at 50 Hz give one of 1, 2, 5, 10" in refused.err

@@ -12,7 +12,7 @@ from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, ParametersRequest
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
 from snakesim_testing.runs.in_process_command import snakesim
 
@@ -25,7 +25,7 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("tuned") / RECORDING
     config = load("peg_row", [parse_set("duration_s=0.6")]).config
     with InProcessRun(config) as run:
-        session, recording = run.network.session(), Recording(path)
+        session, recording = run.network.session(), RecordingWriter(path)
         for row in keys.SPACE:
             session.on_latched_arrival(row.key, recording.write_arrival)
         request = ParametersRequest(

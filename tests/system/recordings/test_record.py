@@ -13,7 +13,8 @@ from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
-from snakesim_operator.results.record import REPORT, RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.processes import nothing_left
 from snakesim_testing.harness.wait import wait_until
@@ -58,7 +59,7 @@ def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Pat
     record, summary = RunRecord.load(tmp_path / "run"), summary_of(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ
     assert summary.ticks == len(record.time_s) and summary.duration_s == pytest.approx(len(record.time_s) / RATE_HZ)
-    assert "host was ended by SIGKILL" in summary.ended and any("last second" in lack for lack in summary.lacks)
+    assert "host was ended by SIGKILL" in summary.ended and any("last second" in lack for lack in summary.missing)
     assert summary.command_digest == record.host.command_digest and record.control
     assert "last second" in (tmp_path / "run" / REPORT).read_text()
 
@@ -223,7 +224,7 @@ def hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", *LONG, "--duration", "4")
     assert ended.code == 0 and "warning:" not in ended.out, ended.out
-    assert summary.wall_s == pytest.approx(4.0, abs=0.1) and summary.overruns < 10 and summary.lacks == []
+    assert summary.wall_s == pytest.approx(4.0, abs=0.1) and summary.overruns < 10 and summary.missing == []
     assert len(RunRecord.load(tmp_path / "run").time_s) == 200 and not hangs.exists()
 
 

@@ -20,7 +20,7 @@ from snakesim_hal.wire.messages import Clock, Description
 from snakesim_operator.playback.play import play
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
@@ -72,7 +72,7 @@ def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_pa
             assert "messages in" in said and beside.wait(20) == 0
             assert said.count("refused a viewer") == 4 and "http://evil.example" in said, said
         assert links == [f"link_{i}" for i in range(14)]
-        assert run.end() == 3, run.said()  # complete, but the record lacks something
+        assert run.end() == 3, run.said()  # complete, but the record is incomplete
     assert run.said().count("warning:") == 1 and "recorder was ended by SIGKILL" in run.said()
     kept = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages([keys.JOINTS]))
     assert len(kept) > 10

@@ -24,11 +24,11 @@ from snakesim_hal.wire.messages import Clock, Description, Done, Intent, OwnSamp
 from snakesim_hal.wire.own_sample import make_message_schema
 from snakesim_hal.wire.quantities import bounded
 from snakesim_operator.recording import tap as tap_module
-from snakesim_operator.recording.process import record_to_file
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.tap import Tap
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_testing.hal.small_robots import PERIOD_NS, description
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.file_size import max_file_size
@@ -48,7 +48,7 @@ def done(tick: int, service: str = "control") -> Arrival:
 
 
 def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
-    recording = Recording(tmp_path / "a.mcap")
+    recording = RecordingWriter(tmp_path / "a.mcap")
     intent = Arrival(
         keys.INTENT, encode(Intent(timestamp_ns=5, requester="anna")), format_encoding(Intent), time.monotonic_ns()
     )
@@ -66,7 +66,7 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
 
 
 def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
-    recording = Recording(tmp_path / "a.mcap")
+    recording = RecordingWriter(tmp_path / "a.mcap")
     for tick in range(50):
         recording.write_arrival(clock(tick))
         if tick in (20, 30):
@@ -89,11 +89,11 @@ def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
 KILLED = """
 import os, sys, time
 from pathlib import Path
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_testing.harness.file_size import max_file_size
 from snakesim_testing.operator.clock_samples import clock
-recording = Recording(Path(sys.argv[1]))
+recording = RecordingWriter(Path(sys.argv[1]))
 for tick in range(10**9):
     recording.write_arrival(clock(tick))
     recording.flush_when_due()
@@ -124,7 +124,7 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
 
 def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: Path) -> None:
     with max_file_size(20_000):
-        recording = Recording(tmp_path / "a.mcap")
+        recording = RecordingWriter(tmp_path / "a.mcap")
         for tick in range(5000):
             recording.write_arrival(clock(tick))
             if tick % 50 == 0:
@@ -199,7 +199,7 @@ def test_a_sample_that_comes_before_the_description_is_kept_with_its_own_schema(
     schema = make_message_schema(Whisker, "test")
     described = encode(msgspec.structs.replace(description(), own={own: schema}))
     robot = Arrival(keys.DESCRIPTION, described, format_encoding(Description), 0)
-    recording = Recording(path)
+    recording = RecordingWriter(path)
     for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):
         recording.write_arrival(arrival)
     recording.close({})

@@ -17,8 +17,8 @@ from snakesim_hal.wire import keys
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.runs.in_process_command import snakesim
 
@@ -38,7 +38,7 @@ def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
         assert np.array_equal(value, getattr(alone, name), equal_nan=True), name
     assert alone.host.command_digest == whole.host.command_digest and alone.config == whole.config
     assert (alone.control, alone.worlds, alone.trajectories) == (whole.control, whole.worlds, whole.trajectories)
-    assert alone.lacks == whole.lacks == []
+    assert alone.missing == whole.missing == []
 
 
 def test_without_a_black_box_for_lack_of_room_the_hosts_numbers_stay(run: Path, tmp_path: Path) -> None:
@@ -46,19 +46,19 @@ def test_without_a_black_box_for_lack_of_room_the_hosts_numbers_stay(run: Path, 
     (tmp_path / RECORDING).write_bytes(content[: len(content) * 2 // 3])
     record = RunRecord.load(tmp_path, host)
     assert 0 < len(record.time_s) < 200 and record.host.command_digest == host.command_digest
-    assert f"{200 - len(record.time_s)} of 200 ticks are missing in the black box" in record.lacks
+    assert f"{200 - len(record.time_s)} of 200 ticks are missing in the black box" in record.missing
 
 
 def test_a_run_tells_of_ticks_that_never_came_to_its_recorder(run: Path, tmp_path: Path) -> None:
     for file in run.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / RECORDING).unlink()
-    recording = Recording(tmp_path / RECORDING)
+    recording = RecordingWriter(tmp_path / RECORDING)
     for message in RecordingReader(run / RECORDING).read_messages():
         if not 0.5e9 < message.time_ns < 1.5e9:
             recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_ns))
     recording.close({})
-    assert RunRecord.load(tmp_path / RECORDING).lacks == []  # nothing in the file itself tells
+    assert RunRecord.load(tmp_path / RECORDING).missing == []  # nothing in the file itself tells
     ended = snakesim("report", ".", cwd=tmp_path)
     said = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
     assert ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text(), ended.err
@@ -74,7 +74,7 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
     content = (run / RECORDING).read_bytes()
     (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
     result = snakesim("info", "torn.mcap", cwd=tmp_path)
-    assert result.code == 3 and "lacks: its end: it breaks off at " in result.out
+    assert result.code == 3 and "missing: its end: it breaks off at " in result.out
 
 
 def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
 
 
 def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     record = RunRecord.load(run)
     ended = snakesim("export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
     assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err

@@ -9,7 +9,7 @@ from snakesim_hal.model.files import list_shipped
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.playback.control import Replay
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 

@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 
 from snakesim_hal.model.scenario import Override, load, parse_set
-from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY
+from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
 from snakesim_operator.run.conclusion import conclude
 from snakesim_operator.run.in_process import LOG_FILE, run_in_process, simulate
 from snakesim_testing.harness.command import SNAKESIM, environment

@@ -11,8 +11,8 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, DepthImage, World
-from snakesim_operator.results.record import CONFIG
-from snakesim_operator.results.record import RunRecord as Record
+from snakesim_operator.results.run_log import RunRecord as Record
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.run.in_process import Result, simulate
 from snakesim_testing.runs.command import run_to_summary
 

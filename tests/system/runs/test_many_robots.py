@@ -11,10 +11,10 @@ from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState
-from snakesim_operator.results.record import RunRecord
-from snakesim_testing.runs.lab_programs import Lab
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
+from snakesim_testing.runs.lab_programs import Lab
 
 pytestmark = pytest.mark.e2e
 

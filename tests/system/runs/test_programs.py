@@ -10,12 +10,15 @@ import pytest
 
 from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.session_file import read_session
-from snakesim_operator.results.record import RunRecord
-from snakesim_testing.runs.command import SNAKESIM, Ended, environment
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.lab_programs import Lab, SCENARIO
+from snakesim_testing.runs.command import Ended
+from snakesim_testing.runs.command import SNAKESIM
+from snakesim_testing.runs.command import environment
+from snakesim_testing.runs.lab_programs import Lab
+from snakesim_testing.runs.lab_programs import SCENARIO
 
 pytestmark = pytest.mark.e2e
 

@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.model.files import SHIPPED
 from snakesim_hal.wire import keys
-from snakesim_operator.results.record import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.recording_contents import read_recording
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import LOG_FILE

@@ -10,7 +10,7 @@ from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest, Status
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.runs.command import running
 from snakesim_testing.harness.processes import nothing_left

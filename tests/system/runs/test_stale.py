@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.record import REPORT, RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.runs.command import Ended, run_to_summary
 

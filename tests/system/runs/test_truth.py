@@ -8,9 +8,11 @@ from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
-from snakesim_operator.results.record import RECORDING, REPORT, RunRecord
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT
 from snakesim_operator.results.summary import summarise
 from snakesim_testing.runs.in_process_command import run_to_summary
 
@@ -47,7 +49,7 @@ def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Pat
     gone = msgspec.structs.replace(last, state="PowerOff", reason="no clock from the HAL")
     before = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages())
     (tmp_path / "run" / RECORDING).unlink()
-    recording = Recording(tmp_path / "run" / RECORDING)
+    recording = RecordingWriter(tmp_path / "run" / RECORDING)
     for reported in before:
         recording.write_arrival(Arrival(reported.key, reported.payload, reported.encoding, reported.wall_ns))
     reported = Arrival(keys.CONTROL_STATE, encode(gone), format_encoding(ControlState), 0)

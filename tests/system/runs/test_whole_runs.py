@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.record import UNRECORDED, RunRecord
 from snakesim_operator.results.report.playback import playback
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import UNRECORDED
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 

@@ -8,7 +8,7 @@ import pytest
 from snakesim_gnc.control.gaits import RaisedHead, Rolling, Sidewinding
 from snakesim_hal.controller import Controller
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import Result, simulate
 from snakesim_testing.gnc.stage import make_stage
 

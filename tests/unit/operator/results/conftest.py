@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.operator.recorded_triplet import triplet
 
 

@@ -21,7 +21,7 @@ from snakesim_operator.results.compare.difference import Difference, differ
 from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.recorded_triplet import finished
 

@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_hal.wire.messages import ControlState, WorldContact
 from snakesim_operator.results.metrics.force_tracking import force_tracking
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 
 EVERY_NS = 50_000_000

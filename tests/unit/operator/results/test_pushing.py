@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set, place_obstacles
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.report.pushing import pushing
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.operator.recorded_triplet import Reader, changed

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.metrics.propulsion import propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, find_events
 from snakesim_operator.results.report.instants import balanced_instants
@@ -23,6 +22,7 @@ from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
 from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, summarise
 from snakesim_testing.operator.recorded_triplet import LOST, SECONDS, Reader, changed, read
 
@@ -201,7 +201,7 @@ def test_the_page_says_how_to_repeat_the_run(page: Reader, record: RunRecord) ->
 
 
 def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
-    intervals = propulsion_intervals(record)
+    intervals = find_propulsion_intervals(record)
     assert [one.joint for one in intervals] == list(INTERVALS_S)
     for one in intervals:
         assert (one.start_s, one.end_s) == pytest.approx(INTERVALS_S[one.joint], abs=0.051)

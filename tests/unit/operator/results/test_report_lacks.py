@@ -14,10 +14,10 @@ from snakesim_hal.model.scenario import Start
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
-from snakesim_operator.results.metrics.propulsion import propulsion_intervals
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.verdict import Verdict, verdict
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
@@ -268,7 +268,7 @@ def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecor
     config_ = msgspec.structs.replace(record.config, scene=scene)
     hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_)
     page = report_page(hurt, summarise(hurt, "complete"))
-    assert propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
+    assert find_propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
     assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page
 
 

@@ -1,8 +1,9 @@
 """The recorder: a process of its own beside a run, or beside any robot. In real time, a robot never waits for it.
 
-`python -m snakesim_operator.recording.process` is the child of `snakesim run`; `snakesim record` calls `record`.
+`python -m snakesim_operator.recording.recorder_process` is the child of `snakesim run`. `snakesim record` calls
+`record_to_file`.
 
-Data flow: Zenoh's threads -> `Tap` (bounded queue) -> `Recorder`, in the main thread -> `Recording` (one file).
+Data flow: Zenoh's threads -> `Tap` (bounded queue) -> `Recorder`, in the main thread -> `RecordingWriter` (one file).
 """
 
 import argparse
@@ -33,8 +34,8 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.recording.message import RAW_ONLY, RECORDING
-from snakesim_operator.recording.recording import Recording, Show
 from snakesim_operator.recording.tap import Tap
+from snakesim_operator.recording.writer import RecordingWriter, Show
 
 CYCLE_S = 0.02
 LAST_MESSAGES_TIMEOUT_S = 2.0  # at the end, for messages that are on their way
@@ -53,7 +54,7 @@ class Recorder:
         self._shown_as = shown_as
         self._show = show
         self._began = datetime.now(UTC)
-        self.recording = Recording(path, shown_as, show)
+        self.recording = RecordingWriter(path, shown_as, show)
 
         # What a new host changes: its description comes, and robot time starts over, in either order.
         self._latched: dict[str, Arrival] = {}  # newest messages that each file begins with, by key
@@ -111,7 +112,7 @@ class Recorder:
         self._host_count += 1
         self.close({})
         self.path.rename(self._find_free_path())
-        self.recording = Recording(self.path, self._shown_as, self._show)
+        self.recording = RecordingWriter(self.path, self._shown_as, self._show)
         for arrival in (*self._latched.values(), clock):
             self.recording.write_arrival(arrival)
 

@@ -15,7 +15,7 @@ from snakesim_operator.features.console.operations import LOG_LINES
 from snakesim_operator.features.console.page_log import StateChangeLog
 from snakesim_operator.features.console.robot_data.message_history import IMAGE_ROWS, MessageHistory
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 MAX_CONTROL_AGE_S = 0.3  # controllers publish more often, so an older message is from before a gap
 CHART_HISTORY_S = 10.0  # shown before an instant that a viewer jumps to
@@ -24,7 +24,7 @@ CHART_SAMPLES = 200  # in CHART_HISTORY_S
 MessageT = TypeVar("MessageT", ControlState, World, Trajectory)
 
 
-class RecordedRun:
+class RunPlayback:
     """A recorded run, by robot time in s."""
 
     def __init__(self, path: Path) -> None:
@@ -37,7 +37,7 @@ class RecordedRun:
             ConfigError: The path is neither.
         """
         self.history = MessageHistory()
-        self.record = RunRecord.load(path, hear=self.history.add)
+        self.record = RunRecord.load(path, on_message=self.history.add)
         self.history.robot = self.record.description
         outputs = (self.record.control, self.record.worlds, self.record.trajectories)
         self._output_times_s = {id(messages): [timestamp_s(message) for message in messages] for messages in outputs}

@@ -14,7 +14,7 @@ from mcap.records import McapRecord
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_operator.recording.chunks import HEAD, MAX_RECORD_BYTES, DamagedError, parse_record, read_chunk_length
-from snakesim_operator.recording.recording import ABOUT
+from snakesim_operator.recording.writer import ABOUT
 
 READ_OPCODES = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
 CUT = "the file ends in the middle of a record"

@@ -36,7 +36,7 @@ COPIED = "lacked_before_copy"  # entry of that record: what the recording lacked
 Show = Callable[[FoxgloveMessage, int], None]  # gets a message for viewers, and its robot time in ns
 
 
-class Recording:
+class RecordingWriter:
     """A file that is being written. A full disk ends it (see `failure`), and raises nothing."""
 
     def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:

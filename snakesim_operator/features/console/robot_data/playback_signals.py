@@ -6,7 +6,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire import keys
-from snakesim_operator.features.console.robot_data.recorded_run import RecordedRun, timestamp_s
+from snakesim_operator.features.console.robot_data.run_playback import RunPlayback, timestamp_s
 from snakesim_operator.features.console.robot_data.signals import (
     PREFIXED_MESSAGES,
     field_of_signal,
@@ -18,12 +18,12 @@ from snakesim_operator.playback.export import table, unit_of
 TimedNumbers = list[tuple[float, dict[str, float]]]  # robot time in s, and numbers by signal
 
 
-class RecordedSignals:
+class PlaybackSignals:
     """The signals of a whole recording."""
 
     recorded = True
 
-    def __init__(self, run: RecordedRun) -> None:
+    def __init__(self, run: RunPlayback) -> None:
         record = run.record
         self._begin_s, _ = run.span_s
         # Signals that are columns of the record.
@@ -36,7 +36,7 @@ class RecordedSignals:
         self._add_messages(run, keys.POWER, list(run.history.iterate_messages(keys.POWER)))
         self._add_messages(run, keys.IMU, list(run.history.iterate_messages(keys.IMU)))
 
-    def _add_messages(self, run: RecordedRun, key: str, messages: list[tuple[float, Any]]) -> None:
+    def _add_messages(self, run: RunPlayback, key: str, messages: list[tuple[float, Any]]) -> None:
         """Add the signals of the messages of one key."""
         robot = run.record.description
         timed_numbers = [(time_s, list_message_numbers(message, robot)) for time_s, message in messages]
