@@ -7,7 +7,7 @@ from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
 from snakesim_gnc.control.policy import Policy
 from snakesim_hal.controller import Controller, NoParameters, require_controller
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 pytest.importorskip("gymnasium")
 from snakesim.environments.assisted import _make_corrected
