@@ -142,7 +142,9 @@ class Controller(ABC, Generic[ParametersT]):
     """
 
     Parameters: ClassVar[type[msgspec.Struct]] = NoParameters
-    """The Struct of the controller's parameters: the scenario's section `[control]`, and `--set control.NAME=VALUE`.
+    """The Struct of the controller's parameters, which a scenario's section `[controllers.NAME]` sets.
+
+    On the command line, `--set control.PARAMETER=VALUE` sets one of them.
 
     Each field needs a type; a default, bounds and a unit are recommended. `snakesim param` changes the values while the
     controller runs. Derive it from `snakesim.Parameters`, which refuses unknown names.
