@@ -27,7 +27,7 @@ class CanEmulatorContext:
     clock_ns: Callable[[], int]  # a steady time, with any origin
 
 
-class CanEmulator(DriveEmulator):
+class CanEmulator(DriveEmulator[Wire]):
     """All drives of a driver type on CAN. In all methods `i` is the index of a drive, from tail to head.
 
     A driver type implements the abstract methods, and `restart` and `on_step` of `DriveEmulator`. The thread that

@@ -1,43 +1,19 @@
 """The backend `moteus`, and `snakesim moteus`, which emulates controllers as a process."""
 
 from collections.abc import Sequence
-from typing import Annotated
 
-from msgspec import Meta
-
-from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
+from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.can_drives.command import run
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured_gains, needed_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
+from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
 ROUNDING = 1.001  # factor: people round the gains that they copy
-
-
-class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
-    """The scenario's `[backends.moteus]` section. `watchdog_s` goes into every command."""
-
-    data_bit_rate: Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})] = 5_000_000
-    """Bit rate of the data of a CAN FD frame."""
-
-    kp_nm_per_turn: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "N·m/turn"})] | None = None
-    """Gain `servo.pid_position.kp` of all controllers, as fractions of which the robot file's gains are sent; none:
-    emulated controllers have the gain that the robot file needs.
-    """
-
-    kd_nm_s_per_turn: Annotated[float, Meta(gt=0, le=1e4, extra_json_schema={"unit": "N·m·s/turn"})] | None = None
-    """Gain `servo.pid_position.kd` of all controllers, as fractions of which the robot file's gains are sent; none:
-    emulated controllers have the gain that the robot file needs.
-    """
-
-    @property
-    def fd_rate(self) -> int | None:
-        """Bit rate of the data on CAN FD."""
-        return self.data_bit_rate
 
 
 class MoteusBackend(CanDriveBackend):

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Generic, Protocol, TypeVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.base.process import on_stop_signal, tune_garbage_collector
@@ -29,14 +29,25 @@ def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callab
         wait(POLL_S)
 
 
-class DriveEmulator(ABC):
+class BusEnd(Protocol):
+    """The drives' end of a bus."""
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+BusEndT = TypeVar("BusEndT", bound=BusEnd)
+
+
+class DriveEmulator(ABC, Generic[BusEndT]):
     """Emulated drives of one type on their body. In all methods `i` is the index of a drive, from tail to head.
 
     A driver type implements the abstract methods. The thread that calls the emulator calls them while it holds the
     lock of the body.
     """
 
-    def __init__(self, body: EmulatedBody, bus_ends: Sequence[Any], clock_ns: Callable[[], int]) -> None:
+    def __init__(self, body: EmulatedBody, bus_ends: Sequence[BusEndT], clock_ns: Callable[[], int]) -> None:
         """Begin to simulate at the present time of the clock.
 
         Args:
@@ -47,7 +58,7 @@ class DriveEmulator(ABC):
         self.body = body
         self._clock_ns = clock_ns
         self._start_ns = clock_ns()
-        self._bus_ends: list[Any] = list({id(end): end for end in bus_ends}.values())  # each once
+        self._bus_ends: list[BusEndT] = list({id(end): end for end in bus_ends}.values())  # each once
         body.add_step_callback(self.on_step)
 
     @abstractmethod

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -21,12 +21,31 @@ STEP_ROUNDING = 0.49  # a step is simulated as soon as all of it but so much has
 POSE_SLACK_US = 1.0  # a pose is captured so long before it is due at the earliest: clocks are rounded
 
 
-def make_physics_model(config: RunConfig, settings: Any, backend: str) -> PhysicsModel:
+class PhysicsSettings(Protocol):
+    """The settings of a backend that concern the physics of its emulated drives."""
+
+    @property
+    def physics_model(self) -> str:
+        """Name of the physics model: an entry point in the group `snakesim.physics_models`."""
+        ...
+
+    @property
+    def physics_model_settings(self) -> dict[str, Any]:
+        """Settings of the physics model, as the scenario has them."""
+        ...
+
+    @property
+    def mounted(self) -> Mapping[str, Mounted]:
+        """How drives are mounted in truth, where that differs from the robot file; by the joint's name."""
+        ...
+
+
+def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: str) -> PhysicsModel:
     """Create the physics model that a backend's settings name, moved by motors as they are in truth.
 
     Args:
         config: The run.
-        settings: The backend's settings, with `physics_model`, `physics_model_settings` and `mounted`.
+        settings: The backend's settings.
         backend: Name of the backend, for messages.
 
     Raises:

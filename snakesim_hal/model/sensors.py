@@ -218,7 +218,8 @@ def _check_range(min_m: float, max_m: float) -> None:
 
 
 AnyMounted = DepthCamera | RangeSensor | CustomSensor
-AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | AnyMounted
+BodySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor
+AnySensor = BodySensor | AnyMounted
 
 
 class Sensors(FileStruct, frozen=True, kw_only=True):

@@ -78,7 +78,7 @@ class EmulatedServo:
         return self.table[at.TORQUE_ENABLE] == 1
 
 
-class EmulatedDynamixel(DriveEmulator):
+class EmulatedDynamixel(DriveEmulator[Pty]):
     """All servos of a robot, at the other end of their ports."""
 
     def __init__(

@@ -15,9 +15,9 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings, require_base_class
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.model.sensors import AnyMounted
+from snakesim_hal.model.sensors import AnyMounted, BodySensor, ContactSensor, ImuSensor, PoseSensor, PowerSensor
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColorImage, Contacts, Imu, Message, OwnSample, Pose, Power
+from snakesim_hal.wire.messages import ColorImage, Message, OwnSample
 from snakesim_sim_backend.sensors.contacts import ContactReader
 from snakesim_sim_backend.sensors.depth import RayCamera
 from snakesim_sim_backend.sensors.imu import ImuReader
@@ -36,30 +36,24 @@ MODELS: dict[str, tuple[type[SensorModel], ...]] = {
 }
 
 
-def _contact_reader(sensor: Any, scope: BodyScope) -> Reader:
-    return ContactReader(scope.sim, scope.data, sensor, scope.noise.standard_normal, scope.physics)
+def make_body_reader(sensor: BodySensor, scope: BodyScope) -> Reader:
+    """Make the reader of a sensor of the body.
 
-
-def _imu_reader(sensor: Any, scope: BodyScope) -> Reader:
-    links = scope.config.robot.chain.modules + 1
-    return ImuReader(scope.data, sensor, links, scope.noise.standard_normal)
-
-
-def _pose_reader(sensor: Any, scope: BodyScope) -> Reader:
-    return PoseReader(scope.data, sensor, scope.noise.standard_normal)
-
-
-def _power_reader(_sensor: Any, scope: BodyScope) -> Reader:
-    return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
-
-
-# Sensors of the body: message -> function that makes the reader.
-SYNCHRONOUS: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
-    Contacts: _contact_reader,
-    Imu: _imu_reader,
-    Pose: _pose_reader,
-    Power: _power_reader,
-}
+    Args:
+        sensor: The entry of the robot file.
+        scope: What the reader may use.
+    """
+    draw_normal = scope.noise.standard_normal
+    match sensor:
+        case ContactSensor():
+            return ContactReader(scope.sim, scope.data, sensor, draw_normal, scope.physics)
+        case ImuSensor():
+            link_count = scope.config.robot.chain.modules + 1
+            return ImuReader(scope.data, sensor, link_count, draw_normal)
+        case PoseSensor():
+            return PoseReader(scope.data, sensor, draw_normal)
+        case PowerSensor():
+            return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
 
 
 def own_noise(key: str, seed: int) -> np.random.Generator:

@@ -10,8 +10,9 @@ from moteus.protocol import parse_message, parse_registers
 
 from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
 from snakesim_can_backend.moteus import protocol
-from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
+from snakesim_can_backend.moteus.backend import MoteusBackend
 from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION, configured_gains
+from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import SafeSetpoints
