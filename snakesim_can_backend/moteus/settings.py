@@ -13,8 +13,6 @@ class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
     data_bit_rate: Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})] = 5_000_000
     """Bit rate of the data of a CAN FD frame."""
 
-    # What all controllers have in `servo.pid_position.kp` and `.kd`; the robot file's gains are sent as shares of them.
-    # Emulated ones have by default what the robot needs.
     kp_nm_per_turn: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "N·m/turn"})] | None = None
     """Gain `servo.pid_position.kp` of all controllers, as fractions of which the robot file's gains are sent; none:
     emulated controllers have the gain that the robot file needs.

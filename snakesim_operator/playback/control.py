@@ -183,7 +183,7 @@ class Replay:
         self._services = [name for name in SERVICE_OUTPUTS if name in self.config.own_services]
         self._output_keys = {key for name in self._services for key in SERVICE_OUTPUTS[name]}
         self._output_keys |= {keys.done_key(name) for name in self._services}
-        clocks: list[tuple[int, Clock]] = sorted(contents.at[keys.CLOCK].items())
+        clocks: list[tuple[int, Clock]] = sorted(contents.messages_by_tick[keys.CLOCK].items())
         self._last_tick = clocks[-1][0] if clocks else -1
         self._epochs = [(tick, clock.lease_epoch) for tick, clock in clocks if clock.lease_epoch]
 

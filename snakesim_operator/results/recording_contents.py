@@ -79,9 +79,9 @@ class RecordingContents:
 
     # Messages of the run.
     streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_STREAMS})
-    at: dict[str, dict[int, Any]] = field(
+    messages_by_tick: dict[str, dict[int, Any]] = field(  # key -> tick -> message
         default_factory=lambda: {key: {} for key in _TICKED}
-    )  # key -> tick -> message
+    )
     custom: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
@@ -123,10 +123,10 @@ class RecordingContents:
                 if isinstance(message, Trajectory):
                     self.searched_nodes[message.tick] = message.searched_nodes
                 kept = self.streams[key]
-                if not kept or _is_news(kept[-1], message):
+                if not kept or _is_kept(kept[-1], message):
                     kept.append(message)
             case _:
-                self.at[key][message.tick] = message
+                self.messages_by_tick[key][message.tick] = message
                 if isinstance(message, Clock) and message.arm_session:
                     self.armed_wall_ns.append(wall_ns)
 
@@ -196,11 +196,11 @@ class RecordingContents:
 
     def _rows(self, joint_count: int) -> list["_Row"]:
         """Return the armed ticks of which joints, setpoints and clock are all known."""
-        joints = self.at[keys.JOINTS]
-        applied = self.at[keys.APPLIED]
-        clocks = self.at[keys.CLOCK]
-        poses = self.at[keys.POSE]
-        contacts = self.at[keys.CONTACTS]
+        joints = self.messages_by_tick[keys.JOINTS]
+        applied = self.messages_by_tick[keys.APPLIED]
+        clocks = self.messages_by_tick[keys.CLOCK]
+        poses = self.messages_by_tick[keys.POSE]
+        contacts = self.messages_by_tick[keys.CONTACTS]
         rows: list[_Row] = []
         pose = [np.nan] * 7
         peak_n = 0.0
@@ -269,7 +269,7 @@ class RecordingContents:
                 f"{self.path}: holds no hal/status, so it is not known what became of the run{why}",
                 code="recording/missing-data",
             )
-        armed = {tick for tick, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
+        armed = {tick for tick, clock in self.messages_by_tick[keys.CLOCK].items() if clock.lifecycle == "armed"}
         wall_s = 0.0
         if self.armed_wall_ns:
             wall_s = (self.armed_wall_ns[-1] - self.armed_wall_ns[0]) * 1e-9
@@ -277,7 +277,7 @@ class RecordingContents:
             ticks=len(columns["tick"]),
             wall_s=wall_s,
             overruns=status.overruns,
-            answered_ticks=len(armed & self.at[keys.JOINT_COMMAND].keys()),
+            answered_ticks=len(armed & self.messages_by_tick[keys.JOINT_COMMAND].keys()),
             armed_ticks=len(armed),
             command_digest=compute_digest(columns),
             state_to_command_us={"p50": None, "p99": None},
@@ -361,7 +361,7 @@ def _count_lost_ticks(reader: "RecordingReader") -> int | None:
     return losses.lost_by_key[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
 
 
-def _is_news(before: Any, message: Any) -> bool:
+def _is_kept(before: Any, message: Any) -> bool:
     """Return whether a message is kept: worlds are thinned, and a path is kept once."""
     match message:
         case World():

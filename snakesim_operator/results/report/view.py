@@ -7,8 +7,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
+from snakesim_operator.results.page.svg import Point
 from snakesim_operator.results.report.instants import Instant
-from snakesim_operator.results.report.svg import Point
 from snakesim_operator.results.run_log import RunRecord
 
 LONGEST_ARROW = 72.0  # of the strongest force, in units of the drawing

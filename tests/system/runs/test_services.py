@@ -61,7 +61,7 @@ def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]
     ended, summary = run(home / out, *SHORT, "--set", NAMED)
     assert ended.code == 0, ended.out + ended.err
     recorded = read_recording(home / out / RECORDING, (keys.POSE, keys.WORLD))
-    assert set(range(50)) <= recorded.at[keys.POSE].keys() and recorded.streams[keys.WORLD]
+    assert set(range(50)) <= recorded.messages_by_tick[keys.POSE].keys() and recorded.streams[keys.WORLD]
     return summary.command_digest
 
 

@@ -145,7 +145,7 @@ def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(page: Reader
     classes = {found for svg in drawings for found in re.findall(r'class="((?:solved|resultant)[^"]*)"', svg)}
     assert {"solved asked shaft", "solved asked head", "resultant asked shaft"} <= classes
     assert not {"solved shaft", "solved head", "resultant shaft", "resultant head"} & classes
-    assert "asked for, and no contact felt there" in pages[1].text
+    assert "desired, but no contact was measured there" in pages[1].text
 
 
 def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(page: Reader) -> None:

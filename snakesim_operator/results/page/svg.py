@@ -1,6 +1,7 @@
-"""SVG by hand, for the snake and its forces: elements with escaped text and finite numbers, and arrows.
+"""Drawings of the snake and its forces as SVG: elements with escaped text and finite numbers, and arrows.
 
-What it looks like stands in figure.css and palette.py; a figure only names classes.
+All drawings on web pages are made here; charts over time are Plotly's (`charts`). On a report, figure.css and
+`palette` say how a class of elements looks. The console's page has no such style sheet, so it passes colors.
 """
 
 import math
@@ -10,6 +11,8 @@ from snakesim_hal.base.terminal import escape_invisible
 
 Point = tuple[float, float]
 Attribute = str | float | int | None
+
+SHAFT_WIDTH = 3.0  # of an arrow that no style sheet draws
 
 
 def number(value: float) -> str:
@@ -39,8 +42,8 @@ def element(name: str, *children: str, **attributes: Attribute) -> str:
     return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
 
 
-def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start") -> str:
-    """Return a line of text. anchor: start, middle or end."""
+def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start", **attributes: Attribute) -> str:
+    """Return a line of text. anchor: start, middle or end. attributes: such as `fill`, where no style sheet has it."""
     return element(
         "text",
         escape(escape_invisible(words), quote=False),
@@ -48,6 +51,7 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
         y=y,
         class_=class_ or None,
         text_anchor=None if anchor == "start" else anchor,
+        **attributes,
     )
 
 
@@ -56,9 +60,9 @@ def title(words: str) -> str:
     return element("title", escape(escape_invisible(words), quote=False))
 
 
-def line(a: Point, b: Point, class_: str) -> str:
-    """Return a straight line."""
-    return element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_)
+def line(a: Point, b: Point, class_: str = "", **attributes: Attribute) -> str:
+    """Return a straight line. attributes: such as `stroke`, where no style sheet has the class."""
+    return element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_ or None, **attributes)
 
 
 def points_text(points: list[Point]) -> str:
@@ -71,13 +75,22 @@ def polyline(points: list[Point], class_: str) -> str:
     return element("polyline", points=points_text(points), class_=class_)
 
 
-def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0) -> str:
-    """Return an arrow of a shaft and a filled head; a dot if it is too short."""
+def arrow(tail: Point, tip: Point, class_: str = "", *, head: float = 9.0, color: str | None = None) -> str:
+    """Return an arrow of a shaft and a filled head; a dot if it is too short.
+
+    Args:
+        tail: Where it begins.
+        tip: Where it ends.
+        class_: Class in the style sheet.
+        head: Maximum length of the head.
+        color: Color, where no style sheet has the class.
+    """
+    stroke_width = None if color is None else SHAFT_WIDTH
     dx = tip[0] - tail[0]
     dy = tip[1] - tail[1]
     length = math.hypot(dx, dy)
     if length < 1.5:
-        return element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head")
+        return element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head", fill=color)
     ux = dx / length
     uy = dy / length
     size = min(head, length / 1.1)
@@ -85,9 +98,8 @@ def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0) -> str:
     wide = 0.38 * size  # half of the head's width
     corners = [tip, (back[0] - uy * wide, back[1] + ux * wide), (back[0] + uy * wide, back[1] - ux * wide)]
     neck = (tip[0] - ux * size * 0.8, tip[1] - uy * size * 0.8)
-    return line(tail, neck, f"{class_} shaft") + element(
-        "polygon", points=points_text(corners), class_=f"{class_} head"
-    )
+    shaft = line(tail, neck, f"{class_} shaft", stroke=color, stroke_width=stroke_width)
+    return shaft + element("polygon", points=points_text(corners), class_=f"{class_} head", fill=color)
 
 
 def figure(width: float, height: float, label: str, *children: str) -> str:
