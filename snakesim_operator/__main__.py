@@ -1,5 +1,6 @@
 """Entry point of the `snakesim` command."""
 
+import errno
 import os
 import sys
 
@@ -45,7 +46,9 @@ def main() -> int:
         from snakesim_operator.cli import main as command
 
         return command()
-    except (MemoryError, ImportError, SystemError) as error:
+    except (MemoryError, ImportError, SystemError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ENOMEM:
+            raise
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if not isinstance(error, MemoryError) and limit == resource.RLIM_INFINITY:  # not for lack of memory
             raise

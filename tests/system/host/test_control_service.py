@@ -76,6 +76,7 @@ def test_a_command_names_the_joint_state_that_it_answers() -> None:
         assert len(named - felt) <= 2  # at the ends of what was heard
 
 
+@pytest.mark.quiet
 def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_leaves_grows_old() -> None:
     limits = {"pose_s": 0.3, "trajectory_s": 0.5}
     with stage(max_age=limits) as made:

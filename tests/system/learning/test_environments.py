@@ -93,7 +93,7 @@ def test_every_number_has_a_name_a_unit_and_bounds() -> None:
 
 @pytest.mark.parametrize(
     "more",
-    [{}, {"set": {"backend": "can"}}, {"set": {"robot": "planar13_camera"}}],
+    [{}, {"set": {"backend": "can"}}, pytest.param({"set": {"robot": "planar13_camera"}}, marks=pytest.mark.slow)],
     ids=["simulator", "emulated modules", "with a camera"],
 )
 def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
@@ -241,6 +241,7 @@ def ctrl_c_raises() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ctrl_c_raises")
 def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
     envs = SnakeVectorEnv(num_envs=2, processes=2, scenario="triplet", frame_skip=600, duration=18)
@@ -376,6 +377,7 @@ def test_without_the_extra_the_import_says_how_to_get_it() -> None:
     assert done.stdout == "core\n" and "pip install 'snakesim[gym]'" in done.stderr, done
 
 
+@pytest.mark.slow
 def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = next(of for of in sections(REPOSITORY / "docs" / "environments.md") if "search.py" in of.files)

@@ -52,6 +52,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_policy(trained: Path, tmp
         assert (out / name).read_bytes() == (trained / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) -> None:
     began = learned_by(str(trained / "policy.onnx"))
     nothing = ("--generations", "1", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.1")
@@ -86,7 +87,7 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
         assert np.allclose(model(seen), policy.targets(seen), atol=1e-5)
 
 
-@pytest.mark.parametrize("backend", ["sim", "can"])
+@pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
 def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, backend: str) -> None:
     name = f"policy:{trained / 'policy.onnx'}"
     run = snakesim.run("surveyed_clutter", controller=name, duration=1, backend=backend)
@@ -107,6 +108,7 @@ def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(
     assert ours == documented
 
 
+@pytest.mark.slow
 def test_the_shipped_policy_crosses_a_field_that_it_was_not_trained_on() -> None:
     given = {"scene.random_field.0.seed": 5400}
     run = snakesim.run("surveyed_clutter", controller="policy:clutter", duration=4, seed=5400, set=given)

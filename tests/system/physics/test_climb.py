@@ -16,6 +16,7 @@ def test_a_whole_snake_climbs_over_a_step(height_m: float) -> None:
     assert (whole.record.mode == Mode.TORQUE.value).any()  # on the level it pushes by torque
 
 
+@pytest.mark.slow
 def test_a_step_that_it_may_not_climb_stops_it() -> None:
     low = ("mission.max_climb_m=0.04", "scene.step.0.position_m=[2.3,0.0]", "control.search_after_s=0.0")
     assert run(configure("mamba_step", *low), duration_s=6.0).moved_m < 1.0

@@ -130,6 +130,7 @@ def test_the_median_error_of_a_push_is_below_15_percent(scenario: str, with_pose
     assert np.median(found.place_m) < 0.04
 
 
+@pytest.mark.slow
 def test_without_imus_three_of_four_pushes_are_still_found() -> None:
     found = score("triplet", "-robot.sensors.imu", "-robot.sensors.contacts", with_pose=False)
     assert len(found.place_m) > 0.75 * len(found.share) > 75

@@ -22,6 +22,7 @@ def test_the_largest_contact_force_is_the_same_within_10_percent_however_hard_th
     assert 10.0 < peaks_n.mean() < 60.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "contact_time_s", [*CONTACT_TIMES_S[::3], *(pytest.param(s, marks=pytest.mark.slow) for s in CONTACT_TIMES_S[1:3])]
 )

@@ -1,5 +1,6 @@
 """`obstacle_aided` and what it pushes off: forces that come true, and no obstacle at all."""
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -12,15 +13,18 @@ ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.peg_friction": 0.3}
 FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
 
 
+slow = partial(pytest.param, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("scenario", "also", "correlation", "error", "empty"),
     [
         ("triplet", {}, 0.9, 0.2, 0.05),
-        ("triplet", {"backend": "can"}, 0.9, 0.2, 0.05),
-        ("peg_row", {}, 0.65, 0.3, 0.05),
-        ("peg_row", {"mission.speed_m_s": 0.1}, 0.9, 0.2, 0.05),
-        ("peg_row", ROUGH, 0.8, 0.23, 0.05),
-        ("surveyed_clutter", FIELD, 0.3, 0.35, 0.15),
+        slow("triplet", {"backend": "can"}, 0.9, 0.2, 0.05),
+        slow("peg_row", {}, 0.65, 0.3, 0.05),
+        slow("peg_row", {"mission.speed_m_s": 0.1}, 0.9, 0.2, 0.05),
+        slow("peg_row", ROUGH, 0.8, 0.23, 0.05),
+        slow("surveyed_clutter", FIELD, 0.3, 0.35, 0.15),
     ],
 )
 def test_what_is_asked_of_obstacles_comes_true_while_the_body_moves(

@@ -31,7 +31,9 @@ def propelled(whole: Run) -> list[int]:
 # --- the case study -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [(), ("seed=2",), pytest.param(("seed=3",), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "noise", [(), *(pytest.param((seed,), marks=pytest.mark.slow) for seed in ("seed=2", "seed=3"))]
+)
 def test_35_newtons_move_the_snake_half_a_metre_in_10_seconds_by_turns_that_pass_backward(noise: tuple[str, ...]):
     whole = triplet(*noise)
     assert whole.record.time_s[-1] <= 10.0
@@ -48,7 +50,7 @@ def test_it_ends_when_the_obstacle_at_the_tail_is_lost():
     assert "2 usable push-points, 3 are needed" in whole.reasons[-1]
 
 
-@pytest.mark.parametrize("what", ["blind", "lost"])
+@pytest.mark.parametrize("what", ["blind", pytest.param("lost", marks=pytest.mark.slow)])
 def test_without_a_world_or_a_trajectory_it_stands_still_and_then_goes_on(what: str):
     gap = range(200, 400)
     blind, lost = (gap, ()) if what == "blind" else ((), gap)
@@ -121,6 +123,7 @@ def test_no_command_jumps_at_a_hand_over():
 # --- triplets that are not neighbors -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clearance_m", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushing(clearance_m: float):
     config = configure("triplet")
@@ -151,6 +154,7 @@ def test_on_a_wave_too_steep_for_neighbours_contacts_further_apart_push():
 # --- the controls: what must not move -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_newtons_are_too_little_and_said_to_be():
     whole = run(configure("triplet", f"{TRIPLET}.propulsion_n=2"))
     assert abs(whole.moved_m) < 0.02
@@ -241,14 +245,16 @@ def test_pegs_that_grip_are_a_jam_too():
 # --- clutter --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [10, pytest.param(14, marks=pytest.mark.slow)])
+@pytest.mark.slow  # a field that is surveyed is crossed below
+@pytest.mark.parametrize("seed", [10, 14])
 def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
     field = (f"scene.random_field.0.seed={seed}", "scene.random_field.0.density_per_m2=12")
     whole = run(configure("surveyed_clutter", *field), duration_s=13.0)
     assert whole.moved_m > 1.5
 
 
-@pytest.mark.parametrize("scale", [pytest.param(0.0, marks=pytest.mark.slow), -1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.0, -1.0])
 def test_in_clutter_without_its_search_for_contacts_nothing_but_the_push_moves_it(scale: float):
     """Neither the paths that are replanned, since it stands, nor a push of the wrong sign, which only shifts it."""
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")

@@ -142,7 +142,10 @@ def momentum_balance(wave: Wave, step_s: float = 0.0005) -> Track:
     return Track(center, axis, step_s, period_s)
 
 
-@pytest.mark.parametrize("wave", random_waves(4))
+FIRST, *OTHERS = random_waves(4)
+
+
+@pytest.mark.parametrize("wave", [FIRST, *(pytest.param(wave, marks=pytest.mark.slow) for wave in OTHERS)])
 def test_a_reversed_wave_drifts_the_other_way_by_as_much(wave: Wave) -> None:
     there, back = swim(wave).drift_mm_s, swim(wave.reversed).drift_mm_s
     assert abs(there + back) < GHOST_MM_S
@@ -176,6 +179,7 @@ def test_a_reflected_snake_goes_the_reflected_way_and_a_turned_one_the_turned_wa
     assert swim(wave, yaw_rad=yaw_rad).center[-1] == pytest.approx([turned.real, turned.imag], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wave",
     [
