@@ -128,7 +128,7 @@ class Command(argparse.ArgumentParser):
         """End the process with one line instead of the whole usage."""
         plain = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
         plain = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain)
-        print_stderr(f"{self.prog}: {plain}; see `{self.prog} --help`")
+        report_error(ConfigError(f"{plain}; see `{self.prog} --help`", code="command/invalid-option"), self.prog)
         sys.exit(BAD_INPUT)
 
 

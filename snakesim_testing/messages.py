@@ -24,6 +24,8 @@ VARYING = (  # parts of texts that differ from run to run
     (re.compile(r"\[::1\]:\d+"), "[::1]:PORT"),
     (re.compile(r"\b([Pp]rocess|pid) \d+"), r"\1 PID"),
     (re.compile(r"0x[0-9a-f]{7,}"), "0xADDRESS"),
+    (re.compile(r"\b(virtual-)?([0-9a-f]{32}|(?<=virtual-)[0-9a-f]{8})\b"), r"\1ID"),
+    (re.compile(r"\((\w+\.py) line \d+\)"), r"(\1 line N)"),
 )
 
 

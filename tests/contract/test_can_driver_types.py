@@ -258,7 +258,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
         emulator._index_of_node.pop((id(emulator.wires[1]), 2))
 
     monkeypatch.setattr(twin_class, "__init__", elsewhere)
-    with raises_error(BackendError, code="backend/failed", field="joint_2"):
+    with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         Robot(robot.driver_type)
 
 
@@ -272,7 +272,7 @@ def test_two_drives_of_one_id_stop_the_robot_and_are_refused_at_the_start_with_b
     assert (fault.what, fault.joint, fault.reach) == ("duplicate_node", "joint_2", "robot")
     assert serials[1] in fault.cause and robot.following() == [False] * JOINTS
     assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "cleared while it is there"
-    with raises_error(BackendError, code="backend/failed"):
+    with raises_error(BackendError, code="drive/not-complete"):
         robot.backend._drives.bring_up()
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
     robot.backend._drives.bring_up()

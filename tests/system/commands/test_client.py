@@ -15,6 +15,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, Status
 from snakesim_operator.playback.info import inspect_recording
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.command import Ended, Running, armed_run, call, environment, running
 from snakesim_testing.runs.documents import REPOSITORY, sections
 
@@ -155,9 +156,9 @@ def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path)
 
 def test_what_is_no_command_is_refused_before_it_is_sent(waiting: Running) -> None:
     with snakesim.Robot.connect(waiting.endpoint) as robot:
-        with pytest.raises(snakesim.ConfigError, match=r"target is \[0.0\], must be 13 finite numbers"):
+        with raises_error(snakesim.ConfigError, code="python/invalid-argument"):
             robot.command([0.0])
-        with pytest.raises(snakesim.ConfigError, match=r"no key 'sensor/joint'.* did you mean `sensor/joints`"):
+        with raises_error(snakesim.ConfigError, code="network/unknown-key", field="sensor/joint"):
             robot.read("sensor/joint")
 
 
@@ -175,16 +176,19 @@ def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(driven: Running
         with robot.record(tmp_path / "live.mcap"):
             robot.wait()
         assert inspect_recording(tmp_path / "live.mcap").robot == "planar13"
-        with pytest.raises(snakesim.ConfigError, match=r"live.mcap: File exists"), robot.record(tmp_path / "live.mcap"):
+        with (
+            raises_error(snakesim.ConfigError, code="file/not-writable", field="live.mcap"),
+            robot.record(tmp_path / "live.mcap"),
+        ):
             pass
-        with pytest.raises(snakesim.RefusedError, match=r"has a controller already; .*services.control.external=true"):
+        with raises_error(snakesim.RefusedError, code="robot/has-controller"):
             robot.arm()
         robot.estop()
         assert robot.wait() and robot.status.lifecycle == "estop"
 
 
 def test_where_there_is_no_robot_it_says_so() -> None:
-    with pytest.raises(snakesim.NotConnectedError, match=r"no robot on tcp/127.0.0.1:9; is its HAL host running"):
+    with raises_error(snakesim.NotConnectedError, code="network/no-robot"):
         snakesim.Robot.connect("tcp/127.0.0.1:9")
-    with pytest.raises(snakesim.ConfigError, match="endpoint"):
+    with raises_error(snakesim.ConfigError, code="network/invalid-address"):
         snakesim.Robot.connect("127.0.0.1")

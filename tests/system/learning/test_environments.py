@@ -23,6 +23,7 @@ from snakesim.environments.rewards import TERMS
 from snakesim_hal.model.drawn import Draw
 from snakesim_hal.model.scenario import write_config
 from snakesim_operator.base.extras import BRINGS
+from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY, sections
 
 IDS = [f"SnakeSIM/{name}-v0" for name in SCENARIOS]
@@ -131,13 +132,13 @@ def test_what_a_lab_does_not_choose_is_drawn_for_each_seed_as_in_an_evaluation()
     assert found[0] == found[2] != found[1] and all(0.1 <= one <= 0.4 for one in found)
     of_suite = Draw(set=["scene.ground.friction"], low=0.1, high=0.4)
     assert found[0] == of_suite.overrides_for_scene(7)[0].value
-    for wrong, why in (
-        ({"scene.ground.frictoin": (0.1, 0.4)}, "did you mean `friction`"),
-        ({"scene.ground.friction": (0.4, 0.1)}, "lowest and the highest"),
-        ({"scene.ground.friction": "0.1"}, "lowest and the highest"),
-        ({"scene.ground.friction": (0.1, 400.0)}, "not allowed"),
+    for wrong, code in (
+        ({"scene.ground.frictoin": (0.1, 0.4)}, "config/unknown-key"),
+        ({"scene.ground.friction": (0.4, 0.1)}, "command/invalid-option"),
+        ({"scene.ground.friction": "0.1"}, "command/invalid-option"),
+        ({"scene.ground.friction": (0.1, 400.0)}, "config/out-of-range"),
     ):
-        with pytest.raises(snakesim.ConfigError, match=why):
+        with raises_error(snakesim.ConfigError, code=code):
             made("surveyed_clutter", draw=wrong)
 
 
@@ -169,7 +170,7 @@ def test_a_robot_that_is_stopped_ends_the_episode_with_the_reason(action: str, f
 
 def test_a_fault_of_what_is_not_there_is_refused() -> None:
     env = made(set={"faults": ["drop:sensor/joints@0.2"]})
-    with pytest.raises(snakesim.ConfigError, match="is one of a key: without a controller"):
+    with raises_error(snakesim.ConfigError, code="injection/not-supported"):
         env.reset(seed=1)
 
 
@@ -220,14 +221,14 @@ def test_many_at_once_are_what_each_is_alone(mode: str | None) -> None:
 
 def test_many_say_what_is_wrong() -> None:
     many: dict[str, Any] = {"num_envs": 2, "duration": 0.1}
-    with pytest.raises(snakesim.ConfigError, match="no scenario called 'triplett'"):
+    with raises_error(snakesim.ConfigError, code="config/unknown-name", field="triplett"):
         gymnasium.make_vec("SnakeSIM/Scenario-v0", scenario="triplett", **many)
     envs = SnakeVectorEnv(scenario="peg_row", flat=False, **many)
     parts, _ = envs.reset(seed=[4, 4])
     assert np.array_equal(parts["angle_rad"][0], parts["angle_rad"][1])
-    with pytest.raises(ValueError, match="actions has 3 rows, must have 2"):
+    with raises_error(ValueError):
         envs.step(np.zeros((3, 13)))
-    with pytest.raises(ValueError, match=r"action\[0\] \(joint_1\) is nan"):
+    with raises_error(ValueError, field="joint_1"):
         envs.step(np.full((2, 13), np.nan))
     envs.step(np.zeros((2, 13)))  # it goes on
     envs.close()
@@ -250,7 +251,7 @@ def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
     threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
     with pytest.raises(KeyboardInterrupt):
         envs.step(still)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="did not finish, so some environments may be a step ahead"):
+    with raises_error(gymnasium.error.ResetNeeded):
         envs.step(still)
     _, at_reset = envs.reset(seed=1)
     _, _, _, _, after = envs.step(still)
@@ -260,19 +261,11 @@ def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
 
 def test_seeds_are_read_as_by_gymnasium() -> None:
     envs = SnakeVectorEnv(num_envs=2, processes=1, scenario="triplet", duration=0.1)
-    wrong: list[tuple[Any, str]] = [
-        (np.int64(0), r"seed is np.int64\(0\): Seed must be a python integer"),
-        (-1, "seed is -1: Seed must be greater or equal to zero"),
-        ([], "seed has 0 entries, must be one number, or 2"),
-        ([1, -2], r"seed\[1\] is -2: Seed must be greater"),
-        ([1, np.int64(2)], r"seed\[1\] is np.int64\(2\): Seed must be a python integer"),
-        ("12", r"seed\[0\] is '1': Seed must be a python integer"),
-        (1.0, "seed is 1.0: Seed must be a python integer"),
-    ]
-    for seed, words in wrong:
-        with pytest.raises((ValueError, gymnasium.error.Error), match=words):
+    wrong: list[Any] = [np.int64(0), -1, [], [1, -2], [1, np.int64(2)], "12", 1.0]
+    for seed in wrong:
+        with raises_error((ValueError, gymnasium.error.Error)):
             envs.reset(seed=seed)
-    with pytest.raises(ValueError, match="reset_mask'] is not supported"):
+    with raises_error(ValueError):
         envs.reset(options={"reset_mask": np.array([True, False])})
     envs.close()
 
@@ -314,54 +307,51 @@ def test_a_picture_of_it() -> None:
 
 
 WRONG = [
-    ({"scenario": "triplett"}, "no scenario called 'triplett'; did you mean `triplet`"),
-    ({"scenario": None}, r"needs scenario=\.\.\."),
-    ({"action": "torqe"}, "action='torqe': did you mean `torque`"),
-    ({"action": "residual:obstacle_aidd"}, "no controller called 'obstacle_aidd' is installed; did you mean"),
-    ({"action": "residual:hold", "safe": False}, "a controller commands through the limiter"),
-    ({"observe": ["angle_rd"]}, "no part 'angle_rd'; did you mean `angle_rad`"),
-    ({"observe": "angle_rad"}, "give a sequence of names"),
-    ({"reward": {"advence": 1}}, "no term 'advence'; did you mean `advance`"),
-    ({"reward": {"advance": "much"}}, r"reward\['advance'\]='much': give a number"),
-    ({"frame_skip": 0}, "frame_skip=0: give a whole number of ticks"),
-    ({"duration": -1}, "duration=-1: `duration_s` = -1 s is not allowed"),
-    ({"set": {"control.lead": 1}}, r"set=\{'control.lead': 1\}: unknown field"),
+    ({"scenario": "triplett"}, "config/unknown-name"),
+    ({"scenario": None}, "python/invalid-argument"),
+    ({"action": "torqe"}, "python/invalid-argument"),
+    ({"action": "residual:obstacle_aidd"}, "plugin/not-found"),
+    ({"action": "residual:hold", "safe": False}, "python/invalid-argument"),
+    ({"observe": ["angle_rd"]}, "policy/invalid"),
+    ({"observe": "angle_rad"}, "policy/invalid"),
+    ({"reward": {"advence": 1}}, "python/invalid-argument"),
+    ({"reward": {"advance": "much"}}, "python/invalid-argument"),
+    ({"frame_skip": 0}, "python/invalid-argument"),
+    ({"duration": -1}, "config/out-of-range"),
+    ({"set": {"control.lead": 1}}, "config/unknown-key"),
 ]
 
 
-@pytest.mark.parametrize(("given", "words"), WRONG, ids=[words for _, words in WRONG])
-def test_wrong_input_is_answered_at_the_call(given: dict[str, Any], words: str) -> None:
-    with pytest.raises(snakesim.ConfigError, match=words):
+@pytest.mark.parametrize(("given", "code"), WRONG)
+def test_wrong_input_is_answered_at_the_call(given: dict[str, Any], code: str) -> None:
+    with raises_error(snakesim.ConfigError, code=code):
         SnakeEnv(**{"scenario": "triplet", **given})
 
 
 @pytest.mark.parametrize(
-    ("action", "words"),
+    "action",
     [
-        (
-            np.zeros(3),
-            r"action has shape \(3,\), must be \(13,\): a position in rad for each joint, joint_1 to joint_13",
-        ),
-        ([0.0] * 12 + [float("nan")], r"action\[12\] \(joint_13\) is nan, must be a finite number of rad"),
-        ("ahead", r"action is 'ahead', must be \(13,\)"),
+        np.zeros(3),
+        [0.0] * 12 + [float("nan")],
+        "ahead",
     ],
 )
-def test_a_wrong_action_is_a_value_error(action: Any, words: str) -> None:
+def test_a_wrong_action_is_a_value_error(action: Any) -> None:
     env = made()
     env.reset(seed=1)
-    with pytest.raises(ValueError, match=words):
+    with raises_error(ValueError):
         env.step(action)
 
 
 def test_an_episode_that_is_over_wants_a_reset() -> None:
     env = made(duration=0.05, render_mode="rgb_array")
     for before_reset in (lambda: env.step(wave(0.0)), env.render):
-        with pytest.raises(gymnasium.error.ResetNeeded, match="there is no robot yet; call reset"):
+        with raises_error(gymnasium.error.ResetNeeded):
             before_reset()
     episode(env)
     env.reset()
     env.step(wave(0.0))
-    with pytest.raises(gymnasium.error.ResetNeeded, match="over"):
+    with raises_error(gymnasium.error.ResetNeeded):
         env.step(wave(0.0))
 
 

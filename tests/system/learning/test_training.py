@@ -15,6 +15,7 @@ from snakesim.training.exported import export, learned_by
 from snakesim.training.form import FORMS, OBSERVE, Policy
 from snakesim_gnc.control.policy import POLICIES, Model
 from snakesim_operator.cli import main, parser
+from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY
 
 DRAW = ("--draw", "scene.ground.friction=0.1:0.4")
@@ -116,7 +117,7 @@ def test_the_shipped_policy_crosses_a_field_that_it_was_not_trained_on() -> None
 
 
 def test_a_policy_of_another_robot_and_one_that_there_is_not_are_refused(trained: Path) -> None:
-    with pytest.raises(snakesim.ConfigError, match=r"policy\.onnx: metadata `snakesim\.\w+` is .*must be"):
+    with raises_error(snakesim.ConfigError, code="policy/invalid", field="policy.onnx"):
         snakesim.run("mamba_flat", controller=f"policy:{trained / 'policy.onnx'}")
-    with pytest.raises(snakesim.ConfigError, match="no policy called 'cluter'"):
+    with raises_error(snakesim.ConfigError, code="config/unknown-name", field="cluter"):
         snakesim.run("surveyed_clutter", controller="policy:cluter")

@@ -15,21 +15,21 @@ GOOD = [
     *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),
     *("tcp/[::1]:7447", "tcp/[fe80::1]:7#iface=eth0", "unixsock-stream/tmp/robot"),
 ]
-WRONG = {
-    "banana": "this is not an endpoint",
-    "": "this is not an endpoint",
-    "127.0.0.1:7447": "this is not an endpoint",
-    "tcp/127.0.0.1": "this is not an endpoint",
-    "tcp/:7447": "this is not an endpoint",
-    "tcp/127.0.0.1:": "this is not an endpoint",
-    "tcp/127.0.0.1:http": "this is not an endpoint",
-    "tcp/127.0.0.1:7447 ": "this is not an endpoint",
-    "tcp/127.0.0.1:7447\n": "this is not an endpoint",
-    "http/127.0.0.1:80": "the protocol is one of tcp",
-    "tcp/127.0.0.1:0": "the port is a number from 1 to 65535",
-    "tcp/127.0.0.1:70000": "the port is a number from 1 to 65535",
-    "x" * 10_000: "this is not an endpoint",
-}
+WRONG = [
+    "banana",
+    "",
+    "127.0.0.1:7447",
+    "tcp/127.0.0.1",
+    "tcp/:7447",
+    "tcp/127.0.0.1:",
+    "tcp/127.0.0.1:http",
+    "tcp/127.0.0.1:7447 ",
+    "tcp/127.0.0.1:7447\n",
+    "http/127.0.0.1:80",
+    "tcp/127.0.0.1:0",
+    "tcp/127.0.0.1:70000",
+    "x" * 10_000,
+]
 
 
 @pytest.mark.parametrize("text", GOOD)
@@ -39,10 +39,9 @@ def test_an_endpoint_is_taken_as_it_is(text: str) -> None:
 
 @pytest.mark.parametrize("text", WRONG)
 def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code="network/invalid-address", field=("--router", "tcp/127.0.0.1:7447")) as caught:
         check_endpoint(text, "--router")
-    said = str(caught.value)
-    assert said.startswith("--router ") and WRONG[text] in said and "tcp/127.0.0.1:7447" in said and len(said) < 400
+    assert len(str(caught.value)) < 400
 
 
 @pytest.mark.parametrize(

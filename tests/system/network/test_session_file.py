@@ -46,31 +46,22 @@ def tokens(session: zenoh.Session) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    "text",
     [
-        ('{connect: {endpoints: ["tcp/10.0.0.1:7447"]}}', '`mode` is missing, must be "client"'),
-        ('{mode: "peer", connect: {endpoints: ["tcp/10.0.0.1:7447"]}}', '`mode` is "peer", must be "client"'),
-        ('{mode: "client"}', "`connect.endpoints` is empty"),
-        ('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:0"]}}', "`connect.endpoints`: tcp/10.0.0.1:0: the port"),
-        (
-            '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, scouting: {gossip: {enabled: true}}}',
-            "`scouting.gossip.enabled` is true, must be false",
-        ),
-        (
-            '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, listen: {endpoints: ["tcp/0.0.0.0:1"]}}',
-            "`listen.endpoints`: a session only connects",
-        ),
-        ('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, namespace: "a b"}', "`namespace`: 'a b'"),
-        ('{mode: "client", connct: {}}', "Zenoh refuses it"),
-        ("{mode: ", "lab.json5"),
+        '{connect: {endpoints: ["tcp/10.0.0.1:7447"]}}',
+        '{mode: "peer", connect: {endpoints: ["tcp/10.0.0.1:7447"]}}',
+        '{mode: "client"}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:0"]}}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, scouting: {gossip: {enabled: true}}}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, listen: {endpoints: ["tcp/0.0.0.0:1"]}}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, namespace: "a b"}',
+        '{mode: "client", connct: {}}',
+        "{mode: ",
     ],
 )
-def test_a_file_that_contradicts_what_every_session_needs_is_refused_by_name(
-    text: str, named: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ConfigError) as refused:
+def test_a_file_that_contradicts_what_every_session_needs_is_refused_by_name(text: str, tmp_path: Path) -> None:
+    with raises_error(ConfigError, code=("network/invalid-address", "network/session-file"), field="lab.json5"):
         read_session(written(tmp_path, text))
-    assert named in str(refused.value) and "lab.json5" in str(refused.value)
 
 
 def test_a_file_for_one_robot_is_no_way_to_another(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from snakesim.training.search import Generation
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.store import write_tables
 from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 FITS_BYTES = 2000  # less than any of these exports takes
@@ -62,6 +63,6 @@ def test_what_searches_and_evaluations_leave_is_whole_or_as_before(
     tmp_path: Path, write: Callable[[Path], object], name: str
 ) -> None:
     (tmp_path / name).write_text("an earlier one")
-    with max_file_size(FITS_BYTES), pytest.raises(ConfigError, match=f"{name}: cannot be written: File too large"):
+    with max_file_size(FITS_BYTES), raises_error(ConfigError, code="file/not-writable", field=name):
         write(tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "an earlier one")]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_testing.messages import Messages
 from snakesim_testing.runs.in_process_command import snakesim
 
 ROBOT = Path("snakesim_hal/shipped/robots/planar13.toml").resolve()
@@ -15,12 +16,13 @@ SCENARIO = Path("snakesim_hal/shipped/scenarios/triplet.toml").resolve()
 
 TABLE = tomllib.loads(Path(__file__).with_name("refusals.toml").read_text())
 RUN = ("run", "--out", "run")
-WRONG: dict[str, tuple[list[str], list[str]]] = {
-    **{name: ([*RUN, "triplet", "--set", flag], words) for name, (flag, *words) in TABLE["set"].items()},
-    **{name: ([*RUN, *typed.split()], words) for name, (typed, *words) in TABLE["arguments"].items()},
-    **{name: (shlex.split(typed), words) for name, (typed, *words) in TABLE["commands"].items()},
-    "50,000 parts": ([*RUN, "triplet", "--set", ".".join("a" * 50_000) + "=1"], ["at most 16 are allowed"]),
+WRONG: dict[str, list[str]] = {
+    **{name: [*RUN, "triplet", "--set", flag] for name, flag in TABLE["set"].items()},
+    **{name: [*RUN, *typed.split()] for name, typed in TABLE["arguments"].items()},
+    **{name: shlex.split(typed) for name, typed in TABLE["commands"].items()},
+    "50,000 parts": [*RUN, "triplet", "--set", ".".join("a" * 50_000) + "=1"],
 }
+CHOICES = r"\(choose from [^)]*\)"  # Python's versions differ in quotes
 HAS_A_LIST = ("too much for the bus", "typo: key")  # in its answer: a line a sum, and a line a key
 
 
@@ -50,13 +52,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_one_clear_error_and_nothing_started(folder: Path, wrong: str) -> None:
-    (typed, words), before = WRONG[wrong], set(folder.iterdir())
-    ended = snakesim(*typed, cwd=folder)
+def test_one_clear_error_and_nothing_started(folder: Path, wrong: str, messages: Messages) -> None:
+    before = set(folder.iterdir())
+    ended = snakesim(*WRONG[wrong], cwd=folder)
     assert ended.code == 2, ended.out + ended.err
     assert ended.out == ""
     assert ended.err.startswith("snakesim") and "Traceback" not in ended.err
     assert ended.err.count("\n") == 1 or wrong in HAS_A_LIST, ended.err
-    for word in words:
-        assert word in ended.err, ended.err
+    messages.check(ended.err.rstrip("\n"), mask=CHOICES)
     assert set(folder.iterdir()) == before

@@ -1,6 +1,5 @@
 """What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
 
-import pytest
 
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.hold import Hold
@@ -11,6 +10,7 @@ from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.hal.small_robots import state
+from snakesim_testing.messages import raises_error
 
 SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 
@@ -32,8 +32,20 @@ def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_comm
 
     config = load("triplet", [parse_set(text) for text in SERVOS]).config
     robot = describe_robot(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
+<<<<<<< ours
     observation = Observation(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
     with pytest.raises(
         ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"
     ):
         GuardedController("pushes", Pushes, robot, NoParameters()).update(observation)  # pyright: ignore[reportArgumentType]
+||||||| base
+    view = View(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
+    with pytest.raises(
+        ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"
+    ):
+        GuardedController("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]
+=======
+    view = View(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
+    with raises_error(ControllerError, code="controller/failed", field="joint_2"):
+        GuardedController("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]
+>>>>>>> theirs

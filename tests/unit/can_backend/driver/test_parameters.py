@@ -55,28 +55,26 @@ def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
 
 
 MISPLACED = {
-    "an id": (JointExceptions(id=25), {}, ["`joints.joint_2.id` = 25", "here 2", "leave `id` out"]),
-    "a port": (JointExceptions(port="can3"), {}, ["joint_2: `port` = 'can3'", "`backends.can.channels`"]),
-    "a zero": (JointExceptions(zero_rad=2.5), {}, ["joint_2: `limits.angle_rad` = 4.07", "at the module's shaft"]),
-    "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}, ["mounted.joint_99", "to joint_13"]),
+    "an id": (JointExceptions(id=25), {}),
+    "a port": (JointExceptions(port="can3"), {}),
+    "a zero": (JointExceptions(zero_rad=2.5), {}),
+    "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}),
     "no emulators": (
         JointExceptions(),
         {"mounted": {"joint_2": Mounted(sign=-1)}, "emulators": "none", "channels": ["can0"]},
-        ["is for emulators"],
     ),
 }
 
 
 @pytest.mark.parametrize("wrong", MISPLACED)
 def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
-    own, given, words = MISPLACED[wrong]
+    own, given = MISPLACED[wrong]
     settings = CanSettings(**given)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code=("bus/invalid-channel", "config/conflict", "drive/unsupported-setting")):
         check_drives(robot, settings)
         check_mounted(robot, "backends.can", settings.mounted, emulators=settings.emulators_run != "none")
         check_ratings(robot)
-    assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
 @pytest.mark.parametrize("tail", [True, False])

