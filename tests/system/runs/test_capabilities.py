@@ -32,20 +32,6 @@ def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_comm
 
     config = load("triplet", [parse_set(text) for text in SERVOS]).config
     robot = describe_robot(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
-<<<<<<< ours
     observation = Observation(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
-    with pytest.raises(
-        ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"
-    ):
-        GuardedController("pushes", Pushes, robot, NoParameters()).update(observation)  # pyright: ignore[reportArgumentType]
-||||||| base
-    view = View(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
-    with pytest.raises(
-        ControllerError, match=r"mode\[1\] is Mode.TORQUE, which joint_2 does not have; it has Mode.PASS"
-    ):
-        GuardedController("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]
-=======
-    view = View(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
     with raises_error(ControllerError, code="controller/failed", field="joint_2"):
-        GuardedController("pushes", Pushes, robot, Hold.Settings()).update(view)  # pyright: ignore[reportArgumentType]
->>>>>>> theirs
+        GuardedController("pushes", Pushes, robot, NoParameters()).update(observation)  # pyright: ignore[reportArgumentType]
