@@ -59,7 +59,7 @@ def host(given: ProcessOptions) -> int:
 
     A simulator that is reset becomes another host, in the same process.
     """
-    if given.arguments.channel is None:
+    if given.arguments.parent_socket is None:
         check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
     if host.ended == "reset":
@@ -125,12 +125,12 @@ def _create_host(
     backend_with_faults, faults = create_host_faults(config, backend, session)
     options = HostOptions(
         # The end of the run.
-        max_ticks=round(config.duration_s * config.rate_hz) if arguments.once else None,
+        max_ticks=round(config.duration_s * config.rate_hz) if arguments.end_after_duration else None,
         end_after_fault_s=arguments.end_after_fault,
         stay=arguments.end_after_fault is None,
         # What connects the host with its surroundings.
         latch=EstopLatch(folder),
-        starter=HostEnd.from_descriptor(arguments.channel),
+        starter=HostEnd.from_descriptor(arguments.parent_socket),
         realtime_warnings=realtime_warnings,
         # The robot.
         faults=faults,

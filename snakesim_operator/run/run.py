@@ -227,7 +227,7 @@ class _RunProcesses:
 
     def _start_host(self) -> None:
         arguments = ["snakesim_hal.programs.host_program", *self._scenario, *self._listening]
-        arguments += ["--once", "--memory", self.supervisor.memory]
+        arguments += ["--end-after-duration", "--memory", self.supervisor.memory]
         if self.request.router is not None or self.request.with_router:
             arguments += ["--router", self.link.endpoint]
         else:

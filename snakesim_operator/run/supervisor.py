@@ -133,7 +133,7 @@ class Supervisor:
         supervisor_end, host_end = socket_pair()
         with host_end:
             inherits = (host_end.fileno(), self._stop_port.fileno())
-            private = ["--channel", str(inherits[0]), "--stop-port", str(inherits[1])]
+            private = ["--parent-socket", str(inherits[0]), "--stop-port", str(inherits[1])]
             child = children.start_child(HOST, [*arguments, *private], keep, inherits=inherits, more=self._secret)
         if self.host is not None:
             self.host.close()

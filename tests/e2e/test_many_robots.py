@@ -70,7 +70,7 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
         path = lab.folder / f"{robot}.toml"
         path.write_text(SCENARIO.format(robot=robot, controller=controller, seconds=SECONDS[form]))
         network = ("--session", str(lab.session), "--namespace", namespace)
-        hosts[namespace] = lab.start("host", str(path), "--once", "--out", robot, *network)
+        hosts[namespace] = lab.start("host", str(path), "--end-after-duration", "--out", robot, *network)
         lab.start("service", "control", str(path), *network)
     wait_until(lambda: lab.tell("status").out.count("next: `snakesim arm") == 2, "both ready")
     listener = Listener()

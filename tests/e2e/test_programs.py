@@ -50,7 +50,7 @@ class Lab:
 
     def host(self, out: str, *arguments: str) -> subprocess.Popen[str]:
         """A HAL host."""
-        return self.start("host", *SCENARIO, "--once", *arguments, "--session", str(self.session), "--out", out)
+        return self.start("host", *SCENARIO, "--end-after-duration", *arguments, "--session", str(self.session), "--out", out)
 
     def service(self, name: str, *arguments: str) -> subprocess.Popen[str]:
         """A service."""

@@ -34,7 +34,7 @@ class Lab:
             self.at("hub", "deploy", step, "lab.toml", "--out", ".")
         scenario = (*SCENARIO, "--backend", backend)
         self.start("hub", "router", "router", str(folder / "hub" / "router.main.json5"))
-        out = ("--once", "--out", str(folder / "record"))
+        out = ("--end-after-duration", "--out", str(folder / "record"))
         self.start("robot1", "host", "host", *scenario, *self.session("robot1", "robot.planar13"), *out)
         for name in ("guidance", "navigation", "control"):
             self.start("ws1", name, "service", name, *scenario, *self.session("ws1", "gnc.planar13"))

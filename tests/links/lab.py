@@ -72,7 +72,7 @@ class Lab:
         ours, its = socket_pair()
         with its:
             arguments = ("snakesim_hal.programs.host_program", str(self._saved), "--router", "tcp/10.77.1.1:7447")
-            out = ("--out", str(self.folder), "--channel", str(its.fileno()))
+            out = ("--out", str(self.folder), "--parent-socket", str(its.fileno()))
             self.robot.module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
         return StarterEnd(ours)
 
