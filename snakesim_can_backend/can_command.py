@@ -155,9 +155,7 @@ def scan_channels(arguments: argparse.Namespace) -> int:
     for channel in arguments.channel:
         if not arguments.anyway and (others := overheard(channel, arguments.bit_rate)):
             in_use.append(channel)
-            say(
-                f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway"
-            )
+            say(f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway")
             for other in others:
                 say(f"  {other}")
             continue
@@ -226,8 +224,8 @@ def replay_log(arguments: argparse.Namespace) -> int:
     loaded = load_scenario(str(arguments.run / "config.json"), [])
     if loaded.config.backend != MODULES:
         raise ConfigError(
-            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim drive replay can` reads "
-            f"the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run"
+            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim drive replay can` "
+            f"reads the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run"
         )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)

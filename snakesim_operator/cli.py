@@ -24,6 +24,8 @@ from snakesim_operator.this_computer import setup
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 HEADINGS = ("daily work", "robot", "runs and studies", "files and computers")  # in the order of the help
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 

@@ -1,4 +1,4 @@
-"""The nouns of `snakesim drive`, below which each driver type registers its commands, and arguments that these share."""
+"""The nouns of `snakesim drive`, below which driver types register their commands, and arguments that these share."""
 
 import argparse
 

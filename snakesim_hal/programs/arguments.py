@@ -76,9 +76,7 @@ def add_scenario_name(parser: argparse.ArgumentParser) -> None:
 
 def add_set(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
     """Add `--set`. about: for the help."""
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about}; may be repeated"
-    )
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about}; may be repeated")
 
 
 def add_seed(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:

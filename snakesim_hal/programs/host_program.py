@@ -1,4 +1,4 @@
-"""The HAL host as a program: `snakesim host SCENARIO`; `python -m snakesim_hal.programs.host_program` for a run's own.
+"""The HAL host as a program: `snakesim start host SCENARIO`; `python -m snakesim_hal.programs.host_program` in a run.
 
 It opens the backend, and runs until it receives a stop signal, or until the run that it belongs to is over.
 """
@@ -48,10 +48,12 @@ GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than t
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
-    parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
+    parser = argparse.ArgumentParser(
+        prog="snakesim start host", description="Run the HAL host of a robot, with its backend."
+    )
     add_host(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim host", lambda: host(process_options(arguments, hosts=True)))
+    return run_tool("snakesim start host", lambda: host(process_options(arguments, hosts=True)))
 
 
 def host(given: ProcessOptions) -> int:

@@ -28,7 +28,9 @@ MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower tha
 def list_topics(*, as_json: bool) -> int:
     """Print the keys on which a robot publishes, with their content."""
     if as_json:
-        rows = [{"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about} for row in _published_rows()]
+        rows = [
+            {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about} for row in _published_rows()
+        ]
         print_json({"topics": rows})
         return 0
     for line in _key_lines():

@@ -88,11 +88,11 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
         "--format", required=True, choices=["csv", "parquet", "npz", "lerobot", "mcap"], help="what to write"
     )
     add_out(parser, "file or folder (default: beside the recording)")
-    parser.add_argument("--images", action="store_true", help="lerobot: with the images of the cameras, in the recordings")
-    add_task(parser, "lerobot: the task, in words (default: the scenario's name)")
-    _add_fps(
-        parser, number_type(1.0, 1000.0, "Hz"), None, "lerobot: frames a second (default: the robot's rate)"
+    parser.add_argument(
+        "--images", action="store_true", help="lerobot: with the images of the cameras, in the recordings"
     )
+    add_task(parser, "lerobot: the task, in words (default: the scenario's name)")
+    _add_fps(parser, number_type(1.0, 1000.0, "Hz"), None, "lerobot: frames a second (default: the robot's rate)")
 
 
 def _add_video(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,6 @@ from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.robot_commands.command import ANSWER_S
 
 
-
 @dataclass(frozen=True)
 class FaultOrder:
     """The command's options."""

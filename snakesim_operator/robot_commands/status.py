@@ -70,7 +70,7 @@ def _print_no_robot(where: RobotSelection) -> None:
     last = last_run.recall()
     ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
     print_line(f"no robot answers on {', '.join(where.endpoints())}{ending}")
-    print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
+    print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenario list`")
 
 
 def _print_robot(robot: _Robot) -> None:
@@ -202,7 +202,7 @@ def _describe_limits(status: Status) -> list[str]:
     for joint, fraction in sorted(status.derated.items()):
         lines.append(f"  derated: {joint} has {100 * fraction:.0f} % of its torque left")
     if status.isolated:
-        lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
+        lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a reset")
     lines += [f"  real time: {warning}" for warning in status.realtime_warnings]
     if status.unchecked:
         lines.append(f"  not checked: {status.unchecked}")
@@ -230,17 +230,19 @@ def _describe_faults(status: Status) -> list[str]:
 def _next_commands(link: Link, status: Status) -> list[str]:
     """Return the commands that the operator may type next."""
     where = flags_of(link, status.robot)
-    arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
+    arm = f"`snakesim robot arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
-        return [f"  next: `snakesim clear{where}`, then {arm}"]
+        return [f"  next: `snakesim robot reset{where}`, then {arm}"]
     if status.isolated and status.lifecycle == "disarmed":
-        lines = [f"  next: `snakesim clear{where}`, to end the isolation of {', '.join(status.isolated)}"]
+        lines = [f"  next: `snakesim robot reset{where}`, to end the isolation of {', '.join(status.isolated)}"]
         if status.ready_to_arm:
             lines.append(f"  or, without: {arm}")
         return lines
     if status.lifecycle == "armed":
-        return [f"  next: `snakesim console{where}` to watch, `snakesim disarm{where}` or `snakesim estop` to stop it"]
+        return [
+            f"  next: `snakesim console{where}` to watch, `snakesim robot disarm{where}` or `snakesim estop` to stop it"
+        ]
     if status.ready_to_arm:
         return [f"  next: {arm}"]
-    missing = ", ".join(f"`snakesim service {name} SCENARIO{where}`" for name in status.waiting_for)
+    missing = ", ".join(f"`snakesim start service {name} SCENARIO{where}`" for name in status.waiting_for)
     return [f"  next: {missing or '`snakesim status` again: what prevents arming is named above'}"]

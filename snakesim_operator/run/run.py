@@ -55,7 +55,7 @@ class RunRequest:
 
     # Arming and faults.
     unchecked: bool = False  # arm also a robot whose joints have not been checked
-    stay: bool = False  # a fault does not end the run: processes are started again, a person clears and arms
+    stay: bool = False  # a fault does not end the run: processes are started again, a person resets and arms
 
     # Output.
     record: bool = True  # every message, in recording.mcap

@@ -165,7 +165,7 @@ class Supervisor:
         for _ in range(self.host.resets - resets_before):
             self._note_restart(HOST, "host was reset", delay_s=0.0)
             robot = self.host.description
-            command = f"snakesim arm {robot.robot} {robot.backend}" if robot is not None else "snakesim arm"
+            command = f"snakesim robot arm {robot.robot} {robot.backend}" if robot is not None else "snakesim robot arm"
             self._say(f"the simulator was reset: it is at the start, and disarmed; go on with `{command}`")
 
     def _note_restart(self, name: str, how: str, delay_s: float) -> None:

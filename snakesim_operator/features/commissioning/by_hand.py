@@ -1,4 +1,4 @@
-"""`snakesim joints zero|direction|gear|limits`: a person moves the robot by hand, and the encoders are read.
+"""`snakesim robot calibrate zero|direction|gear|limits`: a person moves the robot by hand, and the encoders are read.
 
 This module commands no joint. The robot's host must run, and be disarmed all the time.
 """
@@ -112,7 +112,7 @@ class HandMovedRobot:
             case "disarmed" | "fault" | "estop":
                 return
             case _:
-                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim disarm` first")
+                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim robot disarm` first")
 
     def _refuse_unknown_angles(self, state: JointState) -> None:
         unknown = [joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid]
@@ -176,7 +176,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
                 print_line(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
                 values[joint.name] = {"sign": -joint.drive.sign}
     _write_values(path, values, "turned by hand")
-    return _report_unknown(unknown, f"snakesim joints direction {path}")
+    return _report_unknown(unknown, f"snakesim robot calibrate direction {path}")
 
 
 def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: float) -> int:
@@ -210,7 +210,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
                 wrong.append(joint.name)
     if wrong:
         print_line(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")
-    exit_code_of_unknown = _report_unknown(unknown, f"snakesim joints gear {path}")
+    exit_code_of_unknown = _report_unknown(unknown, f"snakesim robot calibrate gear {path}")
     return 1 if wrong else exit_code_of_unknown
 
 
@@ -284,7 +284,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
             values[joint.name] = {"angle_min_rad": lower, "angle_max_rad": upper}
             print_line(f"{joint.name:<10} {lower:+.3f} to {upper:+.3f} rad")
     _write_values(path, values, "end to end by hand")
-    return _report_unknown(unknown, f"snakesim joints limits {path}")
+    return _report_unknown(unknown, f"snakesim robot calibrate limits {path}")
 
 
 def _watch_travel(robot: HandMovedRobot) -> Travel | None:

@@ -1,4 +1,4 @@
-"""`snakesim robot identify`: identifies the joints from a run of the controller `identify`, prints, draws and writes them."""
+"""`snakesim robot identify`: identifies the joints from a run of the controller `identify`."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`snakesim joints jog`: one joint moves slowly while a key is held; the other motors stay off.
+"""`snakesim robot jog`: one joint moves slowly while a key is held; the other motors stay off.
 
 A terminal reports that a key repeats, not that it was released: the joint moves on for `KEY_HOLD_S` after each repeat.
 So a single key makes a small step, and a held key moves the joint on once it repeats. Keys that arrive late, as over a

@@ -1,4 +1,4 @@
-"""A `snakesim joints` command that runs beside the console, in a pseudo-terminal of its own.
+"""A `snakesim robot calibrate` command that runs beside the console, in a pseudo-terminal of its own.
 
 So the page has the texts, the checks and the dead-man's switch of the command. If the console ends, the terminal is
 closed, and the command ends as in any terminal that is closed. If the console hangs, it sends no keys, and a joint that
@@ -30,7 +30,7 @@ class JointStep:
     """One run of the command. A thread of its own reads the output; every method may be called from any thread."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        """Start the command. words: what follows `snakesim joints`, its verb first."""
+        """Start the command. words: what follows `snakesim robot calibrate`, its verb first."""
         self.verb = words[0]
         self._lines: deque[str] = deque(maxlen=MAX_LINES)
         self._lock = threading.Lock()  # of `_lines` and `_terminal`

@@ -1,4 +1,4 @@
-"""`snakesim optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
+"""`snakesim study optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
 
 import shlex
 import time

@@ -1,4 +1,4 @@
-"""Checks for `snakesim deploy check` that a running lab is as its lab file says.
+"""Checks for `snakesim lab check` that a running lab is as its lab file says.
 
 The check connects as each identity in turn, with the certificates in the output folder, and moves nothing: it
 subscribes, looks for liveliness tokens, and sends empty queries, which a host refuses.
@@ -121,10 +121,10 @@ def _check_certificate(identity: Identity, folder: Path, found: Findings) -> Non
     except ConfigError as error:
         found.failed(f"{identity.common_name}: {error}")
         return
-    _check_expiry(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
+    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", found)
     warning = check_permissions(path.with_suffix(".key"))
     if warning:
-        found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim deploy certs --rotate`")
+        found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
 
 
 def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:

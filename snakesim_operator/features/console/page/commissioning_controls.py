@@ -12,7 +12,7 @@ from snakesim_operator.features.console.page.page_html import escape_text
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import PageAction
 
-HOLD_REPEAT_HZ = 20.0  # `snakesim joints jog` counts a key as held for 0.15 s
+HOLD_REPEAT_HZ = 20.0  # `snakesim robot jog` counts a key as held for 0.15 s
 
 
 class CommissioningControls:

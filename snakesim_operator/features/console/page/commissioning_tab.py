@@ -1,4 +1,4 @@
-"""The Commission tab: all joints in a table, and the commands of `snakesim joints`, run from the page.
+"""The Commission tab: all joints in a table, and the commands of `snakesim robot calibrate`, run from the page.
 
 One step runs at a time, for the viewer in control. It ends when that viewer releases control or closes the page.
 """
@@ -181,7 +181,7 @@ class Commissioning:
             steps: list[str] = []
             for verb in STEPS:
                 joint = " joint_N" if verb == "jog" else ""
-                steps.append(f"snakesim joints {verb} FILE{joint}{flags}")
+                steps.append(f"snakesim robot calibrate {verb} FILE{joint}{flags}")
             parts = [
                 _commands_html("Where the robot's FILE is, with which the host was started, type:", steps),
                 _commands_html(
@@ -193,7 +193,7 @@ class Commissioning:
         backend = snapshot.robot.backend
         check = [
             f"snakesim run SCENARIO --controller joint_check --backend {backend} --out runs/check",
-            f"snakesim joints check runs/check {file_name} --straight",
+            f"snakesim robot check runs/check {file_name} --straight",
         ]
         parts.append(
             _commands_html(

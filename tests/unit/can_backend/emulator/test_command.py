@@ -1,4 +1,4 @@
-"""`snakesim modules`: a bus with its modules on it, what it refuses, and that help names every fault."""
+"""`snakesim drive emulate can`: a bus with its modules on it, what it refuses, and that help names every fault."""
 
 import re
 import uuid
