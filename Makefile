@@ -108,9 +108,10 @@ bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link bes
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
 	$(bin)/python -m tests.golden
 
-schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults, commands
 	$(bin)/snakesim schema --out schemas
 	$(bin)/python -m tests.kinds_table
+	$(bin)/python -m tests.commands_page
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

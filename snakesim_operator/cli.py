@@ -176,6 +176,10 @@ class MainParser(CommandParser):
         parser.epilog = f"`{parser.prog} COMMAND --help` explains a command."
         self._nouns[noun.name] = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
 
+    def commands_by_heading(self) -> list[tuple[str, list[argparse.Action]]]:
+        """Return the headings of the help, each with its nouns and commands."""
+        return [(heading, actions) for heading, actions in self._headings.items() if actions]
+
     def has_command(self, words: Sequence[str]) -> bool:
         """Return whether the words begin with a command that has been added, not only with a noun."""
         noun = ""
@@ -200,11 +204,10 @@ class MainParser(CommandParser):
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
-        for heading, actions in self._headings.items():
-            if actions:
-                formatter.start_section(heading)
-                formatter.add_arguments(actions)
-                formatter.end_section()
+        for heading, actions in self.commands_by_heading():
+            formatter.start_section(heading)
+            formatter.add_arguments(actions)
+            formatter.end_section()
         formatter.add_text(self.epilog)
         return formatter.format_help()
 

@@ -14,7 +14,7 @@ from snakesim.environments import SnakeEnv
 from snakesim.training.exported import export, learned_by
 from snakesim.training.form import FORMS, OBSERVE, Policy
 from snakesim_gnc.control.policy import POLICIES, Model
-from snakesim_operator.cli import main, parser
+from snakesim_operator.cli import main, make_parser
 from tests.e2e.documents import REPOSITORY
 
 DRAW = ("--draw", "scene.ground.friction=0.1:0.4")
@@ -112,7 +112,7 @@ def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(
         line for line in page.splitlines() if line.startswith("snakesim policy train") and line.endswith(f"--out {out}")
     ]
     ours, documented = (
-        vars(parser().parse_args(words))
+        vars(make_parser().parse_args(words))
         for words in ([*told["snakesim.trained_by"].split()[1:], "--out", out], shlex.split(given)[1:])
     )
     assert ours == documented
