@@ -266,9 +266,9 @@ def _add_completion(parser: argparse.ArgumentParser) -> None:
 
 
 def _completion(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.this_computer.completion import completion
+    from snakesim_operator.this_computer.completion import write_completion
 
-    for line in completion(make_parser(), arguments.shell):
+    for line in write_completion(make_parser(), arguments.shell):
         print_line(line)
     return OK
 

@@ -1,4 +1,4 @@
-"""The page docs/commands.md: every command with its arguments and examples; `python -m tests.commands_page` writes it."""
+"""Writes docs/commands.md, which has every command with its arguments and examples: `python -m tests.commands_page`."""
 
 import argparse
 from collections.abc import Iterator
@@ -10,8 +10,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """\
 # Commands
 
-Made by `make schemas` from the parsers of `snakesim`; `snakesim COMMAND --help` prints the same. Commands for daily work
-are verbs, such as `snakesim run`. All others are a noun and a verb, such as `snakesim robot arm`.
+Made by `make schemas` from the parsers of `snakesim`; `snakesim COMMAND --help` prints the same. Commands for daily
+work are verbs, such as `snakesim run`. All others are a noun and a verb, such as `snakesim robot arm`.
 [The command](command.md) explains them by task.
 
 The table lists the first word of each command; follow its link for arguments and examples.

@@ -40,7 +40,7 @@ def preview(where: RobotSelection, hz: float, width: int) -> int:
         raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz")
     if not MIN_WIDTH_PX <= width <= MAX_WIDTH_PX:
         raise ConfigError(f"--width {width}: give from {MIN_WIDTH_PX} to {MAX_WIDTH_PX} pixels")
-    link = only_robot(where, "preview")
+    link = only_robot(where, "start preview")
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
         if robot is None:

@@ -39,7 +39,7 @@ def arm(
     Raises:
         RefusedError: another robot or backend is there, or the host refuses.
     """
-    link = only_robot(where, f"arm {robot} {backend}")
+    link = only_robot(where, f"robot arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _read_description(session, link)
         mismatches: list[str] = []
@@ -59,7 +59,7 @@ def arm(
 def disarm(where: RobotSelection, say: PrintLine = print_line) -> int:
     """Make the joints passive; later commands do not move them."""
     request = LifecycleRequest(action="disarm", who=get_user_name())
-    return _request_from_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
+    return _request_from_robot(only_robot(where, "robot disarm"), keys.LIFECYCLE, request, "disarmed", say)
 
 
 def reset(where: RobotSelection, say: PrintLine = print_line) -> int:
@@ -68,7 +68,7 @@ def reset(where: RobotSelection, say: PrintLine = print_line) -> int:
     If no robot runs, an emergency stop stored by the last run is removed.
     """
     try:
-        link = only_robot(where, "reset")
+        link = only_robot(where, "robot reset")
     except NotConnectedError:
         kept = [path for path in find_latched_stops() if where.namespace in (None, path.parent.name)]
         if not kept or where.endpoint is not None:

@@ -122,7 +122,7 @@ class HandMovedRobot:
 
 @contextmanager
 def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[HandMovedRobot]:
-    """Connect to the selected robot. Raises SnakesimError. command: for messages, such as `joints zero`."""
+    """Connect to the selected robot. Raises SnakesimError. command: for messages, such as `robot calibrate zero`."""
     must_be_own(path)
     with open_session(only_robot(selection, command), CONNECT_S) as session:
         yield HandMovedRobot(session, path)
@@ -130,7 +130,7 @@ def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[Ha
 
 def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
     """Write the present pose as the straight pose into a robot file. Return 0. Raises SnakesimError."""
-    with _connect(path, selection, "joints zero") as robot:
+    with _connect(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
             print_line("Lay the robot straight on a flat floor, let go of it, then press Enter.")
             list(robot.read_angles_rad(_line_was_typed))
@@ -164,7 +164,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
     """
     values: dict[str, dict[str, Any]] = {}
     unknown: list[str] = []
-    with _connect(path, selection, "joints direction") as robot:
+    with _connect(path, selection, "robot calibrate direction") as robot:
         for joint in choose_joints(robot.joints, names, path):
             instruction = f"turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more, and hold it still"
             turn = _wait_for_turn(robot, joint, instruction)
@@ -193,7 +193,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
     """
     unknown: list[str] = []
     wrong: list[str] = []
-    with _connect(path, selection, "joints gear") as robot:
+    with _connect(path, selection, "robot calibrate gear") as robot:
         for joint in choose_joints(robot.joints, names, path):
             instruction = f"turn what is ahead of it {DIRECTIONS[joint.axis]} by {degrees:g} degrees, and hold it still"
             turn = _wait_for_turn(robot, joint, instruction)
@@ -264,7 +264,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
     Returns:
         0; 1 if one of them was not moved from end to end.
     """
-    with _connect(path, selection, "joints limits") as robot:
+    with _connect(path, selection, "robot calibrate limits") as robot:
         watched = choose_joints(robot.joints, names, path)
         print_line("Move each joint by hand from end to end, slowly; then press Enter.")
         travel = _watch_travel(robot)

@@ -112,7 +112,7 @@ class CommissioningControls:
         joint = int(self._joint.value)
         options: list[str] = []
         if verb == "jog":
-            options += ["--speed", f"{self._speed_rad_s.value:g}"]
+            options += ["--joint-speed", f"{self._speed_rad_s.value:g}"]
             options += ["--travel", f"{self._travel_rad.value:g}"]
             options += ["--torque", f"{self._torque_fraction.value:g}"]
         if self._is_in_control():
