@@ -72,7 +72,7 @@ def check(lab: Lab, folder: Path, say: PrintLine = print_line, *, as_json: bool 
 
     Args:
         lab: The lab.
-        folder: The output folder of `deploy certs`.
+        folder: The output folder of `lab certs`.
         say: Prints a line.
         as_json: Whether to print one JSON object at the end instead of lines.
 
