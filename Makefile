@@ -85,7 +85,7 @@ fuzz: $(stamp) ## Bad payloads into every decoder, then over the network of a ro
 attack: $(stamp) ## Every attack of an unauthorized client on the network, in full (ARGS="-k a4")
 	$(bin)/python -m verification.attack $(ARGS)
 
-kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear and end (TRIALS=300, ARGS="--seed 2")
+kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, reset and end (TRIALS=300, ARGS="--seed 2")
 	$(bin)/python -m verification.soak.kills --trials $(TRIALS) $(ARGS)
 
 soak: $(stamp) ## A long run with faults at random, and an operator who recovers (MINUTES=30, ARGS="--backend can --seed 2")
@@ -118,10 +118,11 @@ golden: $(stamp) ## Write tests/golden.json again, after a change that is meant 
 	$(bin)/python -m verification.golden
 
 schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables of faults and errors
-	$(bin)/snakesim schemas --write schemas
+	$(bin)/snakesim schema --out schemas
 	$(bin)/python -m docs.site.kinds_table
 	$(bin)/python -m tests.error_pages
 	$(bin)/python -m tests.configuration_page
+	$(bin)/python -m tests.commands_page
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

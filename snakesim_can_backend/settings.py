@@ -38,7 +38,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
 
     emulators: Literal["here", "process", "none"] | None = None
     """Where emulated joint modules run: `here`, in a `process` that the driver starts, or `none` for real modules and
-    those of `snakesim modules`; not given: `here` without channels, `none` with them.
+    those of `snakesim drive emulate can`; not given: `here` without channels, `none` with them.
     """
 
     physics_model: str = "mujoco"
@@ -51,7 +51,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     """For joints of emulated modules, how each is really mounted, to see what a wrong robot file does."""
 
     faults: list[str] = []
-    """Faults of the emulators, such as "mute:joint_3@2"; `snakesim modules --help` lists them."""
+    """Faults of the emulators, such as "mute:joint_3@2"; `snakesim drive emulate can --help` lists them."""
 
     contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None
     """Rate at which modules report contacts; none: that of the contact sensor in the robot file."""

@@ -52,7 +52,9 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     """Longest time that the snake may take to come to rest before the run begins."""
 
     suspended: bool = False
-    """True: the snake hangs from a clamp by its tail link, head down and clear of the ground, for `snakesim identify`.
+    """True: the snake hangs from a clamp by its tail link, head down and clear of the ground.
+
+    `snakesim robot identify` needs it.
     """
 
     tether: Tether | None = None

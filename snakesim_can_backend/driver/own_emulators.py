@@ -45,7 +45,7 @@ def check_emulators(config: RunConfig, settings: CanSettings) -> None:
         )
     if settings.faults and settings.emulators_run == "none":
         raise ConfigError(
-            "`backends.can.faults` are for emulators; give them to `snakesim modules --fault` instead",
+            "`backends.can.faults` are for emulators; give them to `snakesim drive emulate can --fault` instead",
             code="injection/not-supported",
         )
     for text in settings.faults:
@@ -100,7 +100,7 @@ def start_local_emulators(
 
 
 class EmulatorProcess:
-    """`snakesim modules` as a child that dies with this process."""
+    """`snakesim drive emulate can` as a child that dies with this process."""
 
     def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
         """Start the child, and wait until its modules are on the bus.

@@ -1,9 +1,8 @@
-"""The backend `moteus`, and `snakesim moteus`, which emulates controllers as a process."""
+"""The backend `moteus`: moteus controllers, real or emulated."""
 
 from collections.abc import Sequence
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
-from snakesim_can_backend.can_drives.command import run
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured_gains, needed_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
@@ -53,8 +52,3 @@ class MoteusBackend(CanDriveBackend):
                 f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`",
                 code="drive/unsupported-setting",
             )
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `snakesim moteus`."""
-    return run(MoteusBackend, "moteus", argv)

@@ -51,7 +51,7 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     """
 
     cable_unwound: Text = ""
-    """Date at which the cable was unwound with the joint at its zero, which `snakesim joints zero` writes; empty:
+    """Date at which the cable was unwound with the joint at its zero, which `snakesim robot calibrate zero` writes; empty:
     unknown.
     """
 

@@ -122,7 +122,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     """Sensors of the robot."""
 
     checked: StartCheckRecord | None = None
-    """Record of the last start check, which `snakesim joints check` writes; none: the robot was never checked."""
+    """Record of the last start check, which `snakesim robot check` writes; none: the robot was never checked."""
 
     def __post_init__(self) -> None:
         """Check joints, links and sensors against each other. Raises ValueError, which the file reader explains."""

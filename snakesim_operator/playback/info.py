@@ -1,4 +1,4 @@
-"""`snakesim info`: what a recording holds, and what is missing in it."""
+"""`snakesim recording info`: what a recording holds, and what is missing in it."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""Commands to running robots: status, arm, disarm, clear, emergency stop, parameters, faults, teleoperation.
+"""Commands to running robots: status, arm, disarm, reset, emergency stop, parameters, faults, teleoperation.
 
 `commanding`, `simulator_order`   the arguments of these commands; they import little, so that a stop starts quickly
 `status`, `command`, `parameters`, `fault`, `teleop`   one command each

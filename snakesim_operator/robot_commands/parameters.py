@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import msgspec
@@ -22,7 +22,7 @@ from snakesim_hal.base.errors import (
     suggest_word,
 )
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.network.session import Reader, Session, open_session
 from snakesim_hal.wire import keys
@@ -242,11 +242,15 @@ def known_name(name: str, in_force: ControlParameters) -> str:
     return name.removeprefix(PREFIX)
 
 
-def list_parameters(where: RobotSelection) -> int:
+def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
     """Print all parameters for `snakesim param list`."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
         in_force = read_parameters_in_force(session)
     parameters = read_parameters(in_force)
+    if as_json:
+        content = [{**asdict(parameter), "name": PREFIX + parameter.name} for parameter in parameters]
+        print_json({"controller": in_force.controller, "set_by": in_force.requester, "parameters": content})
+        return 0
     if in_force.requester is None:
         origin = "from its configuration"
     else:
@@ -261,13 +265,16 @@ def list_parameters(where: RobotSelection) -> int:
     return 0
 
 
-def get_parameter(name: str, where: RobotSelection) -> int:
-    """Print one value alone, for scripts that use `snakesim param get`."""
+def get_parameter(name: str, where: RobotSelection, *, as_json: bool) -> int:
+    """Print one value alone, for `snakesim param get`."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
         in_force = read_parameters_in_force(session)
     field = known_name(name, in_force)
     value = next(parameter.value for parameter in read_parameters(in_force) if parameter.name == field)
-    print_line(format_value(value))
+    if as_json:
+        print_json({name: value})
+    else:
+        print_line(format_value(value))
     return 0
 
 

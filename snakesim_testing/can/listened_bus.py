@@ -180,9 +180,9 @@ class Bench:
 
     def _is_armed(self) -> bool:
         """Once what there is has been cleared."""
-        if self.tell("arm", self.config.robot.name, self.config.backend).code == 0:
+        if self.tell("robot", "arm", self.config.robot.name, self.config.backend).code == 0:
             return True
-        print(self.tell("clear").said)
+        print(self.tell("robot", "reset").said)
         return False
 
     def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:

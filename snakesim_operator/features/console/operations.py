@@ -15,8 +15,8 @@ from snakesim_hal.network.session import Link, Publisher, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Intent, Message, ParametersRequest
 from snakesim_operator.base.targets import RobotSelection
-from snakesim_operator.robot_commands.command import ANSWER_S, arm, clear, disarm, simulator
-from snakesim_operator.robot_commands.fault import FaultOrder, fault
+from snakesim_operator.robot_commands.command import ANSWER_S, arm, disarm, reset, simulator
+from snakesim_operator.robot_commands.fault import FaultOrder, inject_fault
 from snakesim_operator.robot_commands.prepared_stop import PreparedStop
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -87,9 +87,9 @@ class Operations:
         """Make the joints passive."""
         return self._run_command(f"{requester}: disarm", lambda print_: disarm(self._selection, print_))
 
-    def clear(self, requester: str) -> str:
-        """Clear a fault or an emergency stop."""
-        return self._run_command(f"{requester}: clear", lambda print_: clear(self._selection, print_))
+    def reset_fault(self, requester: str) -> str:
+        """Reset a fault or an emergency stop."""
+        return self._run_command(f"{requester}: reset", lambda print_: reset(self._selection, print_))
 
     def change_time(self, requester: str, order: SimulatorOrder) -> str:
         """Pause, resume, step, speed up or reset a simulator."""
@@ -100,7 +100,7 @@ class Operations:
     def inject(self, requester: str, order: FaultOrder) -> str:
         """Inject a fault, or end it, if the run allows fault injection."""
         title = f"{requester}: fault {order.kind}:{order.target}"
-        return self._run_command(title, lambda print_: fault(order, self._selection, print_))
+        return self._run_command(title, lambda print_: inject_fault(order, self._selection, print_))
 
     def configure(self, requester: str, controller: str, parameters: str) -> str:
         """Change the parameters of the running controller. parameters: all of them, as JSON."""

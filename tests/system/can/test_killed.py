@@ -1,6 +1,6 @@
 """Processes that are killed with SIGKILL while the robot is armed, as a listener on the bus sees it.
 
-Host, control and modules are the processes of `snakesim run` and `snakesim modules`; the listener has the kernel's time
+Host, control and modules are the processes of `snakesim run` and `snakesim drive emulate can`; the listener has the kernel's time
 of every frame. `pytest -rP tests/system/can/test_killed.py` prints a row for each.
 """
 
@@ -116,4 +116,4 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, cha
     assert [r["node"] for r in rows] == [str(node) for node in NODES]
     assert all((r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows)
     assert len({r["serial"] for r in rows}) == JOINTS
-    print(f"| `snakesim can scan {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")
+    print(f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")

@@ -1,4 +1,4 @@
-"""`snakesim joints jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
+"""`snakesim robot jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
 
 import os
 import pty
@@ -28,7 +28,7 @@ def home(tmp_path: Path) -> Path:
 @contextmanager
 def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The command, once it is armed, and the other end of its terminal."""
-    (ours, theirs), words = pty.openpty(), ("joints", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
+    (ours, theirs), words = pty.openpty(), ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
     try:
         with background(home, *words, stdin=theirs) as process:
             assert process.stdout is not None

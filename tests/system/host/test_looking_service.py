@@ -67,7 +67,7 @@ def test_what_the_backend_has_itself_is_left_to_it() -> None:
 
 
 def recording(path, images) -> str:
-    """As `snakesim echo` prints it."""
+    """As `snakesim topic echo` prints it."""
     plain = [{**msgspec.to_builtins(image), "depth": b64encode(image.depth).decode()} for image in images]
     path.write_text("".join(json.dumps({"key": f"planar13/{HEAD}", "message": image}) + "\n" for image in plain))
     return str(path)
