@@ -120,9 +120,9 @@ golden: $(stamp) ## Write tests/golden.json again, after a change that is meant 
 schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables of faults and errors
 	$(bin)/snakesim schema --out schemas
 	$(bin)/python -m docs.site.kinds_table
-	$(bin)/python -m tests.error_pages
-	$(bin)/python -m tests.configuration_page
-	$(bin)/python -m tests.commands_page
+	$(bin)/python -m docs.site.error_pages
+	$(bin)/python -m docs.site.configuration_page
+	$(bin)/python -m docs.site.commands_page
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

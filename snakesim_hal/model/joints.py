@@ -51,8 +51,9 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     """
 
     cable_unwound: Text = ""
-    """Date at which the cable was unwound with the joint at its zero, which `snakesim robot calibrate zero` writes; empty:
-    unknown.
+    """Date at which the cable was unwound with the joint at its zero; empty: unknown.
+
+    `snakesim robot calibrate zero` writes it.
     """
 
     # Motion.

@@ -1,7 +1,7 @@
 """Processes that are killed with SIGKILL while the robot is armed, as a listener on the bus sees it.
 
-Host, control and modules are the processes of `snakesim run` and `snakesim drive emulate can`; the listener has the kernel's time
-of every frame. `pytest -rP tests/system/can/test_killed.py` prints a row for each.
+Host, control and modules are the processes of `snakesim run` and `snakesim drive emulate can`. The listener has the
+kernel's time of every frame. `pytest -rP tests/system/can/test_killed.py` prints a row for each.
 """
 
 import subprocess

@@ -14,8 +14,7 @@ from snakesim.environments import SnakeEnv
 from snakesim.training.exported import export, learned_by
 from snakesim.training.form import FORMS, OBSERVE, Policy
 from snakesim_gnc.control.policy import POLICIES, Model
-from snakesim_operator.cli import main
-from snakesim_operator.cli import make_parser
+from snakesim_operator.cli import main, make_parser
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY
 

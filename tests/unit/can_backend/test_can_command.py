@@ -20,8 +20,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
-from snakesim_testing.can.frames import health
-from snakesim_testing.can.frames import heartbeat
+from snakesim_testing.can.frames import health, heartbeat
 from snakesim_testing.messages import raises_error
 from tests.harness.registered import run_registered
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from docs.site.error_pages import PAGE, make_page
 from snakesim_can_backend.protocol.definitions import ModuleFault
 from snakesim_hal.base import errors
 from snakesim_hal.base.error_codes import ERROR_CODES
 from snakesim_hal.base.fault_codes import FAULT_CODES, REFUSAL_CODES
 from snakesim_hal.base.terminal import run_tool
-from tests.error_pages import PAGE, make_page
 
 REPOSITORY = Path(__file__).parents[3]
 REGISTRIES = ("error_codes.py", "fault_codes.py")

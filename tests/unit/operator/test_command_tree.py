@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import pytest
 
+from docs.site.commands_page import PAGE, make_page
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import COMMANDS, list_installed, offer_plugin
 from snakesim_hal.programs.commands import Command, Noun
 from snakesim_operator.cli import CommandParser, MainParser, find_subparsers, main, make_parser
-from tests.commands_page import PAGE, make_page
 
 MAX_COMMANDS = 25
 WITHOUT_REPORT = {  # they move, start or write something; what they print says what was done

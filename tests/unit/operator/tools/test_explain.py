@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from docs.site.configuration_page import PAGE, documented_structs, fields_without_description, make_page
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import Loaded, load, parse_set
 from snakesim_operator.this_computer.explain import explain_key
 from snakesim_operator.this_computer.scenario_files import list_values
 from snakesim_operator.this_computer.scenario_keys import list_keys
-from tests.configuration_page import PAGE, documented_structs, fields_without_description, make_page
 
 PER_SCENARIO = ("triplet", "peg_row", "surveyed_clutter")
 

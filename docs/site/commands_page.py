@@ -1,4 +1,4 @@
-"""Writes docs/commands.md, which has every command with its arguments and examples: `python -m tests.commands_page`."""
+"""Writes docs/commands.md: every command with its arguments and examples. Run `python -m docs.site.commands_page`."""
 
 import argparse
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from snakesim_operator.cli import find_subparsers, make_parser
 
-PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
+PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
 HEAD = """\
 # Commands
 

@@ -1,4 +1,4 @@
-"""The page docs/configuration.md, every key of every file; `python -m tests.configuration_page` writes it."""
+"""The page docs/configuration.md, every key of every file; `python -m docs.site.configuration_page` writes it."""
 
 from collections.abc import Iterator
 from inspect import cleandoc
@@ -19,7 +19,7 @@ from snakesim_hal.model.scene import SceneFile
 from snakesim_operator.features.evaluate.suite import Suite
 from snakesim_operator.features.lab.lab_file import LabFile
 
-PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
+PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
 INTRODUCTION = """# Configuration
 
 Every key of the files that you write, from the code by `make schemas`. `snakesim config SCENARIO --explain KEY` prints
