@@ -11,7 +11,7 @@ import sys
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
@@ -91,9 +91,13 @@ class Plugin:
 
     def read_stored(self) -> dict[str, list[str]]:
         """Return the content of the file, which is read once."""
-        if self._stored is None:
-            self._stored = json.loads(self._path.read_text(encoding="utf-8")) if self._path.exists() else {}
-        return self._stored
+        if self._stored is not None:
+            return self._stored
+        stored: dict[str, list[str]] = {}
+        if self._path.exists():
+            stored = json.loads(self._path.read_text(encoding="utf-8"))
+        self._stored = stored
+        return stored
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
@@ -121,7 +125,8 @@ class Plugin:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Collect the messages of the tests that passed."""
         if report.when == "call" and report.passed:
-            self._new |= {value[0]: value[1] for name, value in report.user_properties if name == PROPERTY}
+            properties: list[tuple[str, Any]] = report.user_properties
+            self._new |= {value[0]: value[1] for name, value in properties if name == PROPERTY}
 
     def pytest_sessionfinish(self) -> None:
         """Write the file."""

@@ -44,4 +44,4 @@ def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float
         return f"{UNKNOWN}the recording breaks off {done}"
     if host.lifecycle == "armed":
         return f"{UNKNOWN}the recording was ended {done}, with the robot armed"
-    return f"{host.lifecycle} ({host.why}) {done}"
+    return f"{host.lifecycle} ({host.reason}) {done}"

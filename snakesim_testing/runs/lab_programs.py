@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.session_file import read_session
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.runs.command import SNAKESIM, Ended, environment
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until

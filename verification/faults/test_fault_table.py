@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.page import PAGE, TABLE_NAME
 from verification.faults.__main__ import main
-from verification.faults.page import write
+from verification.faults.page import PAGE, TABLE_NAME, write
 from verification.faults.results import Store
 from verification.faults.row import DRIVE_TYPES, Result, Row, Trial, judge
 from verification.faults.table import HEADINGS, ROWS

@@ -31,7 +31,8 @@ from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.wire.messages import Mode
 from snakesim_testing.can.driver_loop import JOINTS, config, loop
-from snakesim_testing.can.frames import (
+from snakesim_testing.can.frames import read
+from snakesim_testing.can.recorded_wire import (
     DISARMED,
     EMERGENCY,
     WIRES,
@@ -39,7 +40,6 @@ from snakesim_testing.can.frames import (
     go,
     is_action,
     is_set_point,
-    read,
     words,
 )
 from snakesim_testing.messages import raises_error

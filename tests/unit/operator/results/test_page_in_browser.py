@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, chromium
 from snakesim_testing.operator.recorded_triplet import Reader, read
-from tests.browser import CHROMIUM, MISSING, chromium
 
 DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
 OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
