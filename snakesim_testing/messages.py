@@ -26,6 +26,11 @@ VARYING = (  # parts of texts that differ from run to run
     (re.compile(r"0x[0-9a-f]{7,}"), "0xADDRESS"),
     (re.compile(r"\b(virtual-)?([0-9a-f]{32}|(?<=virtual-)[0-9a-f]{8})\b"), r"\1ID"),
     (re.compile(r"\((\w+\.py) line \d+\)"), r"(\1 line N)"),
+    (re.compile(r"/dev/pts/\d+"), "/dev/pts/N"),
+    # What Python's parsers report differs from version to version.
+    (re.compile(r"(not valid (?:TOML|JSON|XML): )(?!nested).*?(?=; give| \[[a-z]+/|$)"), r"\1..."),
+    (re.compile(r"(SyntaxError: ).*?(?= \[[a-z]+/|$)"), r"\1..."),
+    (re.compile(r"\(choose from [^)]*\)"), "(choose from ...)"),
 )
 
 

@@ -190,7 +190,7 @@ def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> N
 def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with raises_error(ConfigError, code="file/invalid-syntax", mask=r"(?<=not valid ....: ).*(?= \[)") as caught:
+    with raises_error(ConfigError, code="file/invalid-syntax") as caught:
         read_table(path)
     assert str(caught.value).startswith(f"{path}: ")
 
