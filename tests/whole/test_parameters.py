@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, list_installed
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
@@ -67,7 +68,7 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
         timestamp_ns=0,
         controller=name,
         settings=msgspec.json.encode(settings(**MUST_BE_SET.get(name, {}))).decode(),
-        schema=msgspec.json.encode(msgspec.json.schema(settings)).decode(),
+        schema=msgspec.json.encode(make_schema(settings)).decode(),
     )
     found = read_parameters(in_force)
     assert len(found) == len(msgspec.structs.fields(settings))
