@@ -45,6 +45,7 @@ class LiveSettings:
 
         # The settings in force.
         self._settings = self._check_settings(config.control_settings, f"scenario {config.name!r}")
+        self._schema = _make_schema(type(self._settings))  # reads a source file, so not in a control cycle
         self._changed_by: str | None = None  # None: they are those of the configuration
         self._change_count = 0
         self._published_change = -1  # number of the change that was published last
@@ -121,8 +122,7 @@ class LiveSettings:
         Clients cannot change what is not published.
         """
         settings = _to_json(self._settings)
-        schema = _make_schema(type(self._settings))
-        if len(settings) > MAX_SETTINGS or len(schema) > MAX_SCHEMA:
+        if len(settings) > MAX_SETTINGS or len(self._schema) > MAX_SCHEMA:
             return
         self._publisher.put(
             ControlSettings(
@@ -130,7 +130,7 @@ class LiveSettings:
                 timestamp_ns=clock.timestamp_ns,
                 controller=self._name,
                 settings=settings,
-                schema=schema,
+                schema=self._schema,
                 who=self._changed_by,
                 changes=self._change_count,
             )
