@@ -153,3 +153,19 @@ def test_the_schema_has_descriptions_defaults_and_units() -> None:
     assert properties["size_m"]["unit"] == "m"
     assert schema["$defs"]["Wheel"]["properties"]["radius_m"]["unit"] == "m"
     assert list_structs(Kart) == [Kart, Wheel]
+
+
+def test_two_classes_of_one_name_have_descriptions_each() -> None:
+    class Other:
+        class Wheel(FileStruct):
+            """A toothed wheel."""
+
+            teeth: int = 0
+            """Number of teeth."""
+
+    both: Any = msgspec.defstruct("Both", [("front", Wheel), ("rear", Other.Wheel)])
+    descriptions: list[str] = []
+    for definition in make_schema(both)["$defs"].values():
+        descriptions += [field["description"] for field in definition["properties"].values() if "description" in field]
+    assert "Radius of the wheel, without its tire." in descriptions
+    assert "Number of teeth." in descriptions
