@@ -70,7 +70,8 @@ def test_descriptions_are_inherited_and_overridden() -> None:
 
 def test_exceptions_have_the_descriptions_of_the_section_for_all_but_for_none() -> None:
     assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
-    described = describe_fields(JointExceptions)
+    exceptions: Any = JointExceptions
+    described = describe_fields(exceptions)
     assert described["torque_nm"] == "Maximum torque of the joint; none: as in the section for all."
     assert described["rated_nm"].count("none:") == 1
 
@@ -80,7 +81,7 @@ def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.M
     assert describe_fields(made) == {}
     monkeypatch.setattr(sys.modules[__name__], "__file__", str(Path("gone.pyc").absolute()))
 
-    class Local(FileStruct):
+    class Local(FileStruct, frozen=True):
         x: int
         """Never read."""
 
@@ -157,7 +158,7 @@ def test_the_schema_has_descriptions_defaults_and_units() -> None:
 
 def test_two_classes_of_one_name_have_descriptions_each() -> None:
     class Other:
-        class Wheel(FileStruct):
+        class Wheel(FileStruct, frozen=True):
             """A toothed wheel."""
 
             teeth: int = 0
