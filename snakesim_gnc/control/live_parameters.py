@@ -43,6 +43,7 @@ class LiveParameters:
 
         # The parameters in force.
         self._parameters = self._check_parameters(config.controller_parameters, f"scenario {config.name!r}")
+        self._schema = _make_schema(type(self._parameters))  # reads a source file, so not in a control cycle
         self._changed_by: str | None = None  # None: they are those of the configuration
         self._change_count = 0
         self._published_change = -1  # number of the change that was published last
@@ -119,8 +120,7 @@ class LiveParameters:
         Clients cannot change what is not published.
         """
         parameters = _to_json(self._parameters)
-        schema = _make_schema(type(self._parameters))
-        if len(parameters) > MAX_PARAMETERS_JSON or len(schema) > MAX_SCHEMA:
+        if len(parameters) > MAX_PARAMETERS_JSON or len(self._schema) > MAX_SCHEMA:
             return
         self._publisher.put(
             ControlParameters(
@@ -128,7 +128,7 @@ class LiveParameters:
                 timestamp_ns=clock.timestamp_ns,
                 controller=self._name,
                 parameters=parameters,
-                schema=schema,
+                schema=self._schema,
                 requester=self._changed_by,
                 changes=self._change_count,
             )

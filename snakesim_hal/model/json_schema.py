@@ -1,5 +1,6 @@
 """The JSON Schema of a Struct, with the description, the default and the unit of every field."""
 
+import re
 from inspect import cleandoc
 from typing import Any
 
@@ -19,8 +20,8 @@ def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
         if "description" in definition:  # without its indentation, as Python itself removes it from 3.13 on
             definition["description"] = cleandoc(definition["description"])
     for part in list_structs(struct):
-        full_name = f"{part.__module__}.{part.__qualname__}"
-        name = full_name if full_name in definitions else part.__name__
+        full_name = re.sub(r"[^a-zA-Z0-9.\-_]", "_", f"{part.__module__}.{part.__qualname__}")
+        name = full_name if full_name in definitions else part.__name__  # msgspec uses full names if two are equal
         _complete_definition(definitions[name], part)
     return schema
 

@@ -4,6 +4,7 @@ import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from verification.faults.results import ROOT, Store
 from verification.faults.row import TRIALS, Result, Row, judge
@@ -138,7 +139,7 @@ def _format_table(results: Results) -> str:
     for heading in HEADINGS:
         for row in heading.rows:
             for backend, measure in row.on.items():
-                cells: dict[str, object] = {
+                cells: dict[str, Any] = {
                     "row": row.name,
                     "fault": row.fault,
                     "backend": "sim and can" if backend == "both" else backend,
@@ -158,7 +159,7 @@ def _format_table(results: Results) -> str:
     return text.getvalue()
 
 
-def _measured_cells(row: Row, result: Result) -> dict[str, object]:
+def _measured_cells(row: Row, result: Result) -> dict[str, Any]:
     """Return the cells of a measurement that was made."""
     verdict = judge(row, result)
     return {
@@ -177,7 +178,7 @@ def _measured_cells(row: Row, result: Result) -> dict[str, object]:
     }
 
 
-def _recovery_cells(result: Result) -> dict[str, object]:
+def _recovery_cells(result: Result) -> dict[str, Any]:
     """Return the cells about the recovery; none if there was nothing to recover from."""
     tried = [trial for trial in result.trials if trial.recovered is not None]
     if not tried:

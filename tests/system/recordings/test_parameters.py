@@ -6,6 +6,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.controller import load_controller
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, list_installed
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.programs.single_process import InProcessRun
@@ -70,7 +71,7 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
         timestamp_ns=0,
         controller=name,
         parameters=msgspec.json.encode(parameters_type(**MUST_BE_SET.get(name, {}))).decode(),
-        schema=msgspec.json.encode(msgspec.json.schema(parameters_type)).decode(),
+        schema=msgspec.json.encode(make_schema(parameters_type)).decode(),
     )
     found = read_parameters(in_force)
     assert len(found) == len(msgspec.structs.fields(parameters_type))

@@ -70,7 +70,8 @@ def test_descriptions_are_inherited_and_overridden() -> None:
 
 def test_exceptions_have_the_descriptions_of_the_section_for_all_but_for_none() -> None:
     assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
-    described = describe_fields(JointExceptions)
+    exceptions: Any = JointExceptions
+    described = describe_fields(exceptions)
     assert described["torque_nm"] == "Maximum torque of the joint; none: as in the section for all."
     assert described["rated_nm"].count("none:") == 1
 
@@ -80,7 +81,7 @@ def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.M
     assert describe_fields(made) == {}
     monkeypatch.setattr(sys.modules[__name__], "__file__", str(Path("gone.pyc").absolute()))
 
-    class Local(FileStruct):
+    class Local(FileStruct, frozen=True):
         x: int
         """Never read."""
 
@@ -153,3 +154,19 @@ def test_the_schema_has_descriptions_defaults_and_units() -> None:
     assert properties["size_m"]["unit"] == "m"
     assert schema["$defs"]["Wheel"]["properties"]["radius_m"]["unit"] == "m"
     assert list_structs(Kart) == [Kart, Wheel]
+
+
+def test_two_classes_of_one_name_have_descriptions_each() -> None:
+    class Other:
+        class Wheel(FileStruct, frozen=True):
+            """A toothed wheel."""
+
+            teeth: int = 0
+            """Number of teeth."""
+
+    both: Any = msgspec.defstruct("Both", [("front", Wheel), ("rear", Other.Wheel)])
+    descriptions: list[str] = []
+    for definition in make_schema(both)["$defs"].values():
+        descriptions += [field["description"] for field in definition["properties"].values() if "description" in field]
+    assert "Radius of the wheel, without its tire." in descriptions
+    assert "Number of teeth." in descriptions
