@@ -147,7 +147,9 @@ TYPED = {
 }
 
 
-@pytest.mark.parametrize("command", ["evaluate", pytest.param("optimize", marks=pytest.mark.slow), "train"])
+@pytest.mark.parametrize(
+    "command", ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))]
+)
 def test_ctrl_c_ends_it_at_once_and_leaves_nothing_but_its_results(command: str, tmp_path: Path) -> None:
     (tmp_path / "quick.toml").write_text(SUITE)
     (tmp_path / "tmp").mkdir()
