@@ -53,6 +53,7 @@ def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_chann
         moves_again(run)
 
 
+@pytest.mark.slow
 def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_channel: str) -> None:
     with shared_bus(spare_channel) as run:
         must(ip("link", "delete", spare_channel))
@@ -89,6 +90,7 @@ def unclog(channel: str) -> None:
     must(tc("qdisc", "del", "dev", channel, "root"))
 
 
+@pytest.mark.slow
 def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_sent_late(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
         clog(slow_channel)
@@ -105,6 +107,7 @@ def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_s
         moves_again(run)
 
 
+@pytest.mark.slow
 def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_goes_on(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
         clog(slow_channel)
@@ -117,6 +120,7 @@ def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_g
         assert not run.faults and full > 0 and run.states() == [ModuleState.ARMED] * 4
 
 
+@pytest.mark.slow
 def test_a_long_queue_that_fills_this_sockets_share_of_it_is_a_full_queue_too(slow_channel: str) -> None:
     must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
     with shared_bus(slow_channel) as run:

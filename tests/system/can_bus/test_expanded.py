@@ -46,6 +46,7 @@ def database(expanded: Path) -> Database:
     return database
 
 
+@pytest.mark.slow
 def test_every_message_of_every_node_is_there_and_no_other(database: Database) -> None:
     expected = {
         opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
@@ -91,6 +92,7 @@ def sent() -> list[tuple[Frame, str]]:
     ]
 
 
+@pytest.mark.slow
 def test_stock_cantools_decodes_our_log(expanded: Path) -> None:
     log = io.StringIO()
     wire = LoggedWire(VirtualWire("expanded-log"), log)

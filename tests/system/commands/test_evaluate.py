@@ -85,6 +85,7 @@ def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tu
     assert score["medians"]["jam_ratio"] is not None and score["medians"]["desired_force_error"] is None
 
 
+@pytest.mark.slow
 def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> None:
     ended, out = undisturbed
     rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
@@ -168,7 +169,9 @@ TYPED = {
 }
 
 
-@pytest.mark.parametrize("command", ["evaluate", pytest.param("optimize", marks=pytest.mark.slow), "train"])
+@pytest.mark.parametrize(
+    "command", ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))]
+)
 def test_ctrl_c_ends_it_at_once_and_leaves_nothing_but_its_results(command: str, tmp_path: Path) -> None:
     (tmp_path / "quick.toml").write_text(SUITE)
     (tmp_path / "tmp").mkdir()
@@ -234,6 +237,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undistur
         assert (out / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     ended = evaluate(home, "one", "--only", "path_following:2:2")
     assert ended.code == 0 and (home / "one" / REPORT).is_file(), ended.out + ended.err

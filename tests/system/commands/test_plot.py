@@ -48,6 +48,7 @@ def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Pa
     assert "joint_13" in words(run / "inherited.svg")
 
 
+@pytest.mark.slow
 def test_the_papers_figures_come_from_one_command(run: Path) -> None:
     ended = snakesim("recording", "plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run)
     assert ended.code == 0, ended.err

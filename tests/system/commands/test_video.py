@@ -38,6 +38,7 @@ def test_a_gif_shows_the_snake_in_every_picture(run: Path) -> None:
             assert (blue > red + 40).sum() > 100, f"no blue snake in picture {frame}"
 
 
+@pytest.mark.slow
 def test_an_mp4_is_one(run: Path) -> None:
     out = run.parent / "film.mp4"
     assert film(run, out) == ""

@@ -4,6 +4,8 @@ import random
 import tomllib
 from pathlib import Path
 
+import pytest
+
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 FIELDS = {"friction_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005, "response_time_s": 0.01}
@@ -18,6 +20,7 @@ viscous_nm_s_per_rad = 0.1 # a guess
 """
 
 
+@pytest.mark.slow  # python -m verification commissioning
 def test_hidden_parameters_are_found_and_written_down(tmp_path: Path) -> None:
     pick = random.Random(7)
     truth = {

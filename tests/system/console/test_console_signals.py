@@ -10,7 +10,6 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from docs.site.screenshots import recording
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.report import page
 from snakesim_operator.results.run_log import RunRecord
@@ -18,6 +17,7 @@ from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.browser import CHROMIUM, MISSING, Browser, Tab, chromium
+from verification.screenshots import recording
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 

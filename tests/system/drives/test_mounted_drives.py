@@ -22,6 +22,7 @@ def plain() -> RunSummary:
     return ran()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "others"),
     [

@@ -17,6 +17,7 @@ SHORT = ["triplet", "--backend", "dynamixel", "--duration", "2.5", "--in-process
 BARE = [*SHORT, "--unset", "robot.sensors.imu"]  # and these servos have no contact sensors, whatever the file says
 
 
+@pytest.mark.slow
 def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is_estimated(tmp_path: Path) -> None:
     watched = [*BARE, "--set", "mission.localization=dead_reckoning", "--out", "watched"]
     blind = [*BARE, "--unset", "robot.sensors.pose", "--out", "blind"]

@@ -43,6 +43,7 @@ def images_of(config: RunConfig) -> list[DepthImage]:
     return list(found.values())
 
 
+@pytest.mark.slow
 def test_a_robot_on_can_sees_what_the_simulated_robot_sees_from_the_same_place() -> None:
     can = images_of(config_of("backend=can"))
     assert [image.tick for image in can] == list(range(0, 40, 5))[: len(can)] and len(can) >= 7

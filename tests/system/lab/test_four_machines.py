@@ -71,6 +71,7 @@ def until(lab: Lab, words: str, *arguments: str) -> None:
         time.sleep(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
 def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_path: Path, backend: str) -> None:
     """With `can` the joints are emulated modules, on a bus in the host's memory.

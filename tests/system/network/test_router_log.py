@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from snakesim_hal.network.router_log import LINES_PER_INTERVAL, MAX_BURST_LINES, MAX_LINE_CHARACTERS, RouterLog
 
 ACL, TLS, LINK = (
@@ -90,6 +92,7 @@ def test_what_comes_again_is_counted() -> None:
     assert reported(*[line(put)] * 1000) == [first, f"999 times more: {first}"]
 
 
+@pytest.mark.slow
 def test_a_flood_of_different_lines_is_bounded() -> None:
     said: list[str] = []
     log = RouterLog(said.append)

@@ -41,6 +41,7 @@ def test_who_comes_on_is_not() -> None:
     assert reported[GAVE_UP] is False and reported["crossed"] is True
 
 
+@pytest.mark.slow
 def test_endless_code_is_stopped_and_the_worker_goes_on(tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS)
     began = time.monotonic()

@@ -64,6 +64,7 @@ def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key
     assert reader.finished and following.begin  # what follows was read
 
 
+@pytest.mark.slow  # one flipped bit in one of them below
 def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Path) -> None:
     for chunk in chunks(whole):
         for at in (chunk.begin, chunk.begin + 2, chunk.begin + 45, chunk.end - 5):  # kind, length, name, data

@@ -1,5 +1,7 @@
 """The lease: one holder at a time, for one term, and a new epoch for every new holder."""
 
+import dataclasses
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -71,6 +73,13 @@ def test_the_refusal_says_how_long_it_may_take() -> None:
 def test_live_until_the_last_nanosecond() -> None:
     assert HELD.is_live(1000) and not HELD.is_live(1001) and not FREE.is_live(0)
     assert free_lease(HELD) == Lease(epoch=4) and renew_lease(HELD, 2000, TERM).expires_ns == 2050
+
+
+def test_nobody_changes_a_lease_in_place() -> None:
+    for held in (HELD, LeaseDecision(HELD)):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            held.lease = FREE  # pyright: ignore[reportAttributeAccessIssue]
+    assert Lease() == Lease(None, 0, 0, 0)
 
 
 REQUESTS = st.tuples(

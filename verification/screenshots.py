@@ -1,7 +1,7 @@
 """Pictures of the console for the documentation, of a recorded run or of one that it starts.
 
-python -m docs.site.screenshots runs/clutter docs/console.png --at 5 --dark
-python -m docs.site.screenshots 'peg_row --stay' docs/console-live.png --click 'Take control' --click Parameters
+python -m verification.screenshots runs/clutter docs/console.png --at 5 --dark
+python -m verification.screenshots 'peg_row --stay' docs/console-live.png --click 'Take control' --click Parameters
 """
 
 import argparse
