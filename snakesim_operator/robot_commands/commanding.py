@@ -8,7 +8,7 @@ from pathlib import Path
 from snakesim_hal.programs.arguments import add_duration, add_json, add_network, add_unchecked
 from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
-from snakesim_operator.robot_commands.simulator_order import SIMULATOR_COMMANDS
+from snakesim_operator.robot_commands.simulator_commands import SIMULATOR_COMMANDS
 
 URGENT = -10  # niceness of an emergency stop
 

@@ -23,7 +23,6 @@ from snakesim_operator.results import last_run
 
 STATUS_WAIT_S = 1.0  # for the messages of a network
 ONE_ATTEMPT_S = 0.0  # as a time to connect: Zenoh tries once, and reports a refused connection at once
-HOST_SERVICE = "hal"
 
 
 @dataclass(frozen=True)
@@ -101,11 +100,9 @@ class _NetworkMessages:
         self.processes: dict[str, list[Process]] = {}  # by robot
 
     def read(self, session: Session) -> None:
-        """Subscribe, and collect messages for STATUS_WAIT_S; not at all if no host is alive on the network."""
+        """Subscribe, and collect messages for STATUS_WAIT_S."""
         arrivals: Mailbox[Arrival] = Mailbox()
         prefix = "" if self._link.namespace is not None else "**/"
-        if not session.present(f"{prefix}{keys.alive_key(HOST_SERVICE)}"):
-            return
         for key in self._decoders:
             session.on_latched_arrival(f"{prefix}{key}", arrivals.put)
         live = set(session.present(f"{prefix}{keys.PROCESS_ALL}"))

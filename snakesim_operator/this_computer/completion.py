@@ -3,8 +3,8 @@
 source <(snakesim completion bash)        # in ~/.bashrc
 source <(snakesim completion zsh)         # in ~/.zshrc
 
-Not by shtab: bash and zsh get the same function, which real shells test, and the smallest installation completes too,
-without one more dependency.
+Not by shtab: it completes commands, options and choices, but names of scenarios, robots and keys would need a function
+in each shell's language. Here bash and zsh get the same function, and the smallest installation completes, too.
 """
 
 import argparse

@@ -5,6 +5,7 @@ from base64 import b64encode
 
 import msgspec
 import numpy as np
+import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import SERVICES, offer_plugin
