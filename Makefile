@@ -77,7 +77,7 @@ fuzz: $(stamp) ## Bad payloads into every decoder, then over the network of a ro
 attack: $(stamp) ## Every attack of a stranger on the network, in full (ARGS="-k a4"); make test has the quick form
 	SNAKESIM_ATTACK=full $(bin)/python -m pytest tests/attack --timeout 900 $(ARGS)
 
-kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear and end (TRIALS=300, ARGS="--seed 2")
+kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, reset and end (TRIALS=300, ARGS="--seed 2")
 	$(bin)/python -m tests.soak.kills --trials $(TRIALS) $(ARGS)
 
 soak: $(stamp) ## A long run with faults at random, and an operator who recovers (MINUTES=30, ARGS="--backend can --seed 2")
@@ -108,9 +108,10 @@ bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link bes
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
 	$(bin)/python -m tests.golden
 
-schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
-	$(bin)/snakesim schemas --write schemas
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults, commands
+	$(bin)/snakesim schema --out schemas
 	$(bin)/python -m tests.kinds_table
+	$(bin)/python -m tests.commands_page
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

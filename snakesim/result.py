@@ -45,7 +45,7 @@ class Result:
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All signals split into columns by name, each (ticks,), as in the tables of `snakesim export`."""
+        """All signals split into columns by name, each (ticks,), as in the tables of `snakesim recording export`."""
         return table(self.record)
 
     @property
@@ -188,7 +188,7 @@ class Result:
         return Path(path)
 
     def compare(self, other: "Result") -> str:
-        """Return the differences between this run and another one, as `snakesim compare` prints them."""
+        """Return the differences between this run and another one, as `snakesim study compare` prints them."""
         from snakesim_operator.results.compare.difference import differ
         from snakesim_operator.results.compare.table import table as format_table
 

@@ -284,7 +284,7 @@ class Robot:
         Raises:
             RefusedError: The cause is still present, or the robot does not confirm.
         """
-        self._send_request(LifecycleRequest(action="clear", who=get_user_name()), "cleared")
+        self._send_request(LifecycleRequest(action="reset", who=get_user_name()), "reset")
 
     def estop(self) -> None:
         """Trigger the emergency stop, over the stop port and over the network.

@@ -28,7 +28,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     # Number of joints of each channel, tail to head. Empty: distributed evenly.
     joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
     # Where emulated joint modules run: `here` (virtual bus), as a `process` that this one starts, or `none`: real
-    # modules, or `snakesim modules` in another terminal. Default: `here` without channels, `none` with them.
+    # modules, or `snakesim drive emulate can` in another terminal. Default: `here` without channels, `none` with them.
     emulators: Literal["here", "process", "none"] | None = None
     physics_model: str = (
         "mujoco"  # body that the emulators' motors move: an entry point in the group `snakesim.physics_models`
@@ -36,7 +36,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     physics_model_settings: dict[str, Any] = {}
     # Of the emulators: joint -> how its module is mounted in truth, to see what a wrong robot file does.
     mounted: dict[str, MountedModule] = {}
-    faults: list[str] = []  # of the emulators, such as "mute:joint_3@2"; `snakesim modules --help` lists them
+    faults: list[str] = []  # of the emulators, such as "mute:joint_3@2"; `snakesim drive emulate can --help` lists them
     contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # default: the robot file's
     imu_rate_hz: Annotated[float, from_zero(1e4, "Hz")] = 5.0
     watchdog_s: Annotated[float, Meta(ge=0.02, le=0.1, extra_json_schema={"unit": "s"})] = 0.1

@@ -31,7 +31,7 @@ def main() -> int:
     """The command's exit code.
 
     Ctrl-C ends a command at once, by the signal itself, also during import and exit, where
-    Python would print a traceback. `snakesim run` and `snakesim modules`, which must shut
+    Python would print a traceback. `snakesim run` and `snakesim drive emulate can`, which must shut
     down in order, handle the signal themselves.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):

@@ -35,7 +35,9 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     motor_gain_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0
     # Longest time that the snake may take to come to rest before the run begins.
     settle_s: Annotated[float, from_zero(60, "s")] = 3.0
-    suspended: bool = False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim identify`
+    suspended: bool = (
+        False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim robot identify`
+    )
     tether: Tether | None = None
 
 

@@ -63,7 +63,15 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
         stack.callback(_end, service)
         mine, its = socket_pair()
         with its:
-            out = ["--once", "--end-after-fault", "1", "--out", str(folder), "--channel", str(its.fileno())]
+            out = [
+                "--end-after-duration",
+                "--end-after-fault",
+                "1",
+                "--out",
+                str(folder),
+                "--parent-socket",
+                str(its.fileno()),
+            ]
             host = way.robot.module(
                 "snakesim_hal.programs.host_program", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
             )

@@ -251,7 +251,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         return observation, sum(terms.values()), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return a picture of the robot in its scene, (height, width, 3), drawn as by `snakesim video`.
+        """Return a picture of the robot in its scene, (height, width, 3), drawn as by `snakesim recording video`.
 
         Raises:
             gymnasium.error.ResetNeeded: There is no robot before the first `reset`, nor after `close`.

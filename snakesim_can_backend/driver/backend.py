@@ -24,7 +24,7 @@ class CanBackend(DriveBackend):
     """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
 
     Settings = CanSettings
-    reset_grace_cycles = 0  # the monitor itself gives modules time to follow a clear
+    reset_grace_cycles = 0  # the monitor itself gives modules time to follow a reset
     modules: JointModules
     _sample_builder: SampleBuilder
 

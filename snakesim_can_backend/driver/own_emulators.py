@@ -42,7 +42,9 @@ def check_emulators(config: RunConfig, settings: CanSettings) -> None:
             f'["vcan0"]'
         )
     if settings.faults and settings.emulators_run == "none":
-        raise ConfigError("`backends.can.faults` are for emulators; give them to `snakesim modules --fault` instead")
+        raise ConfigError(
+            "`backends.can.faults` are for emulators; give them to `snakesim drive emulate can --fault` instead"
+        )
     for text in settings.faults:
         parse_fault(text, config.robot.chain.modules)
 
@@ -95,7 +97,7 @@ def start_local_emulators(
 
 
 class EmulatorProcess:
-    """`snakesim modules` as a child that dies with this process."""
+    """`snakesim drive emulate can` as a child that dies with this process."""
 
     def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
         """Start the child, and wait until its modules are on the bus.

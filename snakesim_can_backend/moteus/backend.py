@@ -1,4 +1,4 @@
-"""The backend `moteus`, and `snakesim moteus`, which emulates controllers as a process."""
+"""The backend `moteus`: moteus controllers, real or emulated."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -6,7 +6,6 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
-from snakesim_can_backend.can_drives.command import run
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured_gains, needed_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
@@ -69,8 +68,3 @@ class MoteusBackend(CanDriveBackend):
                 f"`.kd` from {needed_kd:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
                 f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`"
             )
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `snakesim moteus`."""
-    return run(MoteusBackend, "moteus", argv)

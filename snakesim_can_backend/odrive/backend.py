@@ -1,4 +1,4 @@
-"""The backend `odrive`, and `snakesim odrives`, which emulates axes as a process."""
+"""The backend `odrive`: ODrive axes, real or emulated."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,6 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
-from snakesim_can_backend.can_drives.command import run
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.odrive.axes import (
     EMULATED_CONSTANT_NM_PER_A,
@@ -114,8 +113,3 @@ class OdriveBackend(CanDriveBackend):
         """Check also the endpoint files that the settings name."""
         read_all_endpoints(settings.endpoints)
         super().check_drives(config, settings, joints)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `snakesim odrives`."""
-    return run(OdriveBackend, "odrives", argv)

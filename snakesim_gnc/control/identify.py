@@ -2,7 +2,7 @@
 
 The robot hangs by its tail, head down: on the ground, friction under the body would count as friction of the joints.
 Each joint moves slowly back and forth, which shows dry friction, and on top of that shakes at frequencies that no other
-joint has. Neighbors start in opposite directions, so that the body stays near the vertical. `snakesim identify`
+joint has. Neighbors start in opposite directions, so that the body stays near the vertical. `snakesim robot identify`
 evaluates the recording.
 """
 

@@ -1,6 +1,6 @@
 """Joint check: moves one joint after another a little to one side, back, to the other side and back, from tail to head.
 
-The other joints hold. The load of each gear reverses on the way, so that its backlash shows. `snakesim joints check`
+The other joints hold. The load of each gear reverses on the way, so that its backlash shows. `snakesim robot check`
 evaluates afterwards what the motors, the encoders and the IMUs measured.
 """
 

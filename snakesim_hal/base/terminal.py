@@ -38,6 +38,10 @@ def print_line(line: str) -> None:
     print(escape_invisible(line), flush=True)
 
 
+def discard_line(_line: str) -> None:
+    """Print nothing, where a function wants a `PrintLine`."""
+
+
 @contextmanager
 def tolerate_failed_output() -> Iterator[None]:
     """Make failed writes harmless within, because a robot moves: a closed pipe or terminal, a full disk."""

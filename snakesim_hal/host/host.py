@@ -74,7 +74,7 @@ class HostOptions:
 
     # The end of the run.
     max_ticks: int | None = None  # end so many ticks after the first arming; None: on request only
-    end_after_fault_s: float | None = None  # robot time; None: stay, so that a person can clear the fault
+    end_after_fault_s: float | None = None  # robot time; None: stay, so that a person can reset the fault
     clock_mode_after_fault: ClockMode = "realtime"  # of ticks that wait for no service
     stay: bool = False  # count only armed ticks, and record little in between; else count all from the first arming
 
@@ -182,7 +182,7 @@ class Host:
 
     @property
     def requests(self) -> list[str]:
-        """Requests to arm, disarm, clear, finish or stop: who sent them, and the result."""
+        """Requests to arm, disarm, reset, finish or stop: who sent them, and the result."""
         return self._requests.log
 
     @property
@@ -529,7 +529,7 @@ class Host:
     # --- faults and the end ----------------------------------------------------------------------------------
 
     def _restore_estop(self) -> None:
-        """Begin in `estop` if an earlier host of this robot was stopped and the stop was not cleared."""
+        """Begin in `estop` if an earlier host of this robot was stopped and the stop was not reset."""
         latched = self._latch.left_by_earlier_host
         if latched is not None:
             request = EstopRequest(who=f"{latched.who[:40]}, before this host")
@@ -543,7 +543,7 @@ class Host:
         self._state.ending.request("failed", cause)
 
     def _follow_fault(self) -> None:
-        """Stop waiting for services after a fault; wait for them again after it is cleared."""
+        """Stop waiting for services after a fault; wait for them again after it is reset."""
         clock = self._state.clock
         if self.authority.state not in ("fault", "estop"):
             if self._faulted_tick is not None:

@@ -107,7 +107,7 @@ class RequestHandler:
         answer = self._with_host(answer)
         self._log_request(request, answer)
         self._status.publish()
-        if isinstance(request, LifecycleRequest) and request.action == "clear" and answer.ok:
+        if isinstance(request, LifecycleRequest) and request.action == "reset" and answer.ok:
             self._latch.release(make_reply(reply, answer))
         else:
             reply(answer)

@@ -104,7 +104,7 @@ class StatusReporter:
             isolated=authority.isolated_joints,
             # Faults.
             faults=authority.faults,
-            faults_left_out=authority.faults_since_clear.left_out,
+            faults_left_out=authority.faults_since_reset.left_out,
             injected=list(state.faults.active),
             # Commands.
             lease_holder=authority.lease.holder,

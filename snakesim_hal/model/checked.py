@@ -24,7 +24,7 @@ JointNames = Annotated[list[Words], Meta(max_length=MAX_JOINTS)]
 
 
 class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
-    """The section [checked], which `snakesim joints check` writes."""
+    """The section [checked], which `snakesim robot check` writes."""
 
     # Who checked what, and when.
     by: Words

@@ -45,7 +45,7 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     # Revolutions to either side that the cable of a joint without end stops can take; none: it has end stops.
     cable_turns: Annotated[float, above(100, "turns")] | None = None
 
-    # Date at which the cable was unwound with the joint at its zero; `snakesim joints zero` writes it.
+    # Date at which the cable was unwound with the joint at its zero; `snakesim robot calibrate zero` writes it.
     cable_unwound: Text = ""
 
     # Motion.

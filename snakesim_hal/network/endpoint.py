@@ -49,8 +49,8 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
     raise ConfigError(
         f"{origin} {shorten(endpoint)}: anyone who reaches this address could command the robot, because "
         "clients are not "
-        f"authenticated. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
-        f"`snakesim run --router ENDPOINT`), or accept it with --insecure"
+        f"authenticated. Listen on loopback, let the robot join a router with access control (`snakesim start router "
+        f"FILE`, `snakesim run --router ENDPOINT`), or accept it with --insecure"
     )
 
 

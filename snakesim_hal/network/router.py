@@ -1,4 +1,4 @@
-"""Runs a Zenoh router from a JSON5 file: `snakesim router`."""
+"""Runs a Zenoh router from a JSON5 file: `snakesim start router`."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The HAL host as a program: `snakesim host SCENARIO`; `python -m snakesim_hal.programs.host_program` for a run's own.
+"""The HAL host as a program: `snakesim start host SCENARIO`; `python -m snakesim_hal.programs.host_program` in a run.
 
 It opens the backend, and runs until it receives a stop signal, or until the run that it belongs to is over.
 """
@@ -48,10 +48,12 @@ GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than t
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
-    parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
+    parser = argparse.ArgumentParser(
+        prog="snakesim start host", description="Run the HAL host of a robot, with its backend."
+    )
     add_host(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim host", lambda: host(process_options(arguments, hosts=True)))
+    return run_tool("snakesim start host", lambda: host(process_options(arguments, hosts=True)))
 
 
 def host(given: ProcessOptions) -> int:
@@ -59,7 +61,7 @@ def host(given: ProcessOptions) -> int:
 
     A simulator that is reset becomes another host, in the same process.
     """
-    if given.arguments.channel is None:
+    if given.arguments.parent_socket is None:
         check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
     if host.ended == "reset":
@@ -125,12 +127,12 @@ def _create_host(
     backend_with_faults, faults = create_host_faults(config, backend, session)
     options = HostOptions(
         # The end of the run.
-        max_ticks=round(config.duration_s * config.rate_hz) if arguments.once else None,
+        max_ticks=round(config.duration_s * config.rate_hz) if arguments.end_after_duration else None,
         end_after_fault_s=arguments.end_after_fault,
         stay=arguments.end_after_fault is None,
         # What connects the host with its surroundings.
         latch=EstopLatch(folder),
-        starter=HostEnd.from_descriptor(arguments.channel),
+        starter=HostEnd.from_descriptor(arguments.parent_socket),
         realtime_warnings=realtime_warnings,
         # The robot.
         faults=faults,

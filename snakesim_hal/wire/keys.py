@@ -80,7 +80,7 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(
         LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"
     ),
-    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
+    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, reset, finish; replies Answer"),
     KeyRow(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
     KeyRow(
         SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator; replies Answer"

@@ -28,7 +28,7 @@ A_JOINT = "one entry a joint"
 MAX_CONFIG = 500_000  # characters
 RANGE_SLACK_FRACTION = 0.05  # of the stated range of a camera or lidar: room for noise at its ends
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
-LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
+LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a reset")
 HOST = about("random id of the host process, new at each start; null: unknown")
 
 
@@ -489,7 +489,7 @@ class Status(Message, frozen=True, kw_only=True):
     commands_standby: Annotated[q.Count, about("valid commands while disarmed: received, not enacted")]
     commands_rejected: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")]
     commands_limited: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")]
-    faults: Annotated[list[Fault], Meta(max_length=64), about("since the last clear; not all of them stop the robot")]
+    faults: Annotated[list[Fault], Meta(max_length=64), about("since the last reset; not all of them stop the robot")]
     alive: Annotated[list[q.Name], Meta(max_length=64), about("services of the run with a liveliness token")]
     waiting_for: Annotated[list[q.Name], Meta(max_length=64), about("services that arming waits for")]
     overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
@@ -502,7 +502,7 @@ class Status(Message, frozen=True, kw_only=True):
         dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque left by derating")
     ] = {}
     isolated: Annotated[
-        list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a clear")
+        list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a reset")
     ] = []
     host: Annotated[q.Name | None, HOST] = None
     faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
@@ -549,8 +549,8 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/lifecycle`. Arming names robot and backend, so that the wrong one is not armed."""
 
     action: Annotated[
-        Literal["arm", "disarm", "clear", "finish"],
-        about("clear leads from fault or estop to disarmed; finish disarms, and ends the run"),
+        Literal["arm", "disarm", "reset", "finish"],
+        about("reset leads from fault or estop to disarmed; finish disarms, and ends the run"),
     ]
     who: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
     host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
@@ -584,7 +584,7 @@ def make_arm_request(robot: Description, who: str, *, unchecked: bool = False) -
 
 
 class EstopRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
+    """Query payload on `hal/estop`; needs no lease. Latched until `reset` on `hal/lifecycle`."""
 
     who: Annotated[q.Name, about("name of the requester, for status, log and summary")]
 

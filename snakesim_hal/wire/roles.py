@@ -27,7 +27,7 @@ class Role(StrEnum):
 ROLE_DESCRIPTIONS: dict[Role, str] = {
     Role.ROBOT: "the HAL host on the robot's computer, with what runs beside it there",
     Role.GNC: "guidance, navigation and control of one robot",
-    Role.OPERATOR: "a person who arms, disarms, clears, stops, and asks for a speed or a direction",
+    Role.OPERATOR: "a person who arms, disarms, resets, stops, and asks for a speed or a direction",
     Role.VIEWER: "a person who watches, and may stop the robot",
     Role.RECORDER: "a process that writes down everything",
     Role.ADMINISTRATOR: "an operator who may also read the routers' own state, and inject faults if the lab allows it",

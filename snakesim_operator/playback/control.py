@@ -362,7 +362,7 @@ def replay_control(
     comparison = replay.run()
     if out is not None:
         write_config(replay.config, out / CONFIG)
-        say(f"replayed: {out}; `snakesim compare {path} {out}` shows the difference")
+        say(f"replayed: {out}; `snakesim study compare {path} {out}` shows the difference")
     if replay.stopped:
         say(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
     elif not comparison.recorded:

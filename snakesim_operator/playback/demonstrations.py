@@ -2,7 +2,7 @@
 
 The operator drives the robot by `snakesim teleop`, the console or from ROS, while this command records. Enter begins an
 episode and ends it; then s, f or d mark it as succeeded, failed, or to be dropped; q ends the command. Each episode is
-a recording of its own, and a line of EPISODES, from which `snakesim export --format lerobot` makes a data set.
+a recording of its own, and a line of EPISODES, from which `snakesim recording export --format lerobot` makes a dataset.
 """
 
 import signal
@@ -106,7 +106,8 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
     print_line(
-        f"{demonstrations.kept} episodes; `snakesim export {folder} --format lerobot` makes a data set of {folder}"
+        f"{demonstrations.kept} episodes; `snakesim recording export {folder} --format lerobot` makes a dataset "
+        f"of {folder}"
     )
     return 1 if demonstrations.failure else 0
 

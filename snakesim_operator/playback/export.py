@@ -1,4 +1,4 @@
-"""`snakesim export`: a run as a table (CSV, Parquet), as arrays (NumPy), as a LeRobot dataset, or a whole MCAP file.
+"""`snakesim recording export`: a run as a table (CSV, Parquet), as arrays (NumPy), a LeRobot dataset or a whole MCAP.
 
 A table has a row for each tick since the first arming. Its columns have the units in their names, and what they are of
 behind a dot: `angle_rad.joint_1`, `position_w_m.x`. What is not known is empty (CSV, Parquet) or NaN. What the record

@@ -1,4 +1,4 @@
-"""`snakesim info`: what a recording holds, and what it lacks."""
+"""`snakesim recording info`: what a recording holds, and what it lacks."""
 
 import contextlib
 import json

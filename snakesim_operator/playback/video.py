@@ -1,4 +1,4 @@
-"""`snakesim video`: a film of a recorded run, as MP4 or GIF, rendered by MuJoCo without a screen."""
+"""`snakesim recording video`: a film of a recorded run, as MP4 or GIF, rendered by MuJoCo without a screen."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence

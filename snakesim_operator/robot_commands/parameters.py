@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import msgspec
@@ -22,7 +22,7 @@ from snakesim_hal.base.errors import (
     suggest_word,
 )
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.network.session import Reader, Session, open_session
 from snakesim_hal.wire import keys
@@ -239,11 +239,15 @@ def known_name(name: str, settings: ControlSettings) -> str:
     return name.removeprefix(PREFIX)
 
 
-def list_parameters(where: RobotSelection) -> int:
+def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
     """Print all parameters for `snakesim param list`."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
         settings = read_settings(session)
     parameters = read_parameters(settings)
+    if as_json:
+        content = [{**asdict(parameter), "name": PREFIX + parameter.name} for parameter in parameters]
+        print_json({"controller": settings.controller, "set_by": settings.who, "parameters": content})
+        return 0
     if settings.who is None:
         origin = "from its configuration"
     else:
@@ -258,13 +262,16 @@ def list_parameters(where: RobotSelection) -> int:
     return 0
 
 
-def get_parameter(name: str, where: RobotSelection) -> int:
-    """Print one value alone, for scripts that use `snakesim param get`."""
+def get_parameter(name: str, where: RobotSelection, *, as_json: bool) -> int:
+    """Print one value alone, for `snakesim param get`."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
         settings = read_settings(session)
     field = known_name(name, settings)
     value = next(parameter.value for parameter in read_parameters(settings) if parameter.name == field)
-    print_line(format_value(value))
+    if as_json:
+        print_json({name: value})
+    else:
+        print_line(format_value(value))
     return 0
 
 

@@ -50,7 +50,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
         files: the run's folder; closed by this function.
         ending: the reasons for the end that are known so far.
         outcome: what the host and the processes reported.
-        stay: whether faults that a person could clear are part of the run, not its end.
+        stay: whether faults that a person could reset are part of the run, not its end.
 
     Returns:
         The exit code: 0, or 1 on a fault or an early end, 3 when the record has gaps, 130 when interrupted.
@@ -85,7 +85,7 @@ def note_reasons(ending: Ending, host: HostRecord, config: RunConfig, *, stay: b
         ending: gets the reasons.
         host: statistics of the host.
         config: configuration of the run.
-        stay: whether faults that a person could clear are part of the run, not its end.
+        stay: whether faults that a person could reset are part of the run, not its end.
     """
     if not stay:
         for fault in host.faults:
@@ -178,14 +178,14 @@ def _print_paths(folder: Path) -> None:
         if path.is_file():
             print_line(f"{title + ':':<9}{path}")
     if (folder / SUMMARY).is_file() and not extras.is_installed("report"):
-        print_line(f"report:  not written; {pip_install('report')}, then `snakesim report {folder}`")
+        print_line(f"report:  not written; {pip_install('report')}, then `snakesim recording report {folder}`")
 
 
 def _print_kept_stop(robot: Description) -> None:
-    """Print how to clear an emergency stop, if one is stored."""
+    """Print how to reset an emergency stop, if one is stored."""
     stop = robot_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
     if stop.is_file():
-        print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` ends that")
+        print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim robot reset` ends that")
 
 
 def _print_host(host: HostRecord) -> None:

@@ -21,7 +21,7 @@ LOOK_S = 0.25
 INTERRUPT_LIMIT_S = 3.0  # after Ctrl-C, for the present step; Python code is interrupted long before
 OVERDUE_S = 5.0  # after a step is due, the same
 FAILED, INTERRUPTED = 1, 130
-WHERE = "What was recorded until then is in the run's folder; `snakesim report FOLDER` shows it"
+WHERE = "What was recorded until then is in the run's folder; `snakesim recording report FOLDER` shows it"
 
 
 def run_guarded(act: Callable[[Pulse | None], int], *, owns_process: bool) -> int:

@@ -1,4 +1,4 @@
-"""`snakesim host`: the HAL host of a robot alone, with its record. Services join it from this or other machines."""
+"""`snakesim start host`: the HAL host of a robot alone, with its record. Services join it from any machine."""
 
 import argparse
 import contextlib

@@ -54,7 +54,7 @@ class RunMonitor:
             supervisor: of the run's processes, already started.
             ending: collects the reasons for which the run ends.
             say: prints a line for the operator.
-            stay: whether a fault does not end the run; a person clears it and arms again.
+            stay: whether a fault does not end the run; a person resets it and arms again.
             unchecked: whether to arm also without a check of the joints.
         """
         # Collaborators.
@@ -244,7 +244,7 @@ class RunMonitor:
         latched = f"{status.lifecycle}: {status.why}"
         if latched != self._last_latched:
             self._say(latched)
-            self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
+            self._say(f"  go on with `snakesim robot reset`, then `snakesim robot arm {status.robot} {status.backend}`")
         self._last_latched = latched
 
     def _arm_once(self) -> None:

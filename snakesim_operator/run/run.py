@@ -55,7 +55,7 @@ class RunRequest:
 
     # Arming and faults.
     unchecked: bool = False  # arm also a robot whose joints have not been checked
-    stay: bool = False  # a fault does not end the run: processes are started again, a person clears and arms
+    stay: bool = False  # a fault does not end the run: processes are started again, a person resets and arms
 
     # Output.
     record: bool = True  # every message, in recording.mcap
@@ -227,7 +227,7 @@ class _RunProcesses:
 
     def _start_host(self) -> None:
         arguments = ["snakesim_hal.programs.host_program", *self._scenario, *self._listening]
-        arguments += ["--once", "--memory", self.supervisor.memory]
+        arguments += ["--end-after-duration", "--memory", self.supervisor.memory]
         if self.request.router is not None or self.request.with_router:
             arguments += ["--router", self.link.endpoint]
         else:

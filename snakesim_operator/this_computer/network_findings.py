@@ -45,7 +45,7 @@ def routers(where: RobotSelection) -> Iterator[Finding]:
                 took_s = time.monotonic() - began
                 robots = ", ".join(robots_on(session)) or "no robot"
         except SnakesimError as error:
-            fix = ["snakesim router    # there; and is a firewall between?"]
+            fix = ["snakesim start router    # there; and is a firewall between?"]
             yield Finding(what="endpoint", state="fail", detail=f"{link.endpoint}: {error}", fix=fix)
             continue
         yield Finding(what="endpoint", state="ok", detail=f"{link.endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")

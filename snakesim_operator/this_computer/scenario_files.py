@@ -1,4 +1,4 @@
-"""`snakesim scenarios` lists the shipped files; `snakesim config` shows every value that a scenario results in."""
+"""`snakesim scenario list` lists the shipped files; `snakesim config` shows every value that a scenario results in."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Replays depth images from a file, whose lines are as `snakesim echo sensor/depth/head > head.jsonl` prints them."""
+"""Replays depth images from a file, made by `snakesim topic echo sensor/depth/head > head.jsonl`."""
 
 import bisect
 from itertools import pairwise
@@ -65,7 +65,7 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
             f"the recording of camera {camera.name!r}, {file}, cannot be read: {error}; "
-            f"make one with `snakesim echo sensor/depth/{camera.name} > {file}`"
+            f"make one with `snakesim topic echo sensor/depth/{camera.name} > {file}`"
         ) from error
     flaw = _find_flaw(images)
     if flaw is not None:

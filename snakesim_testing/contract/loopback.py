@@ -153,7 +153,7 @@ class Hosted:
         return self.backend.seen[-1].tick if self.backend.seen else -1
 
     def lifecycle(self, action: Any) -> Answer:
-        """Arm (naming robot, backend and configuration), disarm or clear."""
+        """Arm (naming robot, backend and configuration), disarm or reset."""
         robot = self.robot
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
@@ -165,7 +165,7 @@ class Hosted:
         if self.host.authority.state == "armed":
             self.lifecycle("disarm")
         elif self.host.authority.state != "disarmed":
-            self.lifecycle("clear")
+            self.lifecycle("reset")
         self.controller.plan = plan
         deadline = time.monotonic() + LIMIT_S
         while not (answer := self.lifecycle("arm")).ok and time.monotonic() < deadline:

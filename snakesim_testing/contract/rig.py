@@ -245,15 +245,15 @@ class Rig:
         assert self.authority.state == "armed", f"no longer armed: {self.authority.reason}"
 
     def disarm(self) -> None:
-        """Disarm, or clear a stop."""
+        """Disarm, or reset a stop."""
         if self.authority.state == "armed":
             self.authority.on_lifecycle(LifecycleRequest(action="disarm"), self._now_ns)
         else:
-            self.clear()
+            self.reset()
 
-    def clear(self) -> None:
-        """Clear a stop, and end isolations."""
-        self.authority.on_lifecycle(LifecycleRequest(action="clear"), self._now_ns)
+    def reset(self) -> None:
+        """Reset a stop, and end isolations."""
+        self.authority.on_lifecycle(LifecycleRequest(action="reset"), self._now_ns)
 
     def estop(self) -> None:
         """Emergency stop."""

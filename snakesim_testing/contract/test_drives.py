@@ -16,13 +16,13 @@ def go_on(_rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("then", [go_on, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
-def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an_arming(
+def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an_arming(
     rig: Rig, drives: EmulatedDrives, then: Callable[[Rig], None]
 ) -> None:
     """A host that does nothing for 1 s while a joint moves: every drive stops by its own watchdog.
 
     Once the host goes on, the backend reports each of those stops as a fault of its joint, whatever the operator asks
-    for first. No drive is enabled again before the fault is cleared and the robot armed.
+    for first. No drive is enabled again before the fault is reset and the robot armed.
     """
     rig.cruise()
     rig.spoiled = True
@@ -37,12 +37,12 @@ def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an
     silent = [joint.name for joint in rig.robot.joints if joint.name not in named]
     assert not silent, f"their stop was never reported: {silent}; reported were {record.faults}"
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
-    rig.clear()
+    rig.reset()
     must_stay_off(rig, drives, t.ARMING_PERIODS)
-    cleared = rig.tick
+    reset_tick = rig.tick
     rig.cruise()
-    assert all(drives.enabled()), f"cleared and armed, and enabled are {drives.enabled()}"
-    assert not rig.since(cleared).faults, rig.since(cleared).faults
+    assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
+    assert not rig.since(reset_tick).faults, rig.since(reset_tick).faults
 
 
 def must_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:

@@ -107,7 +107,7 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -
 
 @undisturbed
 def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: Hosted) -> None:
-    """Whatever the controller still sends; and only a clear ends it."""
+    """Whatever the controller still sends; and only a reset ends it."""
     ticks = moves_then(silent=False, hosted=hosted)
     at = hosted.armed_at + ticks
     hosted.backend.planted = lambda tick: Fault(tick=tick, what="planted", cause="by the test") if tick >= at else None
@@ -116,8 +116,8 @@ def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: Hosted) -> 
     assert {fault.what for fault in hosted.host.authority.faults} == {"planted"}
     must_have_moved_before(hosted.host.authority.faults[0], hosted)
     must_come_to_rest_after(hosted.host.authority.faults[0], hosted)
-    assert not hosted.lifecycle("arm").ok, "a fault has to be cleared first"
-    answer = hosted.lifecycle("clear")
+    assert not hosted.lifecycle("arm").ok, "a fault has to be reset first"
+    answer = hosted.lifecycle("reset")
     assert answer.ok and answer.lifecycle == "disarmed", answer
 
 

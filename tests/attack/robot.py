@@ -26,7 +26,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Robot:
-    """A run, and somebody who may clear and arm it."""
+    """A run, and somebody who may reset and arm it."""
 
     run: Run
     operator: Stranger

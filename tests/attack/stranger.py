@@ -237,7 +237,7 @@ class Stranger:
                 if self.follows():
                     return
             elif status["lifecycle"] in ("fault", "estop"):
-                last = self.request("clear")
+                last = self.request("reset")
             elif status["ready_to_arm"]:
                 last = self.request("arm")
             time.sleep(0.05)
@@ -251,7 +251,7 @@ class Stranger:
             if status["lifecycle"] == "disarmed" and status["ready_to_arm"]:
                 return
             if status["lifecycle"] != "disarmed":
-                self.request("disarm" if status["lifecycle"] == "armed" else "clear")
+                self.request("disarm" if status["lifecycle"] == "armed" else "reset")
         raise AssertionError(f"not ready to arm within {limit_s:g} s: {self.status()['why']}")
 
     def follows(self, commands: int = 10, limit_s: float = 1.5) -> bool:

@@ -13,7 +13,7 @@ from tests.attack.stranger import Stranger
 def test_a12_who_disarms_clears_and_arms_is_told(robot: Robot) -> None:
     operator = robot.operator
     with Stranger(robot.endpoint) as stranger:
-        for action, before in (("disarm", None), ("arm", "ready"), ("clear", "estop")):
+        for action, before in (("disarm", None), ("arm", "ready"), ("reset", "estop")):
             if before == "estop":
                 operator.ask("hal/estop", {"who": "operator"})
             elif before == "ready":
@@ -53,7 +53,7 @@ def test_a13_a_stop_outlives_its_run_and_its_folder_until_it_is_cleared(tmp_path
             operator.until(lambda: operator.lifecycle() == "armed", "armed", 2.0)
         status = operator.next("hal/status")
         assert status["lifecycle"] == "estop", status["why"]
-        operator.recover()  # cleared and armed by a person, it moves
+        operator.recover()  # reset and armed by a person, it moves
         assert run.interrupt() == 130
     with running(tmp_path, *STANDING, name="three") as run, joined(run) as operator:
         operator.until(lambda: operator.lifecycle() == "armed", "armed")

@@ -78,7 +78,7 @@ def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot
 
 def printed_safely(robot: Robot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
-    told = {f"snakesim {tool}": robot.run.tell(tool).said for tool in ("status", "estop", "clear")}
+    told = {f"snakesim {tool}": robot.run.tell(*tool.split()).said for tool in ("status", "estop", "robot reset")}
     for who, said in {**told, "the run": robot.run.said()[len(before) :]}.items():
         assert not steering(said), f"{who} prints {said!r}"
         assert not any(line.startswith("planar13: armed - all is well") for line in said.splitlines()), said
@@ -91,7 +91,7 @@ def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robo
     robot.operator.until(lambda: robot.operator.lifecycle() == "estop", "the stop")
     robot.run.wait_for("evil")
     assert "evil" in robot.run.tell("status").out
-    echoed = robot.run.tell("echo", "hal/status", "--count", "1")
+    echoed = robot.run.tell("topic", "echo", "hal/status", "--count", "1")
     assert EVIL in json.loads(echoed.out)["message"]["why"] and not steering(echoed.said), echoed.said
     printed_safely(robot, said)
 
@@ -100,7 +100,7 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robo
     said = robot.run.said()
     with Stranger(robot.endpoint) as stranger:
         stranger.ask("hal/lease", {"action": "acquire", "holder": EVIL, "priority": 255})
-        for action in ("disarm", "clear", "arm"):
+        for action in ("disarm", "reset", "arm"):
             stranger.request(action, who=EVIL)
         time.sleep(0.3)
         printed_safely(robot, said)

@@ -31,7 +31,7 @@ def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
         assert stranger.ask("hal/estop", {"who": "mallory"})[0]["ok"]
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "estop", "estop")
         assert "mallory" in robot.operator.next("hal/status")["why"]
-        assert stranger.request("clear", who="mallory")["ok"]
+        assert stranger.request("reset", who="mallory")["ok"]
         robot.operator.recover()
         assert stranger.request("disarm", who="mallory")["ok"]
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "disarmed", "disarmed")
@@ -100,7 +100,7 @@ def test_an_impostor_keeps_tools_from_saying_yes_but_not_a_stop_from_the_robot(r
         ended = robot.run.tell("estop")
         assert robot.operator.stopped_at(asked_s, 3.0) and ended.code == 0, ended.said  # its own stop port says so
         assert "WARNING: 2 answered in its name" in ended.said
-        assert robot.run.tell("clear").code == 1
+        assert robot.run.tell("robot", "reset").code == 1
 
 
 def test_anybody_may_release_the_lease_which_stops_the_robot(robot: Robot) -> None:

@@ -416,7 +416,7 @@ class TakesUpTheOldTarget(Workbench):
         self.was_armed = self.was_armed or (not armed and self.old is not None)
 
 
-@breaks("after_clear_and_arm_it_moves_again")
+@breaks("after_reset_and_arm_it_moves_again")
 class NeverWakesAgain(Workbench):
     stopped = False
 
@@ -445,7 +445,7 @@ class RepeatsItsFaults(Workbench):
         return [Fault(tick=0, what="silent", cause=f"joint {i} is silent") for i in self.silent]
 
 
-FROZEN = "drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an_arming"
+FROZEN = "drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an_arming"
 
 
 @breaks(FROZEN)

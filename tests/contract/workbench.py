@@ -41,7 +41,7 @@ class DrivesWorkbench(Workbench):
         super().__init__(config, settings)
         joints = len(self.angle)
         self.enabled = np.zeros(joints, dtype=bool)
-        self.tripped = np.zeros(joints, dtype=bool)  # by the watchdog, until a clear
+        self.tripped = np.zeros(joints, dtype=bool)  # by the watchdog, until a reset
         self.reported = np.zeros(joints, dtype=bool)
         self.braked_s = 0.0
         self.was: LifecycleState = "disarmed"

@@ -24,7 +24,7 @@ def lab_folder(folder: Path, joints: int, scenario: str, files: Mapping[str, str
 def host(home: Path, backend: str) -> Iterator[str]:
     """A host, disarmed; its endpoint."""
     endpoint = free_endpoint()
-    program = [*SNAKESIM, "host", "bench.toml", "--backend", backend, "--endpoint", endpoint]
+    program = [*SNAKESIM, "start", "host", "bench.toml", "--backend", backend, "--endpoint", endpoint]
     with subprocess.Popen(program, cwd=home, env=environment(home), stdin=subprocess.DEVNULL) as process:
         try:
             wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")

@@ -36,7 +36,7 @@ def machine() -> Iterator[Machine]:
 @contextmanager
 def drives(machine: Machine, folder: Path, ready: str, *command: str) -> Iterator[None]:
     """Emulated drives of another program on the bus."""
-    log, typed = folder / "drives.log", (command[0], "triplet", "--channel", CHANNEL, *command[1:])
+    log, typed = folder / "drives.log", ("drive", "emulate", command[0], "triplet", "--channel", CHANNEL, *command[1:])
     process = machine.start(SNAKESIM, *typed, log=log, hurried=True)
     try:
         wait_until(lambda: f"{ready} ready: 13" in log.read_text(), f"the {ready}")
@@ -61,15 +61,15 @@ def completes(machine: Machine, folder: Path, *arguments: str, backend: str = "c
 
 
 def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: Machine, tmp_path: Path) -> None:
-    with drives(machine, tmp_path, "modules", "modules"):
-        found = machine.run(SNAKESIM, "can", "scan", CHANNEL)
+    with drives(machine, tmp_path, "modules", "can"):
+        found = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
         assert found.count(CHANNEL) == 13, found
         completes(machine, tmp_path, "--controller", "hold", "--duration", "2")
 
 
 @pytest.mark.parametrize(
     ("driver_type", "command", "of"),
-    [pytest.param("odrive", "odrives", "axes", marks=pytest.mark.slow), ("moteus", "moteus", "controllers")],
+    [pytest.param("odrive", "odrive", "axes", marks=pytest.mark.slow), ("moteus", "moteus", "controllers")],
 )
 def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_says_they_are_mounted(
     machine: Machine, tmp_path: Path, driver_type: str, command: str, of: str
@@ -89,12 +89,12 @@ def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpre
 ) -> None:
     """Beside the driver compiled code without end stops the host: what is left is the modules' own watchdog."""
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
-    with drives(machine, tmp_path, "modules", "modules"):
+    with drives(machine, tmp_path, "modules", "can"):
         beside = ("--set", "services.control.place=host", *LISTENING)
         bad = ("--controller", "./bad.py:Controller", "--clock-mode", "realtime", "--duration", "60", *beside)
         said = run(machine, tmp_path, *bad)
         assert "(exit code 1)" in said, said
-        found = machine.run(SNAKESIM, "can", "scan", CHANNEL)
+        found = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
         assert found.count("watchdog") == 13 and " armed" not in found, said + found
 
 

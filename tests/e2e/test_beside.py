@@ -56,7 +56,7 @@ def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) ->
         run.wait_for("fault: ")
 
         def armed() -> bool:
-            asked = (("clear",), ("arm", "planar13", "sim"))
+            asked = (("robot", "reset"), ("robot", "arm", "planar13", "sim"))
             return [command.tell(run, *one).code for one in asked][-1] == 0
 
         wait_until(armed, "a robot that is armed again")

@@ -1,4 +1,4 @@
-"""`snakesim joints zero|direction|gear|limits`, on a host whose drives somebody turns by hand."""
+"""`snakesim robot calibrate zero|direction|gear|limits`, on a host whose drives somebody turns by hand."""
 
 import json
 import subprocess
@@ -71,7 +71,7 @@ def robot(home: Path) -> RobotFile:
 
 def told(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
     """A command that somebody answers by moving joints and pressing Enter."""
-    return background(home, "joints", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
+    return background(home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
 
 
 def line(process: subprocess.Popen[str]) -> str:
@@ -92,7 +92,7 @@ def seen(home: Path, endpoint: str, angle_rad: float) -> None:
     """Wait until the host publishes an angle of joint_1."""
 
     def published() -> bool:
-        said = snakesim("echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
+        said = snakesim("topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
         return abs(json.loads(said)["message"]["angle_rad"][0] - angle_rad) < 1e-3
 
     wait_until(published, f"joint_1 at {angle_rad} rad")
@@ -109,7 +109,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
                 hold(home, pose_rad)
                 assert ("the other way round" if SIGN[joint] < 0 else "as the file says") in line(process)
             assert "1 joints changed" in line(process) and process.wait(20) == 0
-        stale = snakesim("joints", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
+        stale = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
         assert stale.code == 2 and "restart the host with this file" in stale.err
     hold(home, [0.0] * JOINTS)
     with host(home, BACKEND) as endpoint:
@@ -126,7 +126,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
             assert "45 of 45 degrees: as the file says" in line(process) and process.wait(20) == 0
         hold(home, [0.0] * JOINTS)
         seen(home, endpoint, ZERO_RAD[0])
-        assert snakesim("joints", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0
+        assert snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0
     found = robot(home).joint_table
     assert [joint.drive.sign for joint in found] == SIGN.tolist()
     assert [joint.drive.zero_rad for joint in found] == pytest.approx(ZERO_RAD.tolist(), abs=1e-3)
@@ -152,10 +152,10 @@ def test_an_armed_robot_a_shipped_file_and_an_unknown_joint_are_refused(home: Pa
     with running(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
         run.wait_for(" of 600 s")  # armed
         for words, code, why in (
-            (("zero", "snake.toml", "--now"), 1, "snakesim disarm"),
+            (("zero", "snake.toml", "--now"), 1, "snakesim robot disarm"),
             (("zero", "planar13", "--now"), 2, "your own robot file"),
             (("limits", "snake.toml", "joint_9"), 2, "joint_1 to joint_4"),
         ):
-            refused = run.tell("joints", *words)
+            refused = run.tell("robot", "calibrate", *words)
             assert refused.code == code and why in refused.err, refused.said
     assert (home / "snake.toml").read_bytes() == before

@@ -33,7 +33,7 @@ def test_a_turn_that_a_drive_has_forgotten_is_not_wound_again(tmp_path: Path) ->
     drives(tmp_path, 0.0)
     with host(tmp_path, BACKEND) as endpoint:
         assert "joint_1: how far its cable is wound is not known" in why(tmp_path, endpoint)
-        declared = snakesim("joints", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=tmp_path)
+        declared = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=tmp_path)
         assert declared.code == 0 and "its cable counts as unwound here" in declared.out, declared.said
     assert robot(tmp_path).joint_table[0].limits.cable_unwound
     with host(tmp_path, BACKEND) as endpoint:

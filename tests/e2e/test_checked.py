@@ -67,7 +67,7 @@ def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) 
 
     checking = run(home, "check", "--controller", "joint_check", "--duration", "4")
     assert checking.code == 0, checking.out
-    judged = snakesim("joints", "check", "check", "snake.toml", "--straight", cwd=home)
+    judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
     assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints are as the robot file says" in judged.out, judged.out
     text = (home / "snake.toml").read_text()
     assert "[checked]" in text and 'serials = ["A1", "B2", "C3"]' in text
@@ -80,5 +80,5 @@ def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) 
     (home / "snake.toml").write_text(f"{text}\n[joints.joint_2]\nsign = -1\n")
     changed = run(home, "changed", "--duration", "0.1")
     assert changed.code == 1 and "how its joints are mounted was changed in its file since" in changed.out
-    again = snakesim("joints", "check", "check", "snake.toml", "--straight", cwd=home)
+    again = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
     assert again.code == 2 and "says otherwise how the joints are mounted" in again.err

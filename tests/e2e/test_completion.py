@@ -17,21 +17,22 @@ ASKED = 'COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _snakesim; printf "%s\\n" "$
 ASK = {"bash": f'source "$1"; shift; {ASKED}', "zsh": f'source "$1"; shift; setopt ksharrays; {ASKED}'}
 TYPED: dict[str, tuple[list[str], set[str]]] = {
     "command": (["ru"], {"run"}),
-    "all commands": ([""], {"run", "echo", "fault", "can", "modules", "completion"}),
+    "all commands": ([""], {"run", "topic", "fault", "drive", "lab", "completion"}),
     "scenario": (["run", ""], set(list_shipped("scenarios"))),
     "flag": (["run", "triplet", "--clo"], {"--clock-mode"}),
     "value of a flag": (["run", "triplet", "--clock-mode", "l"], {"lockstep"}),
     "controller": (["run", "--controller", ""], set(list_installed(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),
     "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
-    "of an installed package": (["can", ""], {"load", "scan", "replay", "expand"}),
-    "its argument": (["can", "load", "pe"], {"peg_row"}),
-    "its flag": (["can", "load", "peg_row", "--j"], {"--joints"}),
-    "key": (["echo", "sensor/j"], {"sensor/joints"}),
-    "kind of a fault": (["fault", "overh"], {"overheat"}),
-    "robot": (["arm", "pl"], {"planar13", "planar13_camera", "planar13_mixed"}),
+    "of an installed package": (["drive", ""], {"load", "scan", "replay", "emulate", "dbc"}),
+    "driver type": (["drive", "emulate", "o"], {"odrive"}),
+    "its argument": (["drive", "load", "can", "pe"], {"peg_row"}),
+    "its flag": (["drive", "load", "can", "peg_row", "--jo"], {"--joints"}),
+    "key": (["topic", "echo", "sensor/j"], {"sensor/joints"}),
+    "kind of a fault": (["fault", "inject", "overh"], {"overheat"}),
+    "robot": (["robot", "arm", "pl"], {"planar13", "planar13_camera", "planar13_mixed"}),
     "shell": (["completion", "z"], {"zsh"}),
-    "file": (["router", "./"], set()),  # nothing of ours: the shell completes file names
+    "file": (["start", "router", "./"], set()),  # nothing of ours: the shell completes file names
 }
 
 

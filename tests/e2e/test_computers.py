@@ -119,10 +119,10 @@ def test_a_computer_with_another_c_library_says_that_its_digest_is_its_own(tmp_p
     ended = call(typed, tmp_path, on(other, tmp_path))
     own = "its own: NumPy and C library round otherwise than on most computers with NumPy 2.2 to 2.4"
     assert ended.code == 0 and digest_in(ended).endswith(f", {own}"), ended.out + ended.err
-    told = call([*SNAKESIM, "info", "run"], tmp_path, on({}, tmp_path))
+    told = call([*SNAKESIM, "recording", "info", "run"], tmp_path, on({}, tmp_path))
     assert own in told.out
     assert call([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
-    compared = call([*SNAKESIM, "compare", "run", "usual"], tmp_path, on({}, tmp_path))
+    compared = call([*SNAKESIM, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path))
     assert "description.arithmetic.C library" in compared.out, compared.out + compared.err
 
 

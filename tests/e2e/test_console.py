@@ -160,7 +160,7 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         wait_until(lambda: "PAUSED" not in second.text(), "the end of the pause")
         stop_in(second, run)  # no limit: two pages drawn without a graphics card take seconds for a key
         first.wait_for("ESTOP")
-        first.click("Clear")
+        first.click("Reset fault")
         first.wait_for("DISARMED")
         first.send("Page.navigate", url="about:blank")  # and control is free again
         second.wait_for("nobody has control")

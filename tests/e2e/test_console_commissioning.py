@@ -89,7 +89,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         while not await moved_and_stood(viewer, relay, home):
             why = snakesim("status", "--endpoint", endpoint, cwd=home).out
             assert "lease of control expired" in why, why  # this computer was busy for longer than a lease
-            assert snakesim("clear", "--endpoint", endpoint, cwd=home).code == 0
+            assert snakesim("robot", "reset", "--endpoint", endpoint, cwd=home).code == 0
         await armed(viewer, home)
     await watching  # the page is closed
     await until(lambda: told(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")

@@ -102,14 +102,14 @@ def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
     ]
     assert {one["task"] for one in labels} == {"through the field"}
     assert {path.name for path in (demos / "demos").iterdir()} == {"episodes.jsonl", *(one["file"] for one in labels)}
-    info = snakesim("info", "demos/episode-000.mcap", cwd=demos)
+    info = snakesim("recording", "info", "demos/episode-000.mcap", cwd=demos)
     assert "operator/intent" in info.out and "sensor/depth/head" in info.out, info.said
 
 
 @pytest.mark.slow
 def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
-    given = ("export", str(demos / "demos"), "--format", "lerobot", "--images")
+    given = ("recording", "export", str(demos / "demos"), "--format", "lerobot", "--images")
     refused = snakesim(*given, "--fps", "7", "--out", "no", cwd=tmp_path)
     assert refused.code == 2 and "--fps 7: of a robot at 50 Hz give one of 1, 2, 5, 10" in refused.err
     ended = snakesim(*given, "--fps", "10", "--out", "set", cwd=tmp_path)
@@ -137,7 +137,18 @@ def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
         made = subprocess.run([UV, *command], capture_output=True, text=True, check=False)
         if made.returncode:
             pytest.skip(f"{LEROBOT} cannot be installed here: {made.stderr[-300:]}")
-    given = ("export", str(demos / "demos"), "--format", "lerobot", "--images", "--fps", "10", "--out", "set")
+    given = (
+        "recording",
+        "export",
+        str(demos / "demos"),
+        "--format",
+        "lerobot",
+        "--images",
+        "--fps",
+        "10",
+        "--out",
+        "set",
+    )
     assert "2 episodes" in snakesim(*given, cwd=tmp_path).out
     offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "PATH": "/usr/bin:/bin"}
     loaded = call([python, "-c", LOADED], tmp_path, offline, 600.0)

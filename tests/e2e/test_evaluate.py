@@ -55,7 +55,7 @@ def undisturbed(home: Path) -> tuple[Ended, Path]:
 
 
 def evaluate(home: Path, out: str, *arguments: str) -> Ended:
-    return snakesim("evaluate", "./quick.toml", "--out", out, *arguments, cwd=home)
+    return snakesim("study", "evaluate", "./quick.toml", "--out", out, *arguments, cwd=home)
 
 
 def table_of(ended: Ended) -> str:
@@ -109,7 +109,7 @@ def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None
 @pytest.mark.slow
 def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     out = home / "killed"
-    with background(home, "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)) as process:
+    with background(home, "study", "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)) as process:
         wait_until(lambda: done(out) >= 2, "two cases done")
         command_itself = psutil.Process(process.pid)
         left = command_itself.children()
@@ -140,9 +140,31 @@ STOPPED = {
     "train": ("generation 1:", "stopped/policy.onnx is the best policy until then, .* goes on with --resume"),
 }
 TYPED = {
-    "evaluate": ("./quick.toml", "--fields", "400", "--out", "stopped"),
-    "optimize": ("peg_row", "--vary", "control.propulsion_n=5:40", "--goal", "advance_m", "--storage", "stopped.db"),
-    "train": ("surveyed_clutter", "--duration", "0.2", "--population", "4", "--fields", "1", "--out", "stopped"),
+    "evaluate": ("study", "evaluate", "./quick.toml", "--fields", "400", "--out", "stopped"),
+    "optimize": (
+        "study",
+        "optimize",
+        "peg_row",
+        "--vary",
+        "control.propulsion_n=5:40",
+        "--goal",
+        "advance_m",
+        "--storage",
+        "stopped.db",
+    ),
+    "train": (
+        "policy",
+        "train",
+        "surveyed_clutter",
+        "--duration",
+        "0.2",
+        "--population",
+        "4",
+        "--fields",
+        "1",
+        "--out",
+        "stopped",
+    ),
 }
 
 
@@ -153,7 +175,7 @@ def test_ctrl_c_ends_it_at_once_and_leaves_nothing_but_its_results(command: str,
     begun, kept = STOPPED[command]
     environment_of_it = {**environment(tmp_path), "TMPDIR": str(tmp_path / "tmp")}
     with subprocess.Popen(
-        [*SNAKESIM, command, *TYPED[command], "--workers", "2"],
+        [*SNAKESIM, *TYPED[command], "--workers", "2"],
         cwd=tmp_path,
         env=environment_of_it,
         stdout=subprocess.PIPE,
@@ -185,9 +207,12 @@ def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
 def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
     address, scheduler, worker = dask()
     small = ["--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5"]
+    train = ["policy", "train", "surveyed_clutter", *small]
     with background(home, *scheduler, program=DASK), background(home, *worker, program=DASK):
-        there = snakesim("train", "surveyed_clutter", *small, "--cluster", address, "--out", "there", cwd=home)
-    here = snakesim("train", "surveyed_clutter", *small, "--workers", "1", "--out", "here", cwd=home)
+        there = snakesim(
+            "policy", "train", "surveyed_clutter", *small, "--cluster", address, "--out", "there", cwd=home
+        )
+    here = snakesim(*train, "--workers", "1", "--out", "here", cwd=home)
     assert there.code == here.code == 0, there.out + there.err + here.err
     assert (home / "there" / "policy.onnx").read_bytes() == (home / "here" / "policy.onnx").read_bytes()
 
@@ -200,7 +225,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undistur
         background(home, *scheduler, program=DASK),
         background(home, *worker, program=DASK) as lost,
         background(home, *worker, program=DASK),
-        background(home, "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)) as process,
+        background(home, "study", "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)) as process,
     ):
         wait_until(lambda: done(out) >= 2, "two cases done")
         lost.kill()
@@ -246,7 +271,7 @@ def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: t
 def test_a_sweep_runs_every_value(home: Path) -> None:
     span = "controllers.path_following.look_ahead_m=0.02:0.06:3"
     given = ["--vary", span, "--set", "duration_s=0.5", "--seeds", "2", "--set", "controller=path_following"]
-    ended = snakesim("sweep", "peg_row", *given, "--out", "sweep", cwd=home)
+    ended = snakesim("study", "sweep", "peg_row", *given, "--out", "sweep", cwd=home)
     assert ended.code == 0, ended.out + ended.err
     assert [line.split()[1] for line in table_of(ended).splitlines()[1:4]] == ["0.02", "0.04", "0.06"]
     page = re.sub(r"<(script|style).*?</\1>", "", (home / "sweep" / "evaluation.html").read_text(), flags=re.DOTALL)
@@ -255,7 +280,17 @@ def test_a_sweep_runs_every_value(home: Path) -> None:
 
 @pytest.mark.slow
 def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Path) -> None:
-    given = ["optimize", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40", "--seed", "2"]
+    given = [
+        "study",
+        "optimize",
+        "peg_row",
+        "--set",
+        "duration_s=0.5",
+        "--vary",
+        "control.propulsion_n=5:40",
+        "--seed",
+        "2",
+    ]
     given += ["--goal", "path_distance_m", "--workers", "2"]
     first = snakesim(*given, "--trials", "2", cwd=home)
     assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
@@ -273,12 +308,24 @@ def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Pat
 
 @pytest.mark.slow
 def test_a_search_on_a_row_of_a_suite_prints_an_evaluation(home: Path) -> None:
-    given = ["optimize", "./quick.toml", "--rows", "2", "--set", "controller=path_following", "--set", "duration_s=0.4"]
+    given = [
+        "study",
+        "optimize",
+        "./quick.toml",
+        "--rows",
+        "2",
+        "--set",
+        "controller=path_following",
+        "--set",
+        "duration_s=0.4",
+    ]
     given += ["--vary", "control.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1", "--seeds", "2"]
     found = snakesim(*given, "--storage", "row.db", cwd=home)
     _, said = found.out.split("best advance_m: ")
     command = shlex.split(said.splitlines()[1])
-    assert command.pop(0) == "snakesim" and command[:4] == ["evaluate", "./quick.toml", "--rows", "2"], found.out
+    assert command.pop(0) == "snakesim" and command[:5] == ["study", "evaluate", "./quick.toml", "--rows", "2"], (
+        found.out
+    )
     ended = snakesim(*command, "--controllers", "path_following", "--out", "best", cwd=home)
     assert ended.code == 0, ended.out + ended.err
     lines = (home / "best" / "cases.jsonl").read_text().splitlines()

@@ -49,13 +49,13 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
         backend,
     ]
     with armed_run(tmp_path / "run", *arguments) as run:
-        result = tell(run, "fault", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
+        result = tell(run, "fault", "inject", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
         assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
-        result = tell(run, "fault", "mute", "joint_99")
+        result = tell(run, "fault", "inject", "mute", "joint_99")
         assert result.code == 1 and "no joint_99" in result.err
-        result = tell(run, "fault", "drop", "guidance/world", "--amount", "0.2", "--for", "0.5")
+        result = tell(run, "fault", "inject", "drop", "guidance/world", "--amount", "0.2", "--duration", "0.5")
         assert result.code == 0 and result.out.startswith("drop of guidance/world has begun, at "), result.err
-        result = tell(run, "fault", "mute", "joint_3", "--for", "30")
+        result = tell(run, "fault", "inject", "mute", "joint_3", "--duration", "30")
         assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), result.err
         assert run.end() == 1
     record = RunRecord.load(tmp_path / "run").host
@@ -98,7 +98,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     loaded = [tmp_path / part for part in ("host", "control")]
     with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
-            result = tell(run, "fault", *words)
+            result = tell(run, "fault", "inject", *words)
             assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()

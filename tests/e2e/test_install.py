@@ -210,14 +210,14 @@ def stops_and_arms(snakesim: Run) -> None:
     stays.start()
     wait_until(lambda: "armed" in snakesim("status", *at).out.replace("disarmed", ""), "an armed robot")
     assert snakesim("estop", *at).code == 0
-    wait_until(lambda: snakesim("clear", *at).code == 0, "a cleared stop")
-    wait_until(lambda: snakesim("arm", "planar13", "Workbench", *at).code == 0, "an armed robot again")
+    wait_until(lambda: snakesim("robot", "reset", *at).code == 0, "a reset stop")
+    wait_until(lambda: snakesim("robot", "arm", "planar13", "Workbench", *at).code == 0, "an armed robot again")
     stays.join()
 
 
 def drives_modules(snakesim: Run) -> None:
     """The driver, on a bus with emulated modules."""
-    assert "together" in snakesim("can", "load", "triplet").out
+    assert "together" in snakesim("drive", "load", "can", "triplet").out
     drives = (
         "--backend",
         "can",
@@ -256,16 +256,16 @@ def test_what_an_extra_is_for_works_with_that_extra_alone(extra: str, wheel: Pat
 NEEDS: dict[str, tuple[str, ...]] = {
     "sim": ("run", "triplet"),
     "record": ("run", *WORKBENCH),
-    "report": ("report", "run"),
-    "can": ("can", "load", "triplet"),
+    "report": ("recording", "report", "run"),
+    "can": ("drive", "scan", "can", "can0"),
     "console": ("console", "run"),
-    "export": ("export", "run", "--format", "parquet"),
-    "evaluate": ("evaluate", "clutter"),
+    "export": ("recording", "export", "run", "--format", "parquet"),
+    "evaluate": ("study", "evaluate", "clutter"),
     "foxglove": ("record", "--foxglove", "0"),
-    "lab": ("deploy", "render", "lab.toml", "--out", "lab"),
-    "preview": ("preview",),
-    "ros2": ("ros2",),
-    "video": ("video", "run", "--out", "film.mp4"),
+    "lab": ("lab", "render", "lab.toml", "--out", "lab"),
+    "preview": ("start", "preview"),
+    "ros2": ("start", "ros2"),
+    "video": ("recording", "video", "run", "--out", "film.mp4"),
 }
 
 
@@ -273,7 +273,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
 def test_the_core_alone_drives_a_robot_and_every_command_says_which_extra_it_lacks(wheel: Path, tmp_path: Path) -> None:
     snakesim, _ = lent("", wheel, tmp_path)
     listed = snakesim("--help")
-    assert listed.code == 0 and not listed.err and " estop " in listed.out and "backends:\n  can," in listed.out
+    assert listed.code == 0 and not listed.err and " estop " in listed.out and " drive " in listed.out
     completed = snakesim("completion", "bash")
     assert completed.code == 0 and not completed.err
     stops_and_arms(snakesim)

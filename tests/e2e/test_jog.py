@@ -1,4 +1,4 @@
-"""`snakesim joints jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
+"""`snakesim robot jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def home(tmp_path: Path) -> Path:
 @contextmanager
 def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The command, once it is armed, and the other end of its terminal."""
-    (ours, theirs), words = pty.openpty(), ("joints", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
+    (ours, theirs), words = pty.openpty(), ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
     try:
         with background(home, *words, stdin=theirs) as process:
             assert process.stdout is not None
@@ -82,7 +82,7 @@ def steadily(home: Path, endpoint: str, tried: Callable[[Path, str], bool]) -> N
             return
         why = snakesim("status", "--endpoint", endpoint, cwd=home).out
         assert "lease" in why, why
-        snakesim("clear", "--endpoint", endpoint, cwd=home)
+        snakesim("robot", "reset", "--endpoint", endpoint, cwd=home)
     pytest.fail("a busy computer")
 
 

@@ -63,23 +63,23 @@ class Listener:
     "form", ["quick", pytest.param("a million messages", marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
 def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
-    lab.start("router", str(lab.router_file))
+    lab.start("start", "router", str(lab.router_file))
     (lab.folder / "plain.toml").write_text(SCENE)
     hosts = {}
     for namespace, (robot, controller, _) in ROBOTS.items():
         path = lab.folder / f"{robot}.toml"
         path.write_text(SCENARIO.format(robot=robot, controller=controller, seconds=SECONDS[form]))
         network = ("--session", str(lab.session), "--namespace", namespace)
-        hosts[namespace] = lab.start("host", str(path), "--once", "--out", robot, *network)
-        lab.start("service", "control", str(path), *network)
-    wait_until(lambda: lab.tell("status").out.count("next: `snakesim arm") == 2, "both ready")
+        hosts[namespace] = lab.start("start", "host", str(path), "--end-after-duration", "--out", robot, *network)
+        lab.start("start", "service", "control", str(path), *network)
+    wait_until(lambda: lab.tell("status").out.count("next: `snakesim robot arm") == 2, "both ready")
     listener = Listener()
     with open_session(Link.from_session_file(read_session(lab.session))) as session:
         session.on_arrival("**", listener.take)
         only_one_is_armed_when_one_is_named(lab)
         for namespace, (robot, _, _) in ROBOTS.items():
             if namespace != "lab":
-                assert lab.tell("arm", robot, "sim", "--namespace", namespace).code == 0
+                assert lab.tell("robot", "arm", robot, "sim", "--namespace", namespace).code == 0
         began = time.monotonic()
         for namespace, host in hosts.items():
             assert host.wait(2500) == 0, namespace
@@ -97,12 +97,12 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
 
 def only_one_is_armed_when_one_is_named(lab: Lab) -> None:
     """A command that names no robot goes to none of two; one that names the wrong robot is refused by the right one."""
-    for arguments in (("arm", "planar13", "sim"), ("disarm",)):
+    for arguments in (("robot", "arm", "planar13", "sim"), ("robot", "disarm")):
         ended = lab.tell(*arguments)
         assert ended.code == 1 and "several robots found" in ended.err and "--namespace lab/second" in ended.err
-    wrong = lab.tell("arm", "planar13", "sim", "--namespace", "lab/second")
+    wrong = lab.tell("robot", "arm", "planar13", "sim", "--namespace", "lab/second")
     assert wrong.code == 1 and "the robot here is 'mamba', not 'planar13'" in wrong.err
-    assert lab.tell("disarm", "--namespace", "la").code == 1
-    assert lab.tell("disarm", "--namespace", "lab*").code == 2
-    assert lab.tell("arm", "planar13", "sim", "--namespace", "lab").code == 0
+    assert lab.tell("robot", "disarm", "--namespace", "la").code == 1
+    assert lab.tell("robot", "disarm", "--namespace", "lab*").code == 2
+    assert lab.tell("robot", "arm", "planar13", "sim", "--namespace", "lab").code == 0
     assert "lab/second: disarmed" in lab.tell("status", "--namespace", "lab/second").out

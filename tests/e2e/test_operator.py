@@ -1,4 +1,4 @@
-"""What a person tells a robot: arm, disarm, clear, estop; and that a stop outlives the host."""
+"""What a person tells a robot: arm, disarm, reset, estop; and that a stop outlives the host."""
 
 import os
 import signal
@@ -37,19 +37,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 def until_armed(run: Running) -> None:
     """As a person does it: until the answer is yes."""
-    wait_until(lambda: tell(run, "arm", "planar13", "sim").code == 0, "armed", 30.0)
+    wait_until(lambda: tell(run, "robot", "arm", "planar13", "sim").code == 0, "armed", 30.0)
 
 
 def test_arming_is_for_what_is_named(run: Running) -> None:
-    assert tell(run, "disarm").code == 0
+    assert tell(run, "robot", "disarm").code == 0
     for robot, backend, word in (("mamba", "sim", "'planar13', not 'mamba'"), ("planar13", "can", "'sim', not 'can'")):
-        ended = tell(run, "arm", robot, backend)
-        assert ended.code == 1 and word in ended.err and "snakesim arm planar13 sim" in ended.err
+        ended = tell(run, "robot", "arm", robot, backend)
+        assert ended.code == 1 and word in ended.err and "snakesim robot arm planar13 sim" in ended.err
     until_armed(run)
     assert "planar13: armed" in tell(run, "status").out
-    again = tell(run, "arm", "planar13", "sim")
+    again = tell(run, "robot", "arm", "planar13", "sim")
     assert again.code == 1 and "must be disarmed" in again.err
-    assert tell(run, "clear").code == 1
+    assert tell(run, "robot", "reset").code == 1
 
 
 def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
@@ -63,10 +63,14 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
     wait_until(lambda: "planar13: estop" in tell(run, "status").out, "a new host in estop", 30.0)
     assert run.part("host") != first
     status = tell(run, "status").out
-    assert "before this host" in status and "`snakesim clear" in status and "then `snakesim arm planar13 sim" in status
-    refused = tell(run, "arm", "planar13", "sim")
+    assert (
+        "before this host" in status
+        and "`snakesim robot reset" in status
+        and "then `snakesim robot arm planar13 sim" in status
+    )
+    refused = tell(run, "robot", "arm", "planar13", "sim")
     assert refused.code == 1 and "state is estop" in refused.err
-    assert tell(run, "clear").code == 0
+    assert tell(run, "robot", "reset").code == 0
     assert not kept.exists()
     until_armed(run)
     assert run.said().count("; restart in") == 1
@@ -74,7 +78,13 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
 
 @pytest.mark.slow
 def test_nobody_there(tmp_path: Path) -> None:
-    for arguments in (["estop"], ["clear"], ["arm", "planar13", "sim"], ["fault", "mute", "joint_1"], ["status"]):
+    for arguments in (
+        ["estop"],
+        ["robot", "reset"],
+        ["robot", "arm", "planar13", "sim"],
+        ["fault", "inject", "mute", "joint_1"],
+        ["status"],
+    ):
         ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
         words = "no robot answers" if arguments == ["status"] else "no robot on tcp/127.0.0.1:9"
         assert ended.code == 1 and words in ended.err + ended.out

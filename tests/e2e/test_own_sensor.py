@@ -67,16 +67,16 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             assert snapshot is not None
             text = format_sensor_table(snapshot)
             assert LEFT in text and "Whisker on link 13" in text and "bend_rad" in text and " rad" in text
-        echoed = started.tell("echo", LEFT, "--count", "1")
+        echoed = started.tell("topic", "echo", LEFT, "--count", "1")
         assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.said
         started.interrupt()  # in order: a killed recorder lacks its last half second, here that is all
-    done = command("export", "run", "--format", "csv", "--out", "whiskers.csv", cwd=tmp_path)
+    done = command("recording", "export", "run", "--format", "csv", "--out", "whiskers.csv", cwd=tmp_path)
     assert done.code in (0, 3), done.said  # 3: the run was ended from outside
     with (tmp_path / "whiskers.csv").open() as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert {"bend_rad.left", "bend_rad.right", "age_s.left"} <= rows[0].keys()
     assert all(abs(float(row["bend_rad.left"])) <= 1.4 for row in rows if row["bend_rad.left"])
-    command("export", "run", "--format", "mcap", "--out", "whole.mcap", cwd=tmp_path)
+    command("recording", "export", "run", "--format", "mcap", "--out", "whole.mcap", cwd=tmp_path)
     with (tmp_path / "whole.mcap").open("rb") as file:
         found = make_reader(file, decoder_factories=[DecoderFactory()])
         schema, _, _, whisker = next(found.iter_decoded_messages([LEFT]))

@@ -22,9 +22,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 @pytest.fixture
 def param(run: Running, tmp_path: Path):
-    def call(*words: str, robot: str = "planar13") -> Ended:
+    def call(*words: str, robot: str | None = None) -> Ended:
         verb, *more = words
-        return snakesim("param", verb, robot, *more, "--endpoint", run.endpoint, cwd=tmp_path)
+        selection = () if robot is None else ("--namespace", robot)
+        return snakesim("param", verb, *more, *selection, "--endpoint", run.endpoint, cwd=tmp_path)
 
     return call
 

@@ -50,11 +50,13 @@ class Lab:
 
     def host(self, out: str, *arguments: str) -> subprocess.Popen[str]:
         """A HAL host."""
-        return self.start("host", *SCENARIO, "--once", *arguments, "--session", str(self.session), "--out", out)
+        return self.start(
+            "start", "host", *SCENARIO, "--end-after-duration", *arguments, "--session", str(self.session), "--out", out
+        )
 
     def service(self, name: str, *arguments: str) -> subprocess.Popen[str]:
         """A service."""
-        return self.start("service", name, *SCENARIO, *arguments, "--session", str(self.session))
+        return self.start("start", "service", name, *SCENARIO, *arguments, "--session", str(self.session))
 
     def tell(self, *arguments: str) -> Ended:
         """An operator's command, on another machine."""
@@ -62,7 +64,7 @@ class Lab:
 
     def until_armed(self) -> None:
         """As a person does it: until the answer is yes."""
-        wait_until(lambda: self.tell("arm", "planar13", "sim").code == 0, "armed", 60.0)
+        wait_until(lambda: self.tell("robot", "arm", "planar13", "sim").code == 0, "armed", 60.0)
 
 
 @pytest.fixture
@@ -78,13 +80,13 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     first = lab.host("never-armed")
     waited = lab.folder / "service-control.log"
     wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
-    router = lab.start("router", str(lab.router_file))
+    router = lab.start("start", "router", str(lab.router_file))
     wait_until(lambda: "DIFFERS: `mission` is " in lab.tell("status").out, "the difference")
-    refused = lab.tell("arm", "planar13", "sim").err
+    refused = lab.tell("robot", "arm", "planar13", "sim").err
     assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
     other_goal.kill()
     lab.service("control")
-    wait_until(lambda: "next: `snakesim arm planar13 sim --session " in lab.tell("status").out, "ready to arm")
+    wait_until(lambda: "next: `snakesim robot arm planar13 sim --session " in lab.tell("status").out, "ready to arm")
     said = lab.tell("status").out
     assert all(f"  process {name}: " in said for name in ("host", *SERVICES)) and "DIFFERS" not in said, said
     first.send_signal(signal.SIGKILL)  # at tick 0, where the next host begins as well
@@ -101,9 +103,9 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
 def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     (endpoint,) = read_session(lab.session).endpoints
     monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
-    for ended in (lab.tell("disarm"), command.snakesim("disarm", cwd=lab.folder)):
+    for ended in (lab.tell("robot", "disarm"), command.snakesim("robot", "disarm", cwd=lab.folder)):
         assert ended.code == 1 and f"no robot on {endpoint}" in ended.err
-    elsewhere = command.snakesim("disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
+    elsewhere = command.snakesim("robot", "disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
     assert elsewhere.code == 1 and endpoint not in elsewhere.err
     ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")
     assert ended.code == 2 and "--router and --session" in ended.err, ended.err

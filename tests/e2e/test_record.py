@@ -72,7 +72,7 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
         run.end()
     record = RunRecord.load(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ and record.host.ended == "running" and record.control
-    result = command.snakesim("compare", "run", "run", cwd=tmp_path)
+    result = command.snakesim("study", "compare", "run", "run", cwd=tmp_path)
     assert result.code == 3 and "last second may be missing" in result.out and "its end: it breaks off" in result.err
     ended, _ = command.run_to_summary(tmp_path / "run", *SHORT)  # and its folder can be used again
     assert ended.code == 0 and "held an earlier run: moved to" in ended.out
@@ -99,7 +99,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
 
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
-        assert command.tell(run, "disarm").code == 0
+        assert command.tell(run, "robot", "disarm").code == 0
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
     assert "of 2 s" in ended and "the time was over before the requested armed time was reached" in ended

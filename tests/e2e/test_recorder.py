@@ -78,7 +78,7 @@ def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_pa
     assert len(kept) > 10
     alone = RunRecord.load(tmp_path / "beside.mcap")
     assert alone.config.name == "triplet" and len(alone.time_s) > 40
-    assert command.snakesim("report", "beside.mcap", cwd=tmp_path).code == 0
+    assert command.snakesim("recording", "report", "beside.mcap", cwd=tmp_path).code == 0
 
 
 def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`snakesim ros2` in real processes: what a ROS node would see on its own router, and what it may ask of the robot.
+"""`snakesim start ros2` in real processes: what a ROS node would see on its router, and what it may ask of the robot.
 
 The ROS side is plain Zenoh with rmw_zenoh's keys, and rosbags for the messages; nothing of the bridge is imported.
 """
@@ -65,7 +65,7 @@ def ros_router(folder: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """The router of a ROS network, and where it listens."""
     at = free_endpoint()
     (folder / "ros.json5").write_text(ROUTER % at)
-    with background(folder, "router", "ros.json5") as router:
+    with background(folder, "start", "router", "ros.json5") as router:
         yield at, router
 
 
@@ -166,11 +166,11 @@ class RosSide:
 def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
     with running(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
         run.wait_for(" s  ")
-        refused = tell(run, "ros2", "--ros-router", run.endpoint)
+        refused = tell(run, "start", "ros2", "--ros-router", run.endpoint)
         assert refused.code == 2 and "itself is on this endpoint" in refused.err
-        refused = tell(run, "ros2", "--ros-router", at, "--joint-commands")
+        refused = tell(run, "start", "ros2", "--ros-router", at, "--joint-commands")
         assert refused.code != 0 and "has a controller already, which holds the lease" in refused.err
-        bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
+        bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
         with session_at(at) as session, background(tmp_path, *bridge):
             _sees(RosSide(session))
             _steers(RosSide(session), run.endpoint)
@@ -189,7 +189,7 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
     with (
         ros_router(tmp_path) as (at, _),
         session_at(at) as session,
-        background(tmp_path, "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
+        background(tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
     ):
         assert waiting.stdout is not None and "Waiting for it up to 60 s" in waiting.stdout.readline()
         with background(tmp_path, *late):
@@ -200,7 +200,7 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
 
 
 def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
-    """Arm, command single joints, fall silent, stop, clear, disarm: all of it as a node of rmw_zenoh would."""
+    """Arm, command single joints, fall silent, stop, reset, disarm: all of it as a node of rmw_zenoh would."""
     alone = (
         "triplet",
         "--clock-mode",
@@ -212,7 +212,7 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
         "services.control.external=true",
     )
     with running(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
-        bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
+        bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
         with session_at(at) as session, background(tmp_path, *bridge):
             ros = RosSide(session)
             limp = ros.first("joint_states", "sensor_msgs/msg/JointState")
@@ -232,7 +232,7 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
             ros.trigger("stop")
             refused = ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0))
             assert not refused.success and "stop" in refused.message
-            ros.trigger("clear")
+            ros.trigger("reset")
             ros.trigger("arm")
             ros.trigger("disarm")
 

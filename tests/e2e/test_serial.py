@@ -34,7 +34,7 @@ def pose(folder: Path) -> Iterator[str]:
     said, first = folder / "servos.said", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
     with said.open("wb") as file:
         servos = subprocess.Popen(
-            [*first, *SNAKESIM, "dynamixels", "triplet", "--link", "servos", "--pose", address],
+            [*first, *SNAKESIM, "drive", "emulate", "dynamixel", "triplet", "--channel", "servos", "--pose", address],
             cwd=folder,
             env=environment(folder),
             stdout=file,
@@ -58,13 +58,13 @@ def run(folder: Path, pose: str, *arguments: str) -> Ended:
 
 
 def test_servos_of_another_program_are_found_and_driven_in_real_time(pose: str, folder: Path) -> None:
-    found = snakesim("serial", "scan", "servos", "--baud", "1000000", cwd=folder)
+    found = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
     assert found.code == 0 and found.out.count("XM540-W270 (1120)") == 13, found.said
     ended = [run(folder, pose, "--duration", "2")]
     while ended[-1].code and len(ended) < ATTEMPTS:
         ended.append(run(folder, pose, "--duration", "2"))
     assert ended[-1].code == 0, ended[-1].said
-    again = snakesim("serial", "scan", "servos", "--baud", "1000000", cwd=folder)
+    again = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
     assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, "current-based position is kept"
 
 

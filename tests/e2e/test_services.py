@@ -90,7 +90,7 @@ def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
 def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path) -> None:
     """It waits for a host, of which there is none, and says under which name."""
     for name in ("./lab/mocap.py:MotionCapture", "sensor"):
-        command = [*SNAKESIM, "service", name, "triplet", "--set", NAMED, "--endpoint", free_endpoint()]
+        command = [*SNAKESIM, "start", "service", name, "triplet", "--set", NAMED, "--endpoint", free_endpoint()]
         with subprocess.Popen(command, cwd=home, env=environment(home), stderr=subprocess.PIPE, text=True) as service:
             assert service.stderr is not None
             said = service.stderr.readline()

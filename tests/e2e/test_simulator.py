@@ -51,7 +51,7 @@ def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_
             assert len(hosts) == 2, hosts
             assert "as fast as it can" in sim("speed", "2", code=1)
             sim("pause")
-            assert tell(run, "arm", "planar13", "sim").code == 0
+            assert tell(run, "robot", "arm", "planar13", "sim").code == 0
             sim("step", "7")
             wait_until(lambda: shows("armed", 7), "7 ticks")
             wait_until(lambda: "PAUSED" in run.said(), "the pause on the terminal")
@@ -64,7 +64,7 @@ def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_
     assert (out / "recording-1.mcap").is_file() and (out / "blackbox-1.rows").is_file()
     recorded = RunRecord.load(out / "recording.mcap").host
     assert recorded.command_digest == plain.command_digest and recorded.ticks == 100
-    told = snakesim("info", str(out), cwd=tmp_path)
+    told = snakesim("recording", "info", str(out), cwd=tmp_path)
     assert told.code == 0 and "lacks" not in told.out, told.said
     replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)
     same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}  # the last may come too late

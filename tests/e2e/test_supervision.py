@@ -48,7 +48,7 @@ class Robot:
     def is_ready(self) -> None:
         wait_until(lambda: self.status().ready_to_arm, "ready to arm", BACK_S)
 
-    def tell(self, action: Literal["arm", "clear"]) -> Answer:
+    def tell(self, action: Literal["arm", "reset"]) -> Answer:
         robot = self._session.latest(keys.DESCRIPTION, Description, BACK_S)
         assert robot is not None
         request = LifecycleRequest(
@@ -62,7 +62,7 @@ class Robot:
     def is_commanded(self, times: int) -> bool:
         """Armed, too; again, where this computer was busy for longer than a lease."""
         if self.status().lifecycle == "fault":
-            self.tell("clear")
+            self.tell("reset")
         if self.status().lifecycle == "disarmed":
             self.tell("arm")
         return self.status().lifecycle == "armed" and self.status().commands_accepted > times
@@ -111,13 +111,13 @@ def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_pat
                 lambda: "control" in robot.status().alive and robot.status().lease_holder == "control", "control"
             )
             assert robot.status().lifecycle == "fault" and not robot.tell("arm").ok
-            assert robot.tell("clear").ok
+            assert robot.tell("reset").ok
             robot.is_ready()
             robot.arm()
             robot.reaches("armed")
         summary = interrupt(run)
     assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
-    assert summary.ended == "interrupted" and "go on with `snakesim clear`" in run.said()
+    assert summary.ended == "interrupted" and "go on with `snakesim robot reset`" in run.said()
 
 
 def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
@@ -131,9 +131,9 @@ def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: 
             wait_until(lambda: not robot.status().waiting_for, "everybody back", BACK_S)
             assert robot.status().lifecycle == "fault" and pids(run, "host", *SERVICES) == before
             assert "lease_expired" in [fault.what for fault in robot.status().faults]
-            for command in (["clear"], ["arm", "planar13", "sim"]):
+            for command in (["robot", "reset"], ["robot", "arm", "planar13", "sim"]):
                 result = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
-                if command == ["clear"]:
+                if command == ["robot", "reset"]:
                     assert result.code == 0, result.err
                     robot.is_ready()
             robot.reaches("armed")

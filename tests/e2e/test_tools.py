@@ -25,8 +25,8 @@ TUTORIAL = Path("docs/tutorial.md").resolve()
 
 
 def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any]]:
-    """What `snakesim echo` prints, each line read as JSON."""
-    ended = command.tell(run, "echo", key, "--count", str(count), *more)
+    """What `snakesim topic echo` prints, each line read as JSON."""
+    ended = command.tell(run, "topic", "echo", key, "--count", str(count), *more)
     assert ended.code == 0 and ended.err == "", ended.err
     lines = [json.loads(line) for line in ended.out.splitlines()]
     assert len(lines) == count and all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
@@ -36,7 +36,7 @@ def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any
 def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [*SNAKESIM, "scenarios"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            [*SNAKESIM, "scenario", "list"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     assert done.returncode == 1 and done.stderr.startswith("snakesim: ") and done.stderr.count("\n") == 1
     seen = call(["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], tmp_path)
@@ -75,13 +75,13 @@ def test_a_closed_terminal_ends_a_run_in_order(tmp_path: Path) -> None:
 
 INTERRUPTED = (
     ["config", "triplet"],
-    ["scenarios"],
-    ["can", "load", "triplet"],
-    ["schemas", "--write", "schemas"],
-    ["echo", "hal/clock"],
+    ["scenario", "list"],
+    ["drive", "load", "can", "triplet"],
+    ["schema", "--out", "schemas"],
+    ["topic", "echo", "hal/clock"],
     ["status"],
-    ["arm", "planar13", "sim"],
-    ["modules", "triplet"],
+    ["robot", "arm", "planar13", "sim"],
+    ["drive", "emulate", "can", "triplet"],
     ["run", "triplet", "--clock-mode", "realtime", "--out", "run"],
 )
 
@@ -93,7 +93,7 @@ INTERRUPTED = (
 )
 def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Path) -> None:
     """From the first line of ours on; what comes before is the interpreter's own start."""
-    on_network = words[0] in ("echo", "status", "arm", "run")
+    on_network = words[0] in ("topic", "status", "robot", "run")
     endpoint = ["--endpoint", free_endpoint()] if on_network else []
     for snapshot in range(7):
         process = subprocess.Popen(
@@ -126,7 +126,7 @@ def first_line_ran(pid: int) -> bool:
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--clock-mode", "realtime"]
     with armed_run(tmp_path / "run", *arguments) as run:
-        rate = command.tell(run, "echo", "sensor/joints", "--hz", "--count", "2")
+        rate = command.tell(run, "topic", "rate", "sensor/joints", "--count", "2")
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
         (reported,) = echoed(run, "hal/description", 1)
@@ -138,9 +138,9 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         assert {"planar13/hal/description", "planar13/hal/clock", "planar13/hal/done/guidance"} <= everything
         named = echoed(run, "*/joints", 3, "--namespace", "planar13")
         assert {line["key"] for line in named} <= {"sensor/joints", "actuator/joints"}
-        unknown = command.tell(run, "echo", "sensor/smell")
+        unknown = command.tell(run, "topic", "echo", "sensor/smell")
         assert unknown.code == 2 and "sensor/contacts" in unknown.err
-        wrong = command.tell(run, "echo", "sensor/***")
+        wrong = command.tell(run, "topic", "echo", "sensor/***")
         assert wrong.code == 2 and "is not a key" in wrong.err and wrong.err.count("\n") == 1
         status = command.tell(run, "status")
         assert status.code == 0 and "planar13: armed" in status.out and "control, guidance, navigation" in status.out

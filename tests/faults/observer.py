@@ -1,4 +1,4 @@
-"""Watches a robot from a session of its own, and stands for the operator: what came when, clear, and arm.
+"""Watches a robot from a session of its own, and stands for the operator: what came when, reset, and arm.
 
 Times are of the monotonic clock when a sample reached this process, so they are upper bounds.
 """
@@ -189,21 +189,21 @@ class Observer:
             raise TrialError(f"{kind}:{target} was refused: {answer.reason}")
         return answer
 
-    def clear(self) -> None:
-        """Clear what is latched, if anything is."""
+    def reset(self) -> None:
+        """Reset what is latched, if anything is."""
         self.until(lambda: self.status is not None, "a status")
         if self.state() in ("fault", "estop"):
             asked_ns = time.monotonic_ns()
-            self.ask(keys.LIFECYCLE, LifecycleRequest(action="clear"))
+            self.ask(keys.LIFECYCLE, LifecycleRequest(action="reset"))
 
-            def cleared() -> bool:  # if only for a moment: what goes wrong next is another fault
+            def is_reset() -> bool:  # if only for a moment: what goes wrong next is another fault
                 since = [h.message.lifecycle for h in self.statuses if h.at_ns > asked_ns]
                 return self.state() == "disarmed" or "disarmed" in since
 
-            self.until(cleared, "disarmed after clear", 5.0)
+            self.until(is_reset, "disarmed after reset", 5.0)
 
     def arm(self, limit_s: float = LIMIT_S) -> None:
-        """Clear, arm as soon as the robot is ready, and wait until the controller's commands are applied.
+        """Reset, arm as soon as the robot is ready, and wait until the controller's commands are applied.
 
         On a busy machine the lease of a robot that was just armed may expire: that is counted, and tried again.
         """
@@ -230,10 +230,10 @@ class Observer:
         return self.state() != "fault"
 
     def _make_ready(self, limit_s: float) -> None:
-        """Clear, as often as something more is told: what went wrong in the meantime is told after the clear."""
+        """Reset, as often as something more is told: what went wrong in the meantime is told after the reset."""
         deadline = time.monotonic() + limit_s
         while self.status is None or not self.status.ready_to_arm:
-            self.clear()
+            self.reset()
             left_s = max(deadline - time.monotonic(), 0.1)
             self.until(
                 lambda: self.status is not None and (self.status.ready_to_arm or self.state() in ("fault", "estop")),

@@ -30,7 +30,7 @@ period; so what must be done within the lease is done at most one period after i
 before anything was injected: a machine that is busy, or emulated, misses leases. A dash: measured before this was
 counted.
 
-**Recovery.** After each trial an operator's `clear` and `arm` bring the robot back; a trial counts as recovered when
+**Recovery.** After each trial an operator's `reset` and `arm` bring the robot back; a trial counts as recovered when
 the controller's commands are applied again. *Step*: the largest change of an applied angle target from one tick to the
 next in the 0.3 s after it (allowed: the speed limit times T, {speed:.3f} rad, or what keeps the target within
 `max_step_rad` of the measured angle). *First*: the largest distance of a first angle target from the measured angle

@@ -71,7 +71,7 @@ class Robot:
             ]  # network_cut
             module += ["--router", self.endpoint] if self.router else []
             inherits = [self.host.inherited.fileno()]
-            module += ["--channel", str(inherits[0])]
+            module += ["--parent-socket", str(inherits[0])]
         elif name == "router":
             module = ["snakesim_hal.programs.router_program", *common]
         else:

@@ -108,7 +108,7 @@ def sensor_row(name: str, fault: str, kind: str) -> Row:
 
 def isolated_row(name: str, fault: str, kind: str) -> Row:
     """One joint fails, and the robot may lose one."""
-    expected = "fault names the joint, it alone is let go; the others go on; a clear takes it back"
+    expected = "fault names the joint, it alone is let go; the others go on; a reset takes it back"
     return asked_row(name, fault, expected, partial(isolation.set_aside, kind))
 
 
@@ -134,7 +134,7 @@ def drive_row(
     return Row(
         name,
         fault,
-        "fault, which names the joint if it is one; every motor off after the braking; none on again before the clear",
+        "fault, which names the joint if it is one; every motor off after the braking; none on again before the reset",
         f"{limit_ms:.0f} ms to the stop mode: {why}",
         limit_ms,
         "ms",
@@ -200,14 +200,14 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
-        "drives stop by themselves; fault names the joint; no drive is enabled again before clear and arming",
+        "drives stop by themselves; fault names the joint; no drive is enabled again before reset and arming",
         "a watchdog, 100 ms; at 50 Hz (T = 20 ms) for the driver 3 T, and 100 ms for what drives report by themselves",
         (
             Row(
                 "drive_host_frozen",
                 "host: SIGSTOP for 1 s, then SIGCONT",
                 "every drive off by its own watchdog; each stop a fault that names its joint; none enabled again",
-                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before clear and arming",
+                f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before reset and arming",
                 0.0,
                 "drives enabled again",
                 dict.fromkeys(DRIVE_TYPES, drives.host_frozen),

@@ -138,7 +138,7 @@ def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[Loop, Stra
 
 
 def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:
-    """A period under fire; now and then somebody clears and arms."""
+    """A period under fire; now and then somebody resets and arms."""
     if run.tick % 20 == 10:
         run.lifecycle, run.wanted = "disarmed", None
     if run.tick % 20 == 15:

@@ -24,7 +24,7 @@ REAL: dict[type[Message], list[Message]] = {
     ],
     LifecycleRequest: [
         LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=ROBOT.config_hash)
-        for action in ("arm", "disarm", "clear", "finish")
+        for action in ("arm", "disarm", "reset", "finish")
     ],
 }
 LONG = 100_000

@@ -23,15 +23,15 @@ from tests.whole.damaged import Span, chunks, flipped, packed, recorded, spans
 SPOILT, WHOLE, OUT = "spoilt.mcap", "whole.mcap", "made"
 FORMATS = ("csv", "npz", "mcap", "parquet", "lerobot")
 COMMANDS: dict[str, list[str]] = {
-    "info": ["info", SPOILT],
-    "info --json": ["info", SPOILT, "--json"],
-    "report": ["report", SPOILT],
-    "compare with it": ["compare", WHOLE, SPOILT],
-    "compare it": ["compare", SPOILT, WHOLE, "--json"],
-    **{f"export {form}": ["export", SPOILT, "--format", form, "--out", OUT] for form in FORMATS},
-    "replay": ["replay", SPOILT, "--rate", "1000000"],
+    "info": ["recording", "info", SPOILT],
+    "info --json": ["recording", "info", SPOILT, "--json"],
+    "report": ["recording", "report", SPOILT],
+    "compare with it": ["study", "compare", WHOLE, SPOILT],
+    "compare it": ["study", "compare", SPOILT, WHOLE, "--json"],
+    **{f"export {form}": ["recording", "export", SPOILT, "--format", form, "--out", OUT] for form in FORMATS},
+    "replay": ["replay", SPOILT, "--speed", "1000000"],
     "replay --control": ["replay", SPOILT, "--control"],
-    "video": ["video", SPOILT, "--out", "film.gif", "--width", "32", "--height", "32", "--fps", "5"],
+    "video": ["recording", "video", SPOILT, "--out", "film.gif", "--width", "32", "--height", "32", "--fps", "5"],
     "console": ["console", SPOILT, "--port", "0"],
 }
 TRUTH = "export mcap"  # reads every message: when it says that something is lost, no other may say nothing

@@ -60,8 +60,8 @@ class Withholding:
                 return "a valid status"
             case EstopRequest():
                 return "an emergency stop"
-            case LifecycleRequest(action="disarm" | "finish" | "clear"):
-                return f"a request to {message.action}"  # a clear, because it would cover up a fault
+            case LifecycleRequest(action="disarm" | "finish" | "reset"):
+                return f"a request to {message.action}"  # a reset, because it would cover up a fault
             case LeaseRequest(action="acquire") if message.priority > PRIORITY:
                 return "a claim of higher priority"
             case LeaseRequest(action="release" | "renew") if message.epoch == live.epoch:

@@ -106,7 +106,7 @@ def small_lab(folder: Path) -> Iterator[SmallLab]:
     log, parent = folder / "router.log", os.getpid()
     with log.open("w") as out:
         router = subprocess.Popen(
-            [*SNAKESIM, "router", str(folder / "hub" / "router.main.json5")],
+            [*SNAKESIM, "start", "router", str(folder / "hub" / "router.main.json5")],
             cwd=folder,
             env=environment(folder),
             stdout=out,

@@ -1,4 +1,4 @@
-"""What `snakesim deploy render` writes is accepted by those who read it: Zenoh, systemd, and a container's compose."""
+"""What `snakesim lab render` writes is accepted by those who read it: Zenoh, systemd, and a container's compose."""
 
 import re
 import shlex
@@ -39,7 +39,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, robot in ROBOTS.items():
         text += f'\n[robots.{name}]\nmachine = "robot1"\nscenario = "triplet"\nset = ["rate_hz=50"]\n{robot}\n'
     (folder / "lab.toml").write_text(text)
-    assert main(["deploy", "render", str(folder / "lab.toml"), "--out", str(folder)]) == 0
+    assert main(["lab", "render", str(folder / "lab.toml"), "--out", str(folder)]) == 0
     return folder
 
 
@@ -77,9 +77,9 @@ def test_containers_run_what_the_units_run(rendered: Path) -> None:
 def test_what_is_no_longer_in_the_lab_is_removed_and_what_is_not_ours_stays(tmp_path: Path) -> None:
     lab = tmp_path / "lab.toml"
     lab.write_text(EXAMPLE.read_text())
-    assert main(["deploy", "render", str(lab), "--out", str(tmp_path)]) == 0
+    assert main(["lab", "render", str(lab), "--out", str(tmp_path)]) == 0
     (tmp_path / "laptop" / "notes.txt").write_text("mine")
     lab.write_text(EXAMPLE.read_text().replace('role = "viewer"', 'role = "administrator"'))
-    assert main(["deploy", "render", str(lab), "--out", str(tmp_path)]) == 0
+    assert main(["lab", "render", str(lab), "--out", str(tmp_path)]) == 0
     left = {path.name for path in (tmp_path / "laptop").iterdir()}
     assert left == {"notes.txt", "rendered.txt", "operator.planar13.json5", "administrator.planar13.json5"}

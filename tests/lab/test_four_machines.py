@@ -31,13 +31,13 @@ class Lab:
         self.machines = connected(["hub", "robot1", "ws1", "laptop"], stack)
         (folder / "lab.toml").write_text(example(folder, backend))
         for step in ("certs", "render"):
-            self.at("hub", "deploy", step, "lab.toml", "--out", ".")
+            self.at("hub", "lab", step, "lab.toml", "--out", ".")
         scenario = (*SCENARIO, "--backend", backend)
-        self.start("hub", "router", "router", str(folder / "hub" / "router.main.json5"))
-        out = ("--once", "--out", str(folder / "record"))
-        self.start("robot1", "host", "host", *scenario, *self.session("robot1", "robot.planar13"), *out)
+        self.start("hub", "router", "start", "router", str(folder / "hub" / "router.main.json5"))
+        out = ("--end-after-duration", "--out", str(folder / "record"))
+        self.start("robot1", "host", "start", "host", *scenario, *self.session("robot1", "robot.planar13"), *out)
         for name in ("guidance", "navigation", "control"):
-            self.start("ws1", name, "service", name, *scenario, *self.session("ws1", "gnc.planar13"))
+            self.start("ws1", name, "start", "service", name, *scenario, *self.session("ws1", "gnc.planar13"))
 
     def at(self, machine: str, *arguments: str, check: bool = True) -> str:
         """A `snakesim` command on one machine; what it says."""
@@ -80,8 +80,8 @@ def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_p
     with ExitStack() as stack:
         lab = Lab(tmp_path, backend, stack)
         operator, viewer = lab.session("laptop", "operator.planar13"), lab.session("laptop", "viewer.planar13")
-        until(lab, "next: `snakesim arm planar13", "status", *viewer)
-        checked = lab.at("hub", "deploy", "check", "lab.toml", "--out", ".")
+        until(lab, "next: `snakesim robot arm planar13", "status", *viewer)
+        checked = lab.at("hub", "lab", "check", "lab.toml", "--out", ".")
         assert "all is as it should be" in checked, checked
         lab.machines["laptop"].module("tests.lab.intruder", viewer[1], log=tmp_path / "intruder.log")
         refused = lab.at("laptop", "arm", "planar13", backend, *viewer, check=False)

@@ -59,7 +59,7 @@ def typed(machine: Machine, script: str, folder: Path) -> None:
                 break
             assert time.monotonic() < deadline, f"{line}: {said}\n{logs(folder)}"
             time.sleep(0.5)
-        if line.startswith("snakesim deploy example"):
+        if line.startswith("snakesim lab example"):
             own_places(folder)
 
 

@@ -154,7 +154,7 @@ A delay of 20 +- 10 ms on one interface, as `netem` makes it, is about the round
 EVENTS = """
 ## A link or a router that breaks, and comes back
 
-Until the host has stopped the robot, and from the repair until it is armed again (`clear`, then `arm`, by an operator
+Until the host has stopped the robot, and from the repair until it is armed again (`reset`, then `arm`, by an operator
 who does not wait); median / worst.
 
 | what | trials | stopped after, ms | armed again after, s |

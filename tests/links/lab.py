@@ -72,7 +72,7 @@ class Lab:
         ours, its = socket_pair()
         with its:
             arguments = ("snakesim_hal.programs.host_program", str(self._saved), "--router", "tcp/10.77.1.1:7447")
-            out = ("--out", str(self.folder), "--channel", str(its.fileno()))
+            out = ("--out", str(self.folder), "--parent-socket", str(its.fileno()))
             self.robot.module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
         return StarterEnd(ours)
 
@@ -93,12 +93,12 @@ class Lab:
         return time.monotonic() - began
 
     def arm(self, limit_s: float = START_LIMIT_S) -> float:
-        """Clear if needed, and arm as soon as the host is ready. Returns after how many s."""
+        """Reset if needed, and arm as soon as the host is ready. Returns after how many s."""
         began = time.monotonic()
         status = self.status
         if status is not None and status.lifecycle == "fault":
-            self._ask("clear")
-            self.until(lambda status: status.lifecycle == "disarmed", "cleared", limit_s)
+            self._ask("reset")
+            self.until(lambda status: status.lifecycle == "disarmed", "reset", limit_s)
         while (status := self.status) is None or status.lifecycle != "armed":
             assert time.monotonic() - began < limit_s, f"not armed: {status and status.why}"
             if status is not None and status.ready_to_arm:

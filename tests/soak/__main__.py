@@ -132,7 +132,7 @@ class Operator:
         line.recovered_s = round((time.monotonic_ns() - began_ns) * 1e-9 - event.lasts_s - SETTLE_S, 3)
 
     def _recover(self) -> None:
-        """As a person would: clear, wait until it is ready, arm, and see it move."""
+        """As a person would: reset, wait until it is ready, arm, and see it move."""
         watch = self._watch
         give_up = time.monotonic() + RECOVERY_S
         last = ""
@@ -147,7 +147,7 @@ class Operator:
                 if self._moves():
                     return
             elif status.lifecycle in ("fault", "estop"):
-                last = self._ask(keys.LIFECYCLE, LifecycleRequest(action="clear")).reason
+                last = self._ask(keys.LIFECYCLE, LifecycleRequest(action="reset")).reason
             elif status.ready_to_arm:
                 hash_ = watch.description().config_hash
                 arm = LifecycleRequest(action="arm", robot=status.robot, backend=status.backend, config_hash=hash_)

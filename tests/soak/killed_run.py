@@ -24,7 +24,7 @@ from snakesim_operator.results.summary import RunSummary
 from tests.harness.command import running
 from tests.harness.processes import parts_of, processes_with
 
-Moment = Literal["starting", "arm_session", "armed", "stopping", "clearing", "interrupted", "ending"]
+Moment = Literal["starting", "arm_session", "armed", "stopping", "resetting", "interrupted", "ending"]
 MOMENTS: tuple[Moment, ...] = get_args(Moment)
 SUPERVISOR = "supervisor"
 ROBOT = "planar13"
@@ -105,8 +105,8 @@ class Outcome:
     record: HostRecord | None = None
     summary: RunSummary | None = None
     stop_answered: bool = False
-    clear_asked: bool = False
-    clear_answered: bool = False
+    reset_asked: bool = False
+    reset_answered: bool = False
     stop_kept: bool = False
     left_behind: list[str] = field(default_factory=list[str])
 
@@ -155,7 +155,7 @@ class KilledRun:
             return self._until(lambda: self._status is not None, MOMENT_LIMIT_S)
         if not self._until(lambda: bool(self._armed), MOMENT_LIMIT_S):
             return False
-        if self._trial.moment == "clearing":
+        if self._trial.moment == "resetting":
             self._stop()
             return self._until(lambda: self._outcome.stop_answered, 5.0)
         if self._trial.moment == "ending":
@@ -195,7 +195,7 @@ class KilledRun:
         began = time.monotonic()
         acts: dict[Moment, Callable[[], None]] = {
             "stopping": self._stop,
-            "clearing": self._clear,
+            "resetting": self._reset,
             "interrupted": self._interrupt,
         }
         if self._outcome.reached and self._trial.moment in acts:
@@ -232,9 +232,9 @@ class KilledRun:
     def _stop(self) -> None:
         self._asked.append(self._asking.submit(self._ask_to_stop))
 
-    def _clear(self) -> None:
-        self._outcome.clear_asked = True
-        self._asked.append(self._asking.submit(self._ask_to_clear))
+    def _reset(self) -> None:
+        self._outcome.reset_asked = True
+        self._asked.append(self._asking.submit(self._ask_to_reset))
 
     def _ask_to_stop(self) -> None:
         with contextlib.suppress(NotConnectedError):
@@ -245,11 +245,11 @@ class KilledRun:
                 answer = self._session.request(keys.ESTOP, EstopRequest(who="kills"), 3.0)
                 self._outcome.stop_answered = answer.ok
 
-    def _ask_to_clear(self) -> None:
+    def _ask_to_reset(self) -> None:
         if self._session is not None:
             with contextlib.suppress(NotConnectedError):
-                request = LifecycleRequest(action="clear", who="kills")
-                self._outcome.clear_answered = self._session.request(keys.LIFECYCLE, request, 3.0).ok
+                request = LifecycleRequest(action="reset", who="kills")
+                self._outcome.reset_answered = self._session.request(keys.LIFECYCLE, request, 3.0).ok
 
     # --- after it ---------------------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
 """`python -m tests.soak.kills --trials 300 --seed 1`: runs whose processes are killed and frozen at random moments.
 
-Of starting, arming, moving, stopping, clearing, being interrupted and ending, on both backends. Afterwards nothing may
+Of starting, arming, moving, stopping, resetting, being interrupted and ending, on both backends. Afterwards nothing may
 be left behind, exit code 0 must mean that the time asked for was armed, nothing may have thrown, and an emergency stop
 that was answered must be on the disk. Exit code 1 when anything was wrong.
 """
@@ -26,7 +26,7 @@ WITHIN_S = {  # of the moment, the hits come
     "arm_session": 1.0,
     "armed": 0.8,
     "stopping": 0.06,
-    "clearing": 0.06,
+    "resetting": 0.06,
     "interrupted": 0.8,
     "ending": 1.0,
 }
@@ -71,10 +71,10 @@ def judge(outcome: Outcome) -> list[str]:
         if (thrown := THREW.search(text)) is not None and not _before_our_code(trial, name, text)
     ]
     wrong += _lies(outcome)
-    if outcome.stop_answered and not outcome.clear_asked and not outcome.stop_kept:
+    if outcome.stop_answered and not outcome.reset_asked and not outcome.stop_kept:
         wrong.append("an emergency stop was answered, and is not on the disk")
-    if outcome.clear_answered and outcome.stop_kept:
-        wrong.append("a clear was answered, and the emergency stop is still on the disk")
+    if outcome.reset_answered and outcome.stop_kept:
+        wrong.append("a reset was answered, and the emergency stop is still on the disk")
     if not outcome.said.strip() and outcome.code not in (None, 0) and trial.moment != "starting":
         wrong.append(f"exit code {outcome.code}, and not a word why")
     return wrong

@@ -40,7 +40,7 @@ def test_one_seed_draws_the_same_trials_of_all_moments_on_both_backends() -> Non
         ({"code": 1, "said": "fault: x", "logs": {"host": "thread panicked"}}, "host: panicked"),
         ({"code": 1, "said": "fault: x", "left_behind": ["12 python"]}, "left behind: 12"),
         ({"code": 1, "said": "fault: x", "stop_answered": True}, "not on the disk"),
-        ({"code": 1, "said": "fault: x", "clear_answered": True, "stop_kept": True}, "still on the disk"),
+        ({"code": 1, "said": "fault: x", "reset_answered": True, "stop_kept": True}, "still on the disk"),
         ({"code": 1, "said": "fault: x", "stop_answered": True, "stop_kept": True}, None),
         ({"code": 130, "said": "x", "interrupted": True}, None),
     ],

@@ -1,7 +1,7 @@
 """Processes that are killed with SIGKILL while the robot is armed, as a listener on the bus sees it.
 
-Host, control and modules are the processes of `snakesim run` and `snakesim modules`; the listener has the kernel's time
-of every frame. `pytest -rP tests/vcan/test_killed.py` prints a row for each.
+Host, control and modules are the processes of `snakesim run` and `snakesim drive emulate can`; the listener has the
+kernel's time of every frame. `pytest -rP tests/vcan/test_killed.py` prints a row for each.
 """
 
 import os
@@ -180,9 +180,9 @@ class Bench:
 
     def _is_armed(self) -> bool:
         """Once what there is has been cleared."""
-        if self.tell("arm", self.config.robot.name, self.config.backend).code == 0:
+        if self.tell("robot", "arm", self.config.robot.name, self.config.backend).code == 0:
             return True
-        print(self.tell("clear").said)
+        print(self.tell("robot", "reset").said)
         return False
 
     def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
@@ -306,11 +306,11 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, cha
     )
 
     # Whoever looks afterwards sees it.
-    scanned = snakesim("can", "scan", channel, "--seconds", "3", cwd=robot.folder)
+    scanned = snakesim("drive", "scan", "can", channel, "--duration", "3", cwd=robot.folder)
     lines = scanned.out.splitlines()
     assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
     rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]
     assert [r["node"] for r in rows] == [str(node) for node in NODES]
     assert all((r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows)
     assert len({r["serial"] for r in rows}) == JOINTS
-    print(f"| `snakesim can scan {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")
+    print(f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")

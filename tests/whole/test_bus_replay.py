@@ -1,4 +1,4 @@
-"""`snakesim can replay`: the log of a bus gives the joint states that were recorded, to the bit."""
+"""`snakesim drive replay can`: the log of a bus gives the joint states that were recorded, to the bit."""
 
 import json
 import re
@@ -35,7 +35,7 @@ def test_the_log_gives_the_recorded_states(run: Path, suffix: str) -> None:
             for frame in frames:
                 other(frame)
         log = run.with_name(f"other{suffix}")
-    ended = snakesim("can", "replay", str(run), str(log), cwd=run)
+    ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=run)
     assert ended.code == 0 and "joint states of 50 ticks are those of the record, to the bit" in ended.out
     assert "did not answer" not in ended.out
 
@@ -46,7 +46,7 @@ def test_a_lost_answer_is_found(run: Path, tmp_path: Path) -> None:
     del lines[answers[30]]
     log = tmp_path / "lost.log"
     log.write_text("".join(lines))
-    ended = snakesim("can", "replay", str(run), str(log), cwd=tmp_path)
+    ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
     assert ended.code == 1 and "joint_4 did not answer 1 Syncs in time" in ended.out
     assert "joint_4, " in ended.out and "1 of 50 ticks differ" in ended.out
 
@@ -56,7 +56,7 @@ def test_a_log_that_a_power_loss_has_cut_is_compared_up_to_there(run: Path, tmp_
     whole = run.with_name("bus.log").read_bytes()
     cut_at = whole.index(b"\n", 3 * len(whole) // 5) + 8
     log.write_bytes(whole[:cut_at])
-    ended = snakesim("can", "replay", str(run), str(log), cwd=tmp_path)
+    ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
     ticks = re.search(r"joint states of (\d+) ticks are those of the record", ended.out)
     assert ended.code == 0 and ticks is not None and 10 < int(ticks[1]) < 50, ended.out
     last = len(log.read_bytes().splitlines())
@@ -71,7 +71,7 @@ def test_what_candump_prints_without_times_gives_them_too(run: Path, tmp_path: P
         printed += f"  can0  {frame.arbitration_id:03X}   [{frame.dlc}] {data}\n"
     log = tmp_path / "printed.log"
     log.write_text(printed)
-    ended = snakesim("can", "replay", str(run), str(log), cwd=tmp_path)
+    ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
     assert ended.code == 0 and "joint states of 50 ticks are those of the record, to the bit" in ended.out, ended.out
     assert "the frames have no times" in ended.out
 
@@ -82,15 +82,15 @@ def test_a_log_of_drives_of_another_type_is_not_read_as_if_modules_had_sent_it(r
                          for tick in range(20) for node in range(1, 14))  # fmt: skip
     versions = "".join(f"(1700000001.{tick:06d}) can0 080#020404580006{tick:02X}00 R\n" for tick in range(20))
     log.write_text(heartbeats + versions)  # of axis 4; the id is that of a Sync
-    ended = snakesim("can", "replay", str(run), str(log), cwd=tmp_path)
+    ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
     assert ended.code == 1 and "280 frames, and no Sync among them: the log of another bus; " in ended.out, ended.out
     assert "frames look like ODrive's heartbeat" in ended.out
     other = tmp_path / "run"
     shutil.copytree(run, other)
     config = json.loads((other / "config.json").read_text())
     (other / "config.json").write_text(json.dumps(config | {"backend": "odrive"}))
-    ended = snakesim("can", "replay", str(other), str(log), cwd=tmp_path)
-    assert ended.code == 2 and "is a run with the backend 'odrive', and `snakesim can replay` reads" in ended.err
+    ended = snakesim("drive", "replay", "can", str(other), str(log), cwd=tmp_path)
+    assert ended.code == 2 and "is a run with the backend 'odrive', and `snakesim drive replay can` reads" in ended.err
 
 
 @pytest.mark.parametrize(
@@ -100,5 +100,5 @@ def test_what_is_no_log_is_refused(run: Path, tmp_path: Path, name: str, content
     log = tmp_path / name
     if content is not None:
         log.write_text(content)
-    ended = snakesim("can", "replay", str(run), str(log), cwd=tmp_path)
+    ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
     assert ended.code == 2 and "cannot be read as a log of a CAN bus (.log, .asc, .blf)" in ended.err

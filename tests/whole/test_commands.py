@@ -11,8 +11,8 @@ def test_the_command_alone_lists_all_by_task(tmp_path: Path) -> None:
     ended = snakesim(cwd=tmp_path)
     assert ended.code == 0 and ended.out == snakesim("--help", cwd=tmp_path).out
     tasks = [line.rstrip(":") for line in ended.out.splitlines() if line.endswith(":") and not line.startswith(" ")]
-    assert tasks[:4] == ["run", "watch", "command", "results"]
-    assert all(name in ended.out for name in ("can, ", "dynamixels, ", "modules, ")), "those of installed backends"
+    assert tasks == ["daily work", "robot", "runs and studies", "files and computers"]
+    assert all(f"  {name} " in ended.out for name in ("drive", "policy", "lab")), "those of installed packages"
 
 
 def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
@@ -31,14 +31,14 @@ def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
 
 
 def test_scenarios_lists_what_is_shipped(tmp_path: Path) -> None:
-    ended = snakesim("scenarios", cwd=tmp_path)
+    ended = snakesim("scenario", "list", cwd=tmp_path)
     assert ended.code == 0
     for name in ("triplet", "peg_row", "jam", "planar13", "mamba"):
         assert name in ended.out
 
 
 def test_echo_without_a_key_lists_the_keys(tmp_path: Path) -> None:
-    ended = snakesim("echo", cwd=tmp_path)
+    ended = snakesim("topic", "list", cwd=tmp_path)
     assert ended.code == 0, ended.err
     listed = [line.split()[0] for line in ended.out.splitlines()]
     assert listed == [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]

@@ -1,4 +1,4 @@
-"""`snakesim compare` on real runs: what it prints, the page that it leaves, and its exit code."""
+"""`snakesim study compare` on real runs: what it prints, the page that it leaves, and its exit code."""
 
 import os
 import re
@@ -26,14 +26,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_repeated_run_is_the_same(runs: Path) -> None:
-    ended = snakesim("compare", "a", "again", "--within", "0", cwd=runs)
+    ended = snakesim("study", "compare", "a", "again", "--within", "0", cwd=runs)
     assert ended.code == 0, ended.out + ended.err
     assert "no setting differs" in ended.out and "The runs are the same, joint by joint" in ended.out
     assert (runs / "again" / "compare.html").is_file()
 
 
 def test_runs_that_differ_are_told_apart(runs: Path, tmp_path: Path) -> None:
-    ended = snakesim("compare", "a", "slow", "--out", str(tmp_path / "new" / "page.html"), cwd=runs)
+    ended = snakesim("study", "compare", "a", "slow", "--out", str(tmp_path / "new" / "page.html"), cwd=runs)
     assert ended.code == 0, ended.out + ended.err
     assert re.search(r"rate_hz +100.0 -> 50.0", ended.out)
     assert "A is interpolated at the ticks of B" in ended.out
@@ -47,7 +47,7 @@ def test_runs_that_differ_are_told_apart(runs: Path, tmp_path: Path) -> None:
 
 
 def test_within_decides_the_exit_code(runs: Path) -> None:
-    ended = snakesim("compare", "a", "hold", "--within", "20", cwd=runs)
+    ended = snakesim("study", "compare", "a", "hold", "--within", "20", cwd=runs)
     assert ended.code == 1 and re.search(r"not within 20 %: B 1?\d\d\.\d % less", ended.out), ended.out + ended.err
 
 
@@ -86,16 +86,16 @@ def test_pages_are_written_to_files_only(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "link.html").symlink_to(tmp_path / "elsewhere")
     os.mkfifo(tmp_path / "pipe.html")
     for name, words in (("link.html", "is a symbolic link"), ("pipe.html", "is a pipe")):
-        ended = snakesim("compare", str(runs / "a"), str(runs / "a"), "--out", name, cwd=tmp_path)
+        ended = snakesim("study", "compare", str(runs / "a"), str(runs / "a"), "--out", name, cwd=tmp_path)
         assert ended.code == 2 and words in ended.err and ended.err.count("\n") == 1, ended.err
     assert (tmp_path / "elsewhere").read_text() == "precious"
     for name in ("pipe.html", "/dev/zero", "nowhere"):
-        ended = snakesim("compare", str(runs / "a"), name, cwd=tmp_path)
+        ended = snakesim("study", "compare", str(runs / "a"), name, cwd=tmp_path)
         assert ended.code == 2 and "folder" in ended.err and ended.err.count("\n") == 1, ended.err
 
 
 def test_wrong_input_is_refused_with_a_way_out(runs: Path, tmp_path: Path) -> None:
     other, _ = run_to_summary(tmp_path / "mamba", "mamba_hills", "--duration", "0.1")
     assert other.code == 0, other.out + other.err
-    ended = snakesim("compare", str(runs / "a"), "mamba", cwd=tmp_path)
+    ended = snakesim("study", "compare", str(runs / "a"), "mamba", cwd=tmp_path)
     assert ended.code == 2 and "planar13 with 13 joints" in ended.err and "mamba with" in ended.err

@@ -75,13 +75,13 @@ def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Pa
 
 
 COMMANDS = [
-    ["info", "a.mcap"],
-    ["report", "a.mcap"],
-    ["compare", "whole.mcap", "a.mcap"],
-    ["compare", "a.mcap", "whole.mcap", "--json"],
-    ["export", "a.mcap", "--format", "csv", "--out", "a.csv"],
-    ["export", "a.mcap", "--format", "npz", "--out", "a.npz"],
-    ["export", "a.mcap", "--format", "mcap", "--out", "copy.mcap"],
+    ["recording", "info", "a.mcap"],
+    ["recording", "report", "a.mcap"],
+    ["study", "compare", "whole.mcap", "a.mcap"],
+    ["study", "compare", "a.mcap", "whole.mcap", "--json"],
+    ["recording", "export", "a.mcap", "--format", "csv", "--out", "a.csv"],
+    ["recording", "export", "a.mcap", "--format", "npz", "--out", "a.npz"],
+    ["recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap"],
     ["replay", "a.mcap", "--control"],
 ]
 
@@ -127,12 +127,12 @@ def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole:
 def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: bytes, tmp_path: Path) -> None:
     first = chunks(whole)[0]
     written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
-    ended = snakesim("export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
+    ended = snakesim("recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
     count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
     assert ended.code == INCOMPLETE and int(ended.out.split()[0]) > count > 500  # and those for Foxglove
     reader = RecordingReader(tmp_path / "copy.mcap")
     assert len(list(reader.read_messages())) == count and reader.finished
-    told = snakesim("info", "copy.mcap", cwd=tmp_path)
+    told = snakesim("recording", "info", "copy.mcap", cwd=tmp_path)
     assert told.code == INCOMPLETE and "before it was copied: damaged in 1 place" in told.err
     assert "sensor/joints" in told.err
 
@@ -140,7 +140,7 @@ def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: by
 def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> None:
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form in ("csv", "npz"):
-        snakesim("export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+        snakesim("recording", "export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path)
     with (tmp_path / "a.csv").open() as file:
         assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
         rows = list(csv.DictReader(file))
@@ -152,7 +152,9 @@ def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Pat
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form, out in (("parquet", "a.parquet"), ("lerobot", "set")):
-        assert snakesim("export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
+        assert (
+            snakesim("recording", "export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
+        )
     assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.lacks"]
     assert "its end" in json.loads((tmp_path / "set" / "meta" / "lacks.json").read_text())["0"][0]
 
@@ -217,11 +219,11 @@ def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
 def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: bytes, tmp_path: Path) -> None:
     written(tmp_path / "whole.mcap", whole)
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
-    snakesim("report", "a.mcap", cwd=tmp_path)
+    snakesim("recording", "report", "a.mcap", cwd=tmp_path)
     page = (tmp_path / "a.html").read_text()
     assert "How the run ended is not known: the recording breaks off after 0." in page and "ended early" not in page
     assert "The record lacks something. recording: its end" in page
-    compared = snakesim("compare", "whole.mcap", "a.mcap", cwd=tmp_path)
+    compared = snakesim("study", "compare", "whole.mcap", "a.mcap", cwd=tmp_path)
     assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
     assert "in what both records hold: " in compared.out and "for all of their" not in compared.out
 
@@ -232,7 +234,7 @@ def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
         out = tmp_path / ("b.mcap" if form == "mcap" else f"a.{form}")
         out.symlink_to(tmp_path / "elsewhere")
         wanted = ["--out", "b.mcap"] if form == "mcap" else []
-        ended = snakesim("export", "a.mcap", "--format", form, *wanted, cwd=tmp_path)
+        ended = snakesim("recording", "export", "a.mcap", "--format", form, *wanted, cwd=tmp_path)
         assert ended.code == 2 and "there is a symbolic link already; choose another one with --out" in ended.err
         assert not (tmp_path / "elsewhere").exists()
 
@@ -253,7 +255,7 @@ def test_a_bad_lz4_chunk_and_an_impossible_time_are_damage_as_any_other(whole: b
     late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
     assert max(one.time_ns for one in reader.read_messages()) < 2**62 and reader.missing
-    assert snakesim("info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
+    assert snakesim("recording", "info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
 
 
 def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> None:
@@ -269,7 +271,10 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
     bomb = packed(bytes(60_000_000))
     assert len(bomb) < 10_000
     written(tmp_path / "bomb.mcap", MCAP0_MAGIC + bomb * 20)
-    for command in (["info", "bomb.mcap"], ["export", "bomb.mcap", "--format", "mcap", "--out", "o.mcap"]):
+    for command in (
+        ["recording", "info", "bomb.mcap"],
+        ["recording", "export", "bomb.mcap", "--format", "mcap", "--out", "o.mcap"],
+    ):
         ended = snakesim(*command, cwd=tmp_path)
         assert ended.code == 2 and len(ended.err.splitlines()) == 1, ended
         assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
@@ -317,6 +322,6 @@ def test_a_folder_with_a_black_box_tells_of_its_recording_too(run: Path, whole: 
         if path.is_file():
             written(tmp_path / path.name, path.read_bytes())
     written(tmp_path / RECORDING, whole[: len(whole) // 2])
-    ended = snakesim("report", ".", cwd=tmp_path)
+    ended = snakesim("recording", "report", ".", cwd=tmp_path)
     assert ended.code == INCOMPLETE and "its end: it breaks off" in ended.err
     assert len(RunRecord.load(tmp_path).time_s) == 150  # the rows are the black box's

@@ -27,16 +27,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("command", "name"),
     [
-        (["export", "--format", "csv"], "table.csv"),
-        (["export", "--format", "parquet"], "table.parquet"),
-        (["export", "--format", "npz"], "arrays.npz"),
-        (["export", "--format", "lerobot"], "dataset"),
-        (["export", "--format", "mcap"], "whole.mcap"),
-        (["plot"], "plot.pdf"),
-        (["plot"], "plot.svg"),
-        (["video", "--width", "64", "--height", "48", "--fps", "10"], "film.gif"),
-        (["video", "--width", "64", "--height", "48", "--fps", "10"], "film.mp4"),
-        (["report"], "report.html"),
+        (["recording", "export", "--format", "csv"], "table.csv"),
+        (["recording", "export", "--format", "parquet"], "table.parquet"),
+        (["recording", "export", "--format", "npz"], "arrays.npz"),
+        (["recording", "export", "--format", "lerobot"], "dataset"),
+        (["recording", "export", "--format", "mcap"], "whole.mcap"),
+        (["recording", "plot"], "plot.pdf"),
+        (["recording", "plot"], "plot.svg"),
+        (["recording", "video", "--width", "64", "--height", "48", "--fps", "10"], "film.gif"),
+        (["recording", "video", "--width", "64", "--height", "48", "--fps", "10"], "film.mp4"),
+        (["recording", "report"], "report.html"),
     ],
     ids=lambda one: one if isinstance(one, str) else "",
 )
@@ -45,7 +45,7 @@ def test_an_export_that_does_not_fit_is_named_and_leaves_nothing(
 ) -> None:
     out = tmp_path / name
     with max_file_size(FITS_BYTES):
-        ended = snakesim(command[0], str(run), *command[1:], "--out", str(out), cwd=tmp_path)
+        ended = snakesim(*command[:2], str(run), *command[2:], "--out", str(out), cwd=tmp_path)
     assert ended.code == 2 and f"{out}: cannot be written: " in ended.err, ended.out + ended.err
     assert list(tmp_path.iterdir()) == []
 

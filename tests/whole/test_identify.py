@@ -1,4 +1,4 @@
-"""`snakesim identify` on emulated modules whose parameters are hidden from it, by processes of their own."""
+"""`snakesim robot identify` on emulated modules whose parameters are hidden from it, by processes of their own."""
 
 import random
 import tomllib
@@ -30,7 +30,7 @@ def test_hidden_parameters_are_found_and_written_down(tmp_path: Path) -> None:
     sets = [word for text in (f"robot={tmp_path / 'snake.toml'}", *hidden) for word in ("--set", text)]
     ended, _ = run_to_summary(tmp_path / "run", "identify", "--backend", "can", *sets)
     assert ended.code == 0, ended.out + ended.err
-    ended = snakesim("identify", "run", "--write", "snake.toml", cwd=tmp_path)
+    ended = snakesim("robot", "identify", "run", "--write", "snake.toml", cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     assert ended.out.count("unknown: torque constant: the file has none") == 3
     text = (tmp_path / "snake.toml").read_text()
@@ -47,7 +47,7 @@ def test_a_robot_that_does_not_hang_is_not_identified(tmp_path: Path) -> None:
     sets = [word for text in given for word in ("--set", text)]
     run_to_summary(tmp_path / "run", "identify", "--duration", "12", *sets)
     (tmp_path / "snake.toml").write_text(ROBOT)
-    ended = snakesim("identify", "run", "--write", "snake.toml", cwd=tmp_path)
+    ended = snakesim("robot", "identify", "run", "--write", "snake.toml", cwd=tmp_path)
     assert ended.code == 1 and "does not move as a robot that hangs by its tail" in ended.out, ended.out + ended.err
-    ended = snakesim("identify", "run", "--write", "planar13", cwd=tmp_path)
+    ended = snakesim("robot", "identify", "run", "--write", "planar13", cwd=tmp_path)
     assert ended.code == 2 and "give the path of your own robot file" in ended.err

@@ -1,4 +1,4 @@
-"""`snakesim plot`: figures of a run as vector graphics, of any signals and of the paper."""
+"""`snakesim recording plot`: figures of a run as vector graphics, of any signals and of the paper."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -27,13 +27,13 @@ def words(path: Path) -> list[str]:
 def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     given = ["angle_rad.joint_7,target.joint_7", "torque_nm", "contact_count"]
     out = run / "chosen.svg"
-    ended = snakesim("plot", str(run), *given, "--out", str(out), "--from", "1", "--to", "2.5", cwd=run)
+    ended = snakesim("recording", "plot", str(run), *given, "--out", str(out), "--from", "1", "--to", "2.5", cwd=run)
     assert ended.code == 0, ended.err
     written = words(out)
     assert {"[rad]", "torque_nm [N·m]", "contact_count", "time [s]"} <= set(written)
     assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.00", "2.50"} <= set(written)
     light = out.read_text()
-    assert snakesim("plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
+    assert snakesim("recording", "plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
     white = "fill: #ffffff"  # the ground, or all that is written on it
     assert 0 < light.count(white) < out.read_text().count(white)
 
@@ -43,13 +43,13 @@ def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Pa
     """A notebook's window library, and TeX without a TeX."""
     (run / "matplotlibrc").write_text("text.usetex: True\n")
     inherited = {"MPLBACKEND": "module://of_a_notebook", "MATPLOTLIBRC": str(run), "PATH": "/nowhere"}
-    ended = started("plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, more=inherited)
+    ended = started("recording", "plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, more=inherited)
     assert ended.code == 0, ended.err
     assert "joint_13" in words(run / "inherited.svg")
 
 
 def test_the_papers_figures_come_from_one_command(run: Path) -> None:
-    ended = snakesim("plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run)
+    ended = snakesim("recording", "plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run)
     assert ended.code == 0, ended.err
     made = sorted(run.glob("figures/*"), key=lambda path: int(path.stem.removeprefix("figure-")))
     assert [path.name for path in made] == [f"figure-{number}.pdf" for number in range(8, 14)]
@@ -69,5 +69,5 @@ def test_the_papers_figures_come_from_one_command(run: Path) -> None:
     ],
 )
 def test_what_cannot_be_drawn_is_told(run: Path, words: list[str], why: str) -> None:
-    ended = snakesim("plot", str(run), *words, cwd=run)
+    ended = snakesim("recording", "plot", str(run), *words, cwd=run)
     assert ended.code == 2 and why in ended.err and "Traceback" not in ended.err, ended.err

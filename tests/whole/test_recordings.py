@@ -1,4 +1,4 @@
-"""The recording of a run: the record that is made of it alone, and what `snakesim info` tells of it."""
+"""The recording of a run: the record that is made of it alone, and what `snakesim recording info` tells of it."""
 
 import csv
 import json
@@ -59,13 +59,13 @@ def test_a_run_tells_of_ticks_that_never_came_to_its_recorder(run: Path, tmp_pat
             recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_ns))
     recording.close({})
     assert RunRecord.load(tmp_path / RECORDING).lacks == []  # nothing in the file itself tells
-    ended = snakesim("report", ".", cwd=tmp_path)
+    ended = snakesim("recording", "report", ".", cwd=tmp_path)
     said = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
     assert ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text(), ended.err
 
 
 def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:
-    ended = snakesim("info", str(run), "--json", cwd=tmp_path)
+    ended = snakesim("recording", "info", str(run), "--json", cwd=tmp_path)
     info = json.loads(ended.out)
     assert ended.code == 0 and info["finished"] and info["duration_s"] == pytest.approx(2.0)
     assert (info["robot"], info["scenario"], info["ticks"]) == ("planar13_camera", "clutter", 200)
@@ -73,14 +73,14 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
     assert info["keys"]["sensor/joints"]["rate_hz"] == pytest.approx(100.0) and "sensor/depth/head" in info["keys"]
     content = (run / RECORDING).read_bytes()
     (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
-    result = snakesim("info", "torn.mcap", cwd=tmp_path)
+    result = snakesim("recording", "info", "torn.mcap", cwd=tmp_path)
     assert result.code == 3 and "lacks: its end: it breaks off at " in result.out
 
 
 def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     record = RunRecord.load(run)
     for form in ("npz", "csv", "mcap"):
-        ended = snakesim("export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+        ended = snakesim("recording", "export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path)
         assert ended.code == 0, ended.err
     with np.load(tmp_path / "a.npz") as arrays:
         assert np.array_equal(arrays["angle_rad"], record.angle_rad) and arrays["joints"][0] == "joint_1"
@@ -89,14 +89,14 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     assert [float(row["target.joint_3"]) for row in rows] == record.target[:, 2].tolist()
     assert [float(row["position_w_m.y"]) for row in rows] == record.position_w[:, 1].tolist()
     assert np.array_equal(RunRecord.load(tmp_path / "a.mcap").angle_rad, record.angle_rad)
-    again = snakesim("export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path)
+    again = snakesim("recording", "export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path)
     assert again.code == 2 and "there is such a file already" in again.err
 
 
 def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     record = RunRecord.load(run)
-    ended = snakesim("export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
+    ended = snakesim("recording", "export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
     assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
     wanted = {"codebase_version": "v3.0", "fps": 100, "total_frames": 400, "total_episodes": 2}
@@ -123,8 +123,8 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["info", "report"])
 def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    assert "notes.txt is not a recording" in snakesim(command, "notes.txt", cwd=tmp_path).err
-    assert "gone" in snakesim(command, "gone", cwd=tmp_path).err
+    assert "notes.txt is not a recording" in snakesim("recording", command, "notes.txt", cwd=tmp_path).err
+    assert "gone" in snakesim("recording", command, "gone", cwd=tmp_path).err
 
 
 def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:

@@ -59,7 +59,7 @@ def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None
     before, weaker = RunRecord.load(recorded), RunRecord.load(tmp_path / "weaker")
     assert np.array_equal(before.angle_rad, weaker.angle_rad)  # the robot moved as it did
     assert not np.array_equal(before.target, weaker.target)
-    compared = snakesim("compare", str(recorded), "weaker", cwd=tmp_path)
+    compared = snakesim("study", "compare", str(recorded), "weaker", cwd=tmp_path)
     assert compared.code == 0 and "propulsion_n" in compared.out and "torque target" in compared.out
     assert "B is a replay: its robot moves as in" in compared.out
 

@@ -53,7 +53,7 @@ def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
     assert said["propulsion joints"] == "unknown"
     assert (said["locomoting"], said["last state"]) == ("100 % of the time", "Locomoting: moving"), "they are measured"
     assert said["not known"] == UNRECORDED
-    compared = snakesim("compare", "told", "untold", cwd=tmp_path)
+    compared = snakesim("study", "compare", "told", "untold", cwd=tmp_path)
     assert "propulsion joints" in compared.out and "nothing that control reported in B was recorded" in compared.out
     assert "with none" not in compared.out and UNRECORDED in compared.out + compared.err
 

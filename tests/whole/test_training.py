@@ -1,4 +1,4 @@
-"""`snakesim train`: a search in small, the same with any number of processes; what it writes drives robots."""
+"""`snakesim policy train`: a search in small, the same with any number of processes; what it writes drives robots."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ from snakesim.environments import SnakeEnv
 from snakesim.training.exported import export, learned_by
 from snakesim.training.form import FORMS, OBSERVE, Policy
 from snakesim_gnc.control.policy import POLICIES, Model
-from snakesim_operator.cli import main, parser
+from snakesim_operator.cli import main, make_parser
 from tests.e2e.documents import REPOSITORY
 
 DRAW = ("--draw", "scene.ground.friction=0.1:0.4")
@@ -25,7 +25,7 @@ SMALL = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fi
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a search with two processes."""
     out = tmp_path_factory.mktemp("train") / "two"
-    assert main(["train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]) == 0
+    assert main(["policy", "train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]) == 0
     return out
 
 
@@ -35,7 +35,9 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert rows[0]["check_reward"] and not rows[1]["check_reward"] and rows[2]["check_reward"]
     assert (trained / "curve.png").read_bytes().startswith(b"\x89PNG")
     told = {one.key: one.value for one in onnx.load(trained / "policy.onnx").metadata_props}
-    assert told["snakesim.trained_by"].startswith("snakesim train surveyed_clutter --form feeling --duration 0.5 ")
+    assert told["snakesim.trained_by"].startswith(
+        "snakesim policy train surveyed_clutter --form feeling --duration 0.5 "
+    )
     assert " ".join(DRAW) in told["snakesim.trained_by"]
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
@@ -45,7 +47,7 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_policy(trained: Path, tmp
     out.mkdir()
     first, second, *_ = (trained / "search.jsonl").read_bytes().splitlines(keepends=True)
     (out / "search.jsonl").write_bytes(first + second + b'{"rewards": [0.')  # killed while it wrote
-    typed = ["train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]
+    typed = ["policy", "train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]
     assert main(typed) == main([*typed, "--resume", "--seed", "2"]) == 2, "another search is in that folder"
     assert main([*typed, "--resume"]) == 0
     for name in ("policy.onnx", "curve.csv", "search.jsonl"):
@@ -55,7 +57,16 @@ def test_a_search_that_was_stopped_goes_on_to_the_same_policy(trained: Path, tmp
 def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) -> None:
     began = learned_by(str(trained / "policy.onnx"))
     nothing = ("--generations", "1", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.1")
-    typed = ["train", "surveyed_clutter", *nothing, "--from", str(trained / "policy.onnx"), "--spread", "0.01"]
+    typed = [
+        "policy",
+        "train",
+        "surveyed_clutter",
+        *nothing,
+        "--init",
+        str(trained / "policy.onnx"),
+        "--spread",
+        "0.01",
+    ]
     assert main([*typed, "--workers", "1", "--out", str(tmp_path / "on")]) == 0
     ended = learned_by(str(tmp_path / "on" / "policy.onnx"))
     assert ended.keys() == began.keys()
@@ -68,7 +79,7 @@ def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_number_of_processes_changes_nothing(trained: Path, tmp_path: Path) -> None:
-    main(["train", "surveyed_clutter", *SMALL, "--workers", "1", "--out", str(tmp_path / "one")])
+    main(["policy", "train", "surveyed_clutter", *SMALL, "--workers", "1", "--out", str(tmp_path / "one")])
     for name in ("policy.onnx", "curve.csv"):
         assert (tmp_path / "one" / name).read_bytes() == (trained / name).read_bytes(), name
 
@@ -78,7 +89,7 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
     values = {name: one.start + one.sigma for name, one in FORMS["feeling"].items()}
     sizes = {name: len(part.names) for name, part in env.parts.items()}
     policy = Policy.of(values, [joint.axis for joint in env.description.joints], sizes)
-    export(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "train"])
+    export(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "policy", "train"])
     model = Model(env.description, str(tmp_path / "policy.onnx"))
     random = np.random.default_rng(1)
     for _ in range(20):
@@ -98,10 +109,10 @@ def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(
     told = {one.key: one.value for one in onnx.load(POLICIES / f"{name}.onnx").metadata_props}
     page = (REPOSITORY / "docs" / "environments.md").read_text().replace("\\\n", " ")
     (given,) = [
-        line for line in page.splitlines() if line.startswith("snakesim train") and line.endswith(f"--out {out}")
+        line for line in page.splitlines() if line.startswith("snakesim policy train") and line.endswith(f"--out {out}")
     ]
     ours, documented = (
-        vars(parser().parse_args(words))
+        vars(make_parser().parse_args(words))
         for words in ([*told["snakesim.trained_by"].split()[1:], "--out", out], shlex.split(given)[1:])
     )
     assert ours == documented

@@ -21,7 +21,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def film(run: Path, out: Path, *more: str) -> str:
     size = ("--width", "96", "--height", "64", "--fps", "10")
-    ended = snakesim("video", str(run), "--out", str(out), *size, *more, cwd=run.parent)
+    ended = snakesim("recording", "video", str(run), "--out", str(out), *size, *more, cwd=run.parent)
     if "OpenGL" in ended.err:
         pytest.skip(f"no OpenGL here: {ended.err}")
     return ended.err
@@ -53,7 +53,7 @@ def test_an_mp4_is_one(run: Path) -> None:
     ],
 )
 def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) -> None:
-    ended = snakesim("video", str(run), *more, cwd=run.parent)
+    ended = snakesim("recording", "video", str(run), *more, cwd=run.parent)
     assert ended.code == 2 and said in ended.err
 
 

@@ -1,4 +1,4 @@
-"""`snakesim joints zero|direction|gear|limits`: a person moves the robot by hand, and the encoders are read.
+"""`snakesim robot calibrate zero|direction|gear|limits`: a person moves the robot by hand, and the encoders are read.
 
 This module commands no joint. The robot's host must run, and be disarmed all the time.
 """
@@ -112,7 +112,7 @@ class HandMovedRobot:
             case "disarmed" | "fault" | "estop":
                 return
             case _:
-                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim disarm` first")
+                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim robot disarm` first")
 
     def _refuse_unknown_angles(self, state: JointState) -> None:
         unknown = [joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid]
@@ -122,7 +122,7 @@ class HandMovedRobot:
 
 @contextmanager
 def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[HandMovedRobot]:
-    """Connect to the selected robot. Raises SnakesimError. command: for messages, such as `joints zero`."""
+    """Connect to the selected robot. Raises SnakesimError. command: for messages, such as `robot calibrate zero`."""
     must_be_own(path)
     with open_session(only_robot(selection, command), CONNECT_S) as session:
         yield HandMovedRobot(session, path)
@@ -130,7 +130,7 @@ def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[Ha
 
 def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
     """Write the present pose as the straight pose into a robot file. Return 0. Raises SnakesimError."""
-    with _connect(path, selection, "joints zero") as robot:
+    with _connect(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
             print_line("Lay the robot straight on a flat floor, let go of it, then press Enter.")
             list(robot.read_angles_rad(_line_was_typed))
@@ -164,7 +164,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
     """
     values: dict[str, dict[str, Any]] = {}
     unknown: list[str] = []
-    with _connect(path, selection, "joints direction") as robot:
+    with _connect(path, selection, "robot calibrate direction") as robot:
         for joint in choose_joints(robot.joints, names, path):
             instruction = f"turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more, and hold it still"
             turn = _wait_for_turn(robot, joint, instruction)
@@ -176,7 +176,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
                 print_line(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
                 values[joint.name] = {"sign": -joint.drive.sign}
     _write_values(path, values, "turned by hand")
-    return _report_unknown(unknown, f"snakesim joints direction {path}")
+    return _report_unknown(unknown, f"snakesim robot calibrate direction {path}")
 
 
 def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: float) -> int:
@@ -193,7 +193,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
     """
     unknown: list[str] = []
     wrong: list[str] = []
-    with _connect(path, selection, "joints gear") as robot:
+    with _connect(path, selection, "robot calibrate gear") as robot:
         for joint in choose_joints(robot.joints, names, path):
             instruction = f"turn what is ahead of it {DIRECTIONS[joint.axis]} by {degrees:g} degrees, and hold it still"
             turn = _wait_for_turn(robot, joint, instruction)
@@ -210,7 +210,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
                 wrong.append(joint.name)
     if wrong:
         print_line(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")
-    exit_code_of_unknown = _report_unknown(unknown, f"snakesim joints gear {path}")
+    exit_code_of_unknown = _report_unknown(unknown, f"snakesim robot calibrate gear {path}")
     return 1 if wrong else exit_code_of_unknown
 
 
@@ -264,7 +264,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
     Returns:
         0; 1 if one of them was not moved from end to end.
     """
-    with _connect(path, selection, "joints limits") as robot:
+    with _connect(path, selection, "robot calibrate limits") as robot:
         watched = choose_joints(robot.joints, names, path)
         print_line("Move each joint by hand from end to end, slowly; then press Enter.")
         travel = _watch_travel(robot)
@@ -284,7 +284,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
             values[joint.name] = {"angle_min_rad": lower, "angle_max_rad": upper}
             print_line(f"{joint.name:<10} {lower:+.3f} to {upper:+.3f} rad")
     _write_values(path, values, "end to end by hand")
-    return _report_unknown(unknown, f"snakesim joints limits {path}")
+    return _report_unknown(unknown, f"snakesim robot calibrate limits {path}")
 
 
 def _watch_travel(robot: HandMovedRobot) -> Travel | None:

@@ -1,4 +1,4 @@
-"""`snakesim joints check`: judges a run of the joint check, prints the verdicts, and marks the robot as checked."""
+"""`snakesim robot check`: judges a run of the joint check, prints the verdicts, and marks the robot as checked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from pathlib import Path
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.checked import CHECK, PROPERTIES, JointProperty, StartCheckRecord, mounting_digest
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
@@ -38,13 +38,14 @@ class CheckRequest:
         return properties
 
 
-def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
+def check(run: Path, robot_file: Path | None, request: CheckRequest, *, as_json: bool = False) -> int:
     """Judge a run of the joint check, and print a line a joint.
 
     Args:
         run: folder of the run.
         robot_file: file into which to write that the robot was checked; None: nothing is written.
         request: what a person states.
+        as_json: whether to print one JSON object instead of a line a joint.
 
     Returns:
         0 if every property of every joint was confirmed, otherwise 1.
@@ -64,8 +65,11 @@ def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
     )
     rows = judge_joints(measurements, straight=request.straight, allowed_backlash_rad=request.allowed_backlash_rad)
     rows = [row.confirmed_by_hand(request.by_hand) for row in rows]
-    for line in report_lines(rows):
-        print_line(line)
+    if as_json:
+        print_json({"joints": rows})
+    else:
+        for line in report_lines(rows):
+            print_line(line)
     if robot_file is not None:
         _write_result(robot_file, record, rows, request)
     return 0 if all(row.all_confirmed for row in rows) else 1

@@ -1,4 +1,4 @@
-"""`snakesim joints jog`: one joint moves slowly while a key is held; the other motors stay off.
+"""`snakesim robot jog`: one joint moves slowly while a key is held; the other motors stay off.
 
 A terminal reports that a key repeats, not that it was released: the joint moves on for `KEY_HOLD_S` after each repeat.
 So a single key makes a small step, and a held key moves the joint on once it repeats. Keys that arrive late, as over a
@@ -110,8 +110,8 @@ def jog(path: Path, selection: RobotSelection, request: JogRequest) -> int:
         selection: the robot.
         request: the joint and its bounds.
     """
-    keyboard = Keyboard("joints jog reads keys, and stdin is no terminal; start it in one")
-    link = only_robot(selection, "joints jog")
+    keyboard = Keyboard("robot jog reads keys, and stdin is no terminal; start it in one")
+    link = only_robot(selection, "robot jog")
     set_realtime_priority(SERVICE_PRIORITY)  # where it is allowed: a late command ends the lease
     with open_session(link, CONNECT_S) as session:
         joints = running_joints(session, path)
@@ -153,7 +153,7 @@ class _JogSession:
         signal.signal(signal.SIGHUP, lambda *_: self._request_stop())
         self._cycle_until(self._is_ready_to_arm)
         arm_session_before = self._cycle().arm_session
-        requester = f"{get_user_name()[:40]}, joints jog"
+        requester = f"{get_user_name()[:40]}, robot jog"
         # Unchecked is allowed, because jogging is how a user finds out how the joints are mounted.
         self._send_request(make_arm_request(self._robot, requester, unchecked=True), "armed")
         try:

@@ -66,7 +66,7 @@ def write_checked(path: Path, checked: StartCheckRecord) -> None:
     """Write the section `[checked]` of a robot file. Raises ConfigError; then nothing changed."""
     document = tomlkit.parse(read_text(path))
     section = tomlkit.table()
-    section.comment("written by `snakesim joints check`; it counts until the joints above or their drives change")
+    section.comment("written by `snakesim robot check`; it counts until the joints above or their drives change")
     for name, value in msgspec.to_builtins(checked).items():
         if value:
             section[name] = value

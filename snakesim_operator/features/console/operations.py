@@ -15,8 +15,8 @@ from snakesim_hal.network.session import Link, Publisher, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Intent, Message, SettingsRequest
 from snakesim_operator.base.targets import RobotSelection
-from snakesim_operator.robot_commands.command import ANSWER_S, arm, clear, disarm, simulator
-from snakesim_operator.robot_commands.fault import FaultOrder, fault
+from snakesim_operator.robot_commands.command import ANSWER_S, arm, disarm, reset, simulator
+from snakesim_operator.robot_commands.fault import FaultOrder, inject_fault
 from snakesim_operator.robot_commands.prepared_stop import PreparedStop
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -87,9 +87,9 @@ class Operations:
         """Make the joints passive."""
         return self._run_command(f"{who}: disarm", lambda print_: disarm(self._selection, print_))
 
-    def clear(self, who: str) -> str:
-        """Clear a fault or an emergency stop."""
-        return self._run_command(f"{who}: clear", lambda print_: clear(self._selection, print_))
+    def reset_fault(self, who: str) -> str:
+        """Reset a fault or an emergency stop."""
+        return self._run_command(f"{who}: reset", lambda print_: reset(self._selection, print_))
 
     def change_time(self, who: str, order: SimulatorOrder) -> str:
         """Pause, resume, step, speed up or reset a simulator."""
@@ -98,7 +98,7 @@ class Operations:
     def inject(self, who: str, order: FaultOrder) -> str:
         """Inject a fault, or end it, if the run allows fault injection."""
         title = f"{who}: fault {order.kind}:{order.target}"
-        return self._run_command(title, lambda print_: fault(order, self._selection, print_))
+        return self._run_command(title, lambda print_: inject_fault(order, self._selection, print_))
 
     def configure(self, who: str, controller: str, settings: str) -> str:
         """Change the settings of the running controller. settings: all of them, as JSON."""

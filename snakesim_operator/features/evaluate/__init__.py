@@ -1,4 +1,4 @@
-"""Many runs: `snakesim evaluate`, `sweep` and `optimize`, on workers of this computer or of a Dask cluster.
+"""Many runs: `snakesim study evaluate`, `sweep` and `optimize`, on workers of this computer or of a Dask cluster.
 
 `arguments`  the three commands' arguments; the only module here that is imported without the extra `evaluate`
 `suite`      reads a suite file and makes the cases; `case` is one of them, and runs in a worker

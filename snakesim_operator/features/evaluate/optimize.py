@@ -1,4 +1,4 @@
-"""`snakesim optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
+"""`snakesim study optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
 
 import shlex
 import time
@@ -165,7 +165,7 @@ def _report_best(request: SearchRequest, study: Study) -> int:
     print_line(f"best {request.goal}: {best.value:.4g}, trial {best.user_attrs[NUMBER]}")
     if request.rows:
         rows = ",".join(map(str, request.rows))
-        words = ["snakesim", "evaluate", request.scenario, "--rows", rows]
+        words = ["snakesim", "study", "evaluate", request.scenario, "--rows", rows]
         print_line(f"  {_command_line(words, request.set, best.params)}")
         return 0
     results = best.user_attrs[RESULTS]

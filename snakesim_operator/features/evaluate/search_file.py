@@ -49,7 +49,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
 
     def command_line(self, storage: Path) -> str:
         """Return the command that continues the search, as a user types it."""
-        words = ["snakesim", "optimize", self.scenario]
+        words = ["snakesim", "study", "optimize", self.scenario]
         if self.rows:
             words += ["--rows", ",".join(map(str, self.rows))]
         for key, limits in self.vary.items():

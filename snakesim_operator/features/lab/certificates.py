@@ -105,7 +105,7 @@ def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
     if certificate.not_valid_after_utc < datetime.now(UTC):
         raise ConfigError(
             f"{at_certificate}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; move the folder away, run "
-            "`snakesim deploy certs` again, and install the new files on every machine"
+            "`snakesim lab certs` again, and install the new files on every machine"
         )
     return Issuer(certificate, key)
 
@@ -194,7 +194,7 @@ def read_certificate(at: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(read_bytes(at))
     except ValueError as error:
-        raise ConfigError(f"{at}: not a certificate: {error}; remove it and run `snakesim deploy certs`") from None
+        raise ConfigError(f"{at}: not a certificate: {error}; remove it and run `snakesim lab certs`") from None
 
 
 def _is_still_valid(path: Path, issuer: Issuer, identity: Identity, lab: Lab) -> bool:

@@ -1,4 +1,4 @@
-"""The lab file: machines, routers, robots, and who has which role. `snakesim deploy example` prints one."""
+"""The lab file: machines, routers, robots, and who has which role. `snakesim lab example` prints one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

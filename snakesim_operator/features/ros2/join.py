@@ -123,7 +123,7 @@ def _wait_for_robot(selection: RobotSelection) -> Link:
     is_reported = False
     while True:
         try:
-            return only_robot(selection, "ros2")
+            return only_robot(selection, "start ros2")
         except NotConnectedError as error:
             if time.monotonic() > give_up_s:
                 raise

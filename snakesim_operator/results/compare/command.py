@@ -1,4 +1,4 @@
-"""`snakesim compare RUN_A RUN_B`: read two run folders, print the table, write the page."""
+"""`snakesim study compare RUN_A RUN_B`: read two run folders, print the table, write the page."""
 
 from pathlib import Path
 

@@ -31,8 +31,8 @@ MIN_STOP_S = 0.5  # a shorter stop at the end is not mentioned
 MAX_STANDING_FRACTION = 0.5  # a run that stood still for more of its time, up to its end, is a poor one
 MOVED_RAD = 1e-3  # a joint whose target changed by less, as by rounding, was not moved
 JUDGING_COMMANDS = {  # controller that does not locomote -> command that judges its run
-    CHECK: "snakesim joints check",
-    "identify": "snakesim identify",
+    CHECK: "snakesim robot check",
+    "identify": "snakesim robot identify",
 }
 Kind = Literal["good", "poor", "bad"]
 

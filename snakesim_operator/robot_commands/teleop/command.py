@@ -277,7 +277,7 @@ class Teleop:
     def _describe_request(self) -> str:
         """Return what the operator requests from the robot, or why no request is sent."""
         if self._stopping is not None:
-            return f"EMERGENCY STOP: {self._describe_stop()}. Then: snakesim clear, snakesim arm"
+            return f"EMERGENCY STOP: {self._describe_stop()}. Then: snakesim robot reset, snakesim robot arm"
         silent_s = time.monotonic() - self._clock_s
         if silent_s > SILENT_S:
             return f"{self._describe_silence(silent_s)}: nothing can be asked for"

@@ -41,7 +41,7 @@ def _trial(made: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
 
 
 def _failing(fail: Fail, mend: Mend, request: Request) -> Iterator[Trial]:
-    """fail: when it began, by the monotonic clock; mend: before the operator clears."""
+    """fail: when it began, by the monotonic clock; mend: before the operator resets."""
     with robot(request) as (made, observer):
         for _ in range(request.trials):
             yield _trial(made, observer, fail, mend)

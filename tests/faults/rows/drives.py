@@ -90,7 +90,7 @@ class DrivesOutside:
 
 
 def host_frozen(request: Request) -> Iterator[Trial]:
-    """SIGSTOP for the host, for 1 s. The value: drives that are enabled at any time before the clear."""
+    """SIGSTOP for the host, for 1 s. The value: drives that are enabled at any time before the reset."""
     _use_loopback()
     config = robot_of(request.backend, backend__pose_listen=POSE, **BUSES[request.backend])
     slowest_ms = 0.0

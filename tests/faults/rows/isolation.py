@@ -60,7 +60,7 @@ def _objections(observer: Observer, name: str, since_ns: int) -> list[str]:
 
 
 def _take_back(observer: Observer) -> None:
-    """Disarm, and clear: then the joint counts again."""
-    for action in ("disarm", "clear"):
+    """Disarm, and reset: then the joint counts again."""
+    for action in ("disarm", "reset"):
         observer.ask(keys.LIFECYCLE, LifecycleRequest(action=action))
     observer.until(lambda: observer.status is not None and not observer.status.isolated, "the joint is taken back", 3.0)

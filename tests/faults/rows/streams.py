@@ -18,7 +18,7 @@ DEPTH = 4096
 
 
 def no_joints(request: Request) -> Iterator[Trial]:
-    """The value: until the stop mode. Somebody clears and arms when the stream is back."""
+    """The value: until the stop mode. Somebody resets and arms when the stream is back."""
     with robot(request) as (made, observer):
         for _ in range(request.trials):
             made.set_in_motion(observer)

@@ -113,7 +113,7 @@ def armed(run: LoopT) -> LoopT:
 
 
 def cleared_and_armed_again(run: Loop) -> None:
-    """A person clears the fault and arms; nothing is left of it."""
+    """A person resets the fault and arms; nothing is left of it."""
     reported = len(run.faults)
     run.lifecycle = "disarmed"
     run.run(10)

@@ -213,7 +213,7 @@ class Running:
         return self.session.request(key, request)
 
     def lifecycle(self, action: Any) -> Answer:
-        """Arm (naming the robot rightly), disarm, clear or finish."""
+        """Arm (naming the robot rightly), disarm, reset or finish."""
         config_hash = self.host.description.config_hash
         request = LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=config_hash)
         return self.ask(keys.LIFECYCLE, request)

@@ -67,7 +67,7 @@ def test_what_the_backend_has_itself_is_left_to_it() -> None:
 
 
 def recording(path, images) -> str:
-    """As `snakesim echo` prints it."""
+    """As `snakesim topic echo` prints it."""
     plain = [{**msgspec.to_builtins(image), "depth": b64encode(image.depth).decode()} for image in images]
     path.write_text("".join(json.dumps({"key": f"planar13/{HEAD}", "message": image}) + "\n" for image in plain))
     return str(path)
@@ -88,7 +88,7 @@ def test_a_recording_is_played_again_with_the_times_of_this_run(tmp_path) -> Non
 
 def test_a_recording_that_is_none_is_told(tmp_path) -> None:
     file = tmp_path / "head.jsonl"
-    for text, why in (("{", "cannot be read.*snakesim echo sensor/depth/head"), ("", "it is empty")):
+    for text, why in (("{", "cannot be read.*snakesim topic echo sensor/depth/head"), ("", "it is empty")):
         file.write_text(text)
         config = config_of("robot.sensors.depth.0.model=recorded", f'robot.sensors.depth.0.settings.file="{file}"')
         with pytest.raises(ConfigError, match=why):

@@ -113,7 +113,7 @@ class ViewerControls:
     def _add_control_buttons(self) -> None:
         gui = self.client.gui
         self._take_control = gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
-        self._lifecycle = gui.add_button_group("Robot", ("Arm", "Disarm", "Clear"))
+        self._lifecycle = gui.add_button_group("Robot", ("Arm", "Disarm", "Reset fault"))
         self._unchecked_reason = gui.add_html("", visible=False)
         self._arm_unchecked = gui.add_button("Arm it unchecked", color="red", visible=False)
 
@@ -284,7 +284,7 @@ class ViewerControls:
             case "Disarm":
                 self.run_operation("Disarm", lambda: self._operations.disarm(self.name))
             case _:
-                self.run_operation("Clear", lambda: self._operations.clear(self.name))
+                self.run_operation("Reset fault", lambda: self._operations.reset_fault(self.name))
 
     def _arm(self, *, unchecked: bool) -> None:
         """Arm the robot; offer to arm it unchecked, with a button of its own, once the host has refused."""

@@ -25,7 +25,7 @@ from tests.unit.hal.rig import run_config
 
 JOINTS = 4
 SHOWN = 20  # ticks in which a fault shows: a heartbeat takes ten
-CLEARED = 80  # and in which drives are cleared, some by a restart
+CLEARED = 80  # and in which drives are reset, some by a restart
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_aga
     fault = robot.run(SHOWN, "armed")[0]
     assert (fault.what, fault.joint) == ("drive_fault", "joint_2") and robot.driver_type.overheated in fault.cause
     assert robot.run(50, "fault") == [] and robot.run(50, "estop") == [] and robot.following() == [False] * JOINTS
-    assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], "cleared while it was still hot"
+    assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], "reset while it was still hot"
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
     robot.emulator.body.thermal.winding_c[:] = 20.0
     robot.run(5, "fault")
@@ -270,7 +270,7 @@ def test_two_drives_of_one_id_stop_the_robot_and_are_refused_at_the_start_with_b
     [fault] = robot.run(SHOWN, "armed")
     assert (fault.what, fault.joint, fault.reach) == ("duplicate_node", "joint_2", "robot")
     assert serials[1] in fault.cause and robot.following() == [False] * JOINTS
-    assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "cleared while it is there"
+    assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "reset while it is there"
     words = rf"(?s)not complete; .*joint_2 \(node 2 on .*\) answers with 2 serial numbers, .*{serials[1]}.* its own id"
     with pytest.raises(BackendError, match=words):
         robot.backend._drives.bring_up()

@@ -47,7 +47,7 @@ def test_twins_that_cannot_be_are_refused(settings: CanSettings, words: str) -> 
 
 
 class Child:
-    """Instead of `snakesim modules` runs a program that notes how it was started, and does as told."""
+    """Instead of `snakesim drive emulate can` runs a program that notes how it was started, and does as told."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self._noted, self._program = folder / "noted.json", folder / "python"

@@ -43,7 +43,7 @@ class Bench:
     def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
         return [found for _ in range(count) for found in self.tick(speak)]
 
-    def clear(self) -> None:
+    def reset(self) -> None:
         self.watch.reset(self.reading.sync)
 
 

@@ -11,7 +11,7 @@ from cantools.database.can import Database, Message
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire
-from snakesim_can_backend.can_command import main
+from snakesim_can_backend.commands import COMMANDS
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.codec import load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
@@ -26,15 +26,16 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_can_backend.protocol.expanded import list_nodes
 from snakesim_hal.wire.messages import Mode
+from tests.harness.registered import run_registered
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
 
 
 @pytest.fixture(scope="module")
 def expanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file, as `snakesim can expand` writes it."""
+    """The file, as `snakesim drive dbc` writes it."""
     path = tmp_path_factory.mktemp("dbc") / "expanded.dbc"
-    assert main(["expand", "--out", str(path)]) == 0
+    assert run_registered(COMMANDS, ["drive", "dbc", "--out", str(path)]) == 0
     return path
 
 

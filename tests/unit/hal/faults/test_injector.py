@@ -46,7 +46,7 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is
         assert on.startswith("mute:joint_2@")
         assert ask(run, "mute", "joint_2", end=True).ok
         wait_until(lambda: run.status.injected == [], "an end of it")
-        assert run.lifecycle("clear").ok
+        assert run.lifecycle("reset").ok
         run.arm()
         assert [text.split()[-1] for text in run.host.faults.notes] == ["begins", "ends"]
         assert all(text.startswith("tick ") for text in run.host.faults.notes)

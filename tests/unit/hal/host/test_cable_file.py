@@ -84,7 +84,7 @@ def test_what_nobody_has_kept_is_unknown_until_it_is_declared_unwound(tmp_path: 
     bench = Bench(tmp_path, "cable_turns = 0.6")
     (refused,) = bench.host(0.0)
     assert "joint_2: how far its cable is wound is not known: no host before this one" in refused
-    assert "`snakesim joints zero`" in refused
+    assert "`snakesim robot calibrate zero`" in refused
     bench.file(f'cable_turns = 0.6\ncable_unwound = "{DECLARED}"')
     assert "declared unwound at" in bench.host(0.0, now_s=LATER_S)[0]  # long ago: who knows what was turned since
     assert bench.host(0.0) == [] == bench.host(0.1, now_s=LATER_S)

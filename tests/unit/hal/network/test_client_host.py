@@ -115,7 +115,7 @@ def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_cl
         faults = {fault.what: fault.cause for fault in run.status.faults}
         assert "control is gone" in faults["service_lost"] and "lease of control" in faults["lease_expired"]
         assert not run.lifecycle("arm").ok
-        assert run.lifecycle("clear").ok
+        assert run.lifecycle("reset").ok
         with following(run.link, Follower()) as control:
             run.arm()
             wait_until(lambda: len(control.armed_ticks) > 5, "five more ticks")
@@ -134,7 +134,7 @@ def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
         assert "passer-by" in run.status.why and run.status.faults[-1].what == "estop"
         assert "must be disarmed" in run.lifecycle("arm").reason
-        assert run.lifecycle("clear").lifecycle == "disarmed"
+        assert run.lifecycle("reset").lifecycle == "disarmed"
         run.arm()
         assert run.lifecycle("finish").ok
         wait_until(run.ended, "the end of the run")

@@ -86,7 +86,7 @@ class Model(RuleBasedStateMachine):
         self.aside: set[int] = set()  # joints that have failed
         self.offered = 0
         self.rejected = 0
-        self.faults = 0  # kept since the last clear
+        self.faults = 0  # kept since the last reset
         self.hold_at = [0.0] * JOINTS
         self.halt: list[list[float]] | None = None  # wanted angle, its velocity, target: of every joint
         self.timestamp_ns = 0

@@ -10,7 +10,7 @@ from tests.unit.hal.rig import PERIOD_NS, command, description, power, state
 ROBOT = description()
 JOINTS = len(ROBOT.joints)
 ARM = LifecycleRequest(action="arm", robot="worm", backend="lag", config_hash=ROBOT.config_hash)
-DISARM, CLEAR, FINISH = (LifecycleRequest(action=action) for action in ("disarm", "clear", "finish"))
+DISARM, CLEAR, FINISH = (LifecycleRequest(action=action) for action in ("disarm", "reset", "finish"))
 ESTOP = EstopRequest(who="a person")
 
 

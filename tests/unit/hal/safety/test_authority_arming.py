@@ -38,11 +38,11 @@ def test_the_way_to_armed() -> None:
 def test_a_stopped_robot_is_armed_only_after_a_clear_and_says_so() -> None:
     rig = Rig()
     rig.authority.on_estop(ESTOP, rig.tick)
-    assert "state is estop, must be disarmed; first `snakesim clear`" in rig.arm().reason
+    assert "state is estop, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
     rig.authority.fault(Fault(tick=rig.tick, what="test", cause="test"))
-    assert "state is fault, must be disarmed; first `snakesim clear`" in rig.arm().reason
-    assert "snakesim clear" not in armed().arm().reason
+    assert "state is fault, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
+    assert "snakesim robot reset" not in armed().arm().reason
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_what_counted_in_an_earlier_arming_does_not_count_in_the_next() -> None:
 
 @pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])
 def test_no_arming_before_the_motors_were_told_of_a_stop(stop: str) -> None:
-    """Cleared and armed again within one period, the backend would never have heard of it."""
+    """Reset and armed again within one period, the backend would never have heard of it."""
     rig = armed()
     rig.tick_with(0.1)
     if stop == "estop":
@@ -288,7 +288,7 @@ def test_no_arming_before_the_motors_were_told_of_a_stop(stop: str) -> None:
     else:
         rig.authority.on_lifecycle(DISARM, rig.now_ns)
     if stop != "disarm":
-        rig.pass_tick()  # told of the stop, but not that it was cleared
+        rig.pass_tick()  # told of the stop, but not that it was reset
         rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     rig.acquire()
     rig.send(0.1)

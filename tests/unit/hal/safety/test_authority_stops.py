@@ -110,10 +110,10 @@ def test_faults_are_kept_up_to_a_limit_the_first_and_the_newest() -> None:
     for i in range(100):
         rig.authority.fault(Fault(tick=i, what="hot", cause="hot"))
     assert [fault.tick for fault in rig.authority.faults] == [*range(16), *range(84, 100)]
-    assert rig.authority.faults_since_clear.left_out == rig.authority.faults_since_start.left_out == 68
+    assert rig.authority.faults_since_reset.left_out == rig.authority.faults_since_start.left_out == 68
     assert (MAX_FAULTS_KEPT, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
     rig.authority.on_lifecycle(CLEAR, 0)
-    assert rig.authority.faults == [] and rig.authority.faults_since_clear.left_out == 0
+    assert rig.authority.faults == [] and rig.authority.faults_since_reset.left_out == 0
     assert (
         len(rig.authority.faults_since_start.kept) == MAX_FAULTS_KEPT
         and rig.authority.faults_since_start.left_out == 68

@@ -89,7 +89,7 @@ def test_another_search_is_refused_with_every_difference(kept: Path, other: dict
         searched(kept, **other)
     assert f"--storage {kept}" in str(error.value) and difference in str(error.value)
     assert str(error.value).count(" there, ") == 1
-    assert "choose another file" in str(error.value) and "`snakesim optimize triplet --vary" in str(error.value)
+    assert "choose another file" in str(error.value) and "`snakesim study optimize triplet --vary" in str(error.value)
     assert kept.read_bytes() == before
 
 

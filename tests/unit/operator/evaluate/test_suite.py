@@ -100,7 +100,7 @@ def test_a_wrong_suite_is_told_what_and_where(
     text: str, reported: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.toml").write_text(text)
-    assert main(["evaluate", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert main(["study", "evaluate", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert all(part in said for part in reported), said
     assert not (tmp_path / "out").exists()

@@ -21,7 +21,7 @@ def states(folder: Path, *, rotate: bool = False) -> dict[str, str]:
 
 
 def test_private_keys_are_their_owners_and_never_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["deploy", "certs", str(EXAMPLE), "--out", str(tmp_path)]) == 0
+    assert main(["lab", "certs", str(EXAMPLE), "--out", str(tmp_path)]) == 0
     keys = list(tmp_path.rglob("*.key"))
     assert len(keys) == len(list(identities(LAB))) + 1
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}

@@ -71,7 +71,7 @@ def files_of(robot: str, folder: Path) -> dict[str, str]:
 def command_of(unit: str) -> list[str]:
     line = re.search(r"^ExecStart=(.*)$", unit, re.MULTILINE)
     assert line is not None
-    return shlex.split(line[1])[2:]  # without the program and its subcommand
+    return shlex.split(line[1])[3:]  # without the program and its two words, such as `start host`
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -19,7 +19,7 @@ def mode(path: Path) -> int:
 
 
 def certs(out: Path, *more: str) -> int:
-    return main(["deploy", "certs", str(EXAMPLE), "--out", str(out), *more])
+    return main(["lab", "certs", str(EXAMPLE), "--out", str(out), *more])
 
 
 def test_a_folder_that_is_there_keeps_its_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,7 +80,7 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("max_mb", [20, 30, 40, 100])
 def test_too_little_memory_is_one_line(tmp_path: Path, max_mb: int) -> None:
-    typed = [*SNAKESIM, "deploy", "certs", str(EXAMPLE), "--out", str(tmp_path / "lab")]
+    typed = [*SNAKESIM, "lab", "certs", str(EXAMPLE), "--out", str(tmp_path / "lab")]
     limited = ["sh", "-c", f'ulimit -v {max_mb * 1024}; exec "$@"', "sh", *typed]
     ended = call(limited, tmp_path, environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0)
     assert ended.code in (0, 1) and "Traceback" not in ended.err, ended.err

@@ -16,7 +16,7 @@ from tests.unit.hal.rig import description, status
 
 
 def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenarios", "--json"]) == 0
+    assert main(["scenario", "list", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
     assert sorted(reported["robots"]) == list_shipped("robots") and reported["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
@@ -59,7 +59,7 @@ def test_status_and_top_say_whether_something_real_moves(
         main(["status", "--endpoint", endpoint])
         assert capsys.readouterr().out.splitlines()[1].startswith(said)
         if described is None or "host" not in described:
-            assert main(["top", "--once", "--endpoint", endpoint]) == 0
+            assert main(["topic", "rate", "--once", "--endpoint", endpoint]) == 0
             assert capsys.readouterr().out.startswith(f"worm: {said.strip()}")
 
 
@@ -70,5 +70,5 @@ def test_a_joint_that_is_let_go_is_told_with_the_way_back(capsys: pytest.Capture
         session.latched_publisher(keys.STATUS, Status).put(lost)
         assert main(["status", "--endpoint", endpoint]) == 0
     said = capsys.readouterr().out
-    assert "isolated: joint_3; passive until a clear" in said and "to end the isolation of joint_3" in said
-    assert "or, without: `snakesim arm worm lag" in said
+    assert "isolated: joint_3; passive until a reset" in said and "to end the isolation of joint_3" in said
+    assert "or, without: `snakesim robot arm worm lag" in said

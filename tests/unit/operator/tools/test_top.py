@@ -1,4 +1,4 @@
-"""`snakesim top`: what it makes of arrivals, of a stranger's too, and that nobody can make it grow."""
+"""`snakesim topic rate`: what it makes of arrivals, of a stranger's too, and that nobody can make it grow."""
 
 import itertools
 import json
