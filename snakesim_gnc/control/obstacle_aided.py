@@ -129,7 +129,11 @@ class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
     """Duration of a search, after which the body tries its path again."""
 
     blend_s: Blend = 0.3
+    """Time over which the command changes smoothly to a new reference."""
+
     speed_filter_s: SpeedFilter = 0.05
+    """Time constant of the filter of the speed along the path; 0: no filter."""
+
     no_contact_cost: Annotated[float, from_zero(1000, "1")] = 10.0
     """Additional cost of a force on an obstacle without measured contact; 0: it costs as much as on others."""
 

@@ -28,7 +28,10 @@ class PathFollowingParameters(FileStruct, frozen=True, kw_only=True):
     """Maximum look-ahead of the shape along its path."""
 
     blend_s: Blend = 0.3
+    """Time over which the command changes smoothly to a new reference."""
+
     speed_filter_s: SpeedFilter = 0.03
+    """Time constant of the filter of the speed along the path; 0: no filter."""
 
 
 class PathFollowing(Controller[PathFollowingParameters]):

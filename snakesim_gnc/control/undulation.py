@@ -53,7 +53,10 @@ class LateralUndulationParameters(FileStruct, frozen=True, kw_only=True):
     """Phase of a joint behind the one ahead of it; negative: the wave travels to the head."""
 
     steering: Steering = 0.0
+    """Bend of all joints for each radian that the path leads aside; 0: no steering."""
+
     blend_s: Blend = 1.0
+    """Time over which the command changes smoothly to a new reference."""
 
 
 class LateralUndulation(Controller[LateralUndulationParameters]):
@@ -129,6 +132,7 @@ class HeadSteeredUndulationParameters(LateralUndulationParameters, frozen=True, 
     """Parameters of lateral undulation, with steering."""
 
     steering: Steering = 0.8
+    """Bend of all joints for each radian that the path leads aside; 0: no steering."""
 
 
 class HeadSteeredUndulation(LateralUndulation):
