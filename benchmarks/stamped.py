@@ -1,4 +1,4 @@
-"""A controller that holds the pose and writes down when it had each command ready."""
+"""A controller that holds the pose and writes the time of each finished command to a file."""
 
 import time
 
@@ -9,10 +9,10 @@ from snakesim_hal.wire.messages import Description
 
 
 class Stamped:
-    """`--controller benchmarks/stamped.py:Stamped --set control.path=FILE`."""
+    """Holds the pose; selected with `--controller benchmarks/stamped.py:Stamped --set control.path=FILE`."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
-        """Where to write to."""
+        """The file that gets the times, one a line, in s since the epoch."""
 
         path: str
 
@@ -21,7 +21,7 @@ class Stamped:
         self._file = open(settings.path, "w", buffering=1, encoding="ascii")  # noqa: PTH123, SIM115 - open until the end
 
     def update(self, view: View) -> Action:
-        """The pose of the start, for ever."""
+        """Return the pose of the start, and write down the time."""
         action = self._hold.update(view)
         self._file.write(f"{time.time():.6f}\n")
         return action
