@@ -12,7 +12,7 @@ from snakesim_hal.wire.messages import FaultRequest
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.robot_commands.command import ANSWER_S
 
-LIST = "list"
+LIST = "list"  # instead of a kind: print all kinds
 
 
 @dataclass(frozen=True)
@@ -26,17 +26,56 @@ class FaultOrder:
     end: bool = False
 
 
-def fault(order: FaultOrder, where: RobotSelection, say: PrintLine = print_line) -> int:
-    """Send the request to the responsible part. Raises RefusedError if it refuses, NotConnectedError without answer."""
+def fault(order: FaultOrder, where: RobotSelection, report: PrintLine = print_line) -> int:
+    """Inject a fault, or print the list of all kinds.
+
+    Args:
+        order: the command's options.
+        where: selects the robot.
+        report: gets each line of the result.
+
+    Returns:
+        0, the exit code of the command.
+
+    Raises:
+        ConfigError: there is no such fault, or the options contradict each other.
+        RefusedError: the run does not allow the fault.
+        NotConnectedError: the process that can do it does not answer.
+    """
     if order.kind == LIST and order.target is None:
         for line in explain_kinds().splitlines():
-            say(line)
+            report(line)
         return 0
-    kinds = sorted({kind for of_target in KINDS.values() for kind in of_target})
+    injection = _check_order(order)
+    request = FaultRequest(
+        kind=order.kind,
+        target=injection.target,
+        for_s=order.for_s,
+        amount=order.amount,  # without the default, which the process fills in itself
+        end=order.end,
+    )
+    link = only_robot(where, f"fault {order.kind} {order.target}")
+    with open_session(link, CONNECT_S) as session:
+        try:
+            answer = session.request(keys.fault_key(injection.part), request, ANSWER_S)
+        except NotConnectedError:
+            raise NotConnectedError(
+                f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "
+                f"shows which services are alive"
+            ) from None
+    if not answer.ok:
+        raise RefusedError(f"not done: {answer.reason}")
+    report(answer.reason)
+    return 0
+
+
+def _check_order(order: FaultOrder) -> Injection:
+    """Return the injection that the options describe. Raises ConfigError for options that cannot be."""
+    kinds = sorted({kind for kinds_of_target in KINDS.values() for kind in kinds_of_target})
     if order.kind not in kinds:
-        meant = suggest_word(order.kind, kinds)
+        suggestion = suggest_word(order.kind, kinds)
         raise ConfigError(
-            f"fault {shorten(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
+            f"fault {shorten(order.kind)}: there is no such kind; {suggestion}`snakesim fault list` explains all"
         )
     if order.target is None:
         raise ConfigError(f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`")
@@ -47,16 +86,4 @@ def fault(order: FaultOrder, where: RobotSelection, say: PrintLine = print_line)
         raise ConfigError(f"--for {order.for_s:g}: give more than 0 s")
     if injection.about.once and (order.end or order.for_s is not None):
         raise ConfigError(f"{order.kind} happens once and has no end; omit --for and --end")
-    request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
-    with open_session(only_robot(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
-        try:
-            answer = session.request(keys.fault_key(injection.part), request, ANSWER_S)
-        except NotConnectedError:
-            raise NotConnectedError(
-                f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "
-                f"shows which services are alive"
-            ) from None
-    if not answer.ok:
-        raise RefusedError(f"not done: {answer.reason}")
-    say(answer.reason)
-    return 0
+    return injection
