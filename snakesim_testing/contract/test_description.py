@@ -61,14 +61,14 @@ def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Recor
     for sensor in rig.robot.sensors:
         if sensor.key == keys.JOINTS:
             continue
-        came = how_often(sensor.key, healthy)
+        came = count_readings(sensor.key, healthy)
         wanted = seconds * sensor.rate_hz
         slack = 1 + t.RATE_SHARE * wanted
         assert came >= 1 or wanted < 2, f"{sensor.key} is listed but never published"
         assert abs(came - wanted) <= slack, f"{sensor.key}: {came} in {seconds} s, stated are {sensor.rate_hz} Hz"
 
 
-def how_often(key: str, record: Record) -> int:
+def count_readings(key: str, record: Record) -> int:
     """Number of readings. IMUs may answer in turns, so there it is that of the most frequent link."""
     messages = [sample.others[key] for sample in record.samples if key in sample.others]
     links = Counter(link for message in messages if isinstance(message, Imu) for link in message.link)
