@@ -45,7 +45,7 @@ class _Gait:
         self._missing = _explain_missing_joints(self._yaw, self._pitch)
 
     def update(self, view: View) -> Action:
-        """Advance the gait while motion is wanted; a robot that lacks joints for it holds its pose."""
+        """Advance the gait while motion is wanted; a robot without the necessary joints holds its pose."""
         if self._missing or not motion_wanted(view):
             return self._bumpless.hold(view, self._missing)
         self._phase_rad += math.tau * view.period_s / self._set.period_s

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 
 class SnakesimError(Exception):
-    """Base of all errors of SnakeSIM; the message says what is wrong, and what to do next."""
+    """Base of all errors of SnakeSIM; the message explains what is wrong, and what to do next."""
 
     def __init__(self, *lines: str) -> None:
         """Make an error with one line or more. Each is printed as one line, whatever it quotes from file or network."""

@@ -68,7 +68,7 @@ class InProcessRun:
         Args:
             config: of the run.
             pulse: shows another process whether the run goes on.
-            turn_limit_s: wall time that a part may take in one turn, if not as the configuration says.
+            turn_limit_s: wall time that a part may take in one turn; None: as the configuration allows.
 
         Raises:
             ConfigError: the run needs more than one process.

@@ -11,9 +11,14 @@ from snakesim_testing.contract.rig import Rig
 def test_the_torque_limit_of_the_set_points_is_kept(rig: Rig, pushing: Pushing) -> None:
     """Velocity mode (or else a position beyond it) against a stop pushes with the limit, and no more."""
     rig.skip_without(torque=True)
-    felt, limit = abs(pushing.limited.torque_nm[-1, :2]), pushing.limit_nm
-    assert max(felt) < (1 + t.TORQUE_SHARE) * limit + t.TORQUE_NM, f"{felt} N·m, limit is {limit:.2f} N·m"
-    assert min(felt) > (1 - t.TORQUE_SHARE) * limit - t.TORQUE_NM, f"{felt} N·m does not use the limit of {limit:.2f}"
+    measured_nm = abs(pushing.limited.torque_nm[-1, :2])
+    limit_nm = pushing.limit_nm
+    assert max(measured_nm) < (1 + t.TORQUE_SHARE) * limit_nm + t.TORQUE_NM, (
+        f"{measured_nm} N·m, limit is {limit_nm:.2f} N·m"
+    )
+    assert min(measured_nm) > (1 - t.TORQUE_SHARE) * limit_nm - t.TORQUE_NM, (
+        f"{measured_nm} N·m does not use the limit of {limit_nm:.2f}"
+    )
 
 
 def test_a_torque_limit_of_zero_lets_nothing_move(rig: Rig) -> None:

@@ -46,10 +46,11 @@ def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: Pus
     """Against a stop the reported torque is the one asked for, in N·m, with its sign."""
     rig.skip_without(Mode.TORQUE, torque=True)
     assert pushing.torque_mode is not None
-    felt, asked = pushing.torque_mode.torque_nm[-1], pushing.asked_nm
+    measured_nm = pushing.torque_mode.torque_nm[-1]
+    asked = pushing.asked_nm
     slack = t.TORQUE_SHARE * asked + t.TORQUE_NM
-    assert abs(felt[0] - asked) < slack, f"asked for {asked:.2f} N·m: {felt[0]:.3f} N·m"
-    assert abs(felt[1] + asked) < slack, f"asked for {-asked:.2f} N·m: {felt[1]:.3f} N·m"
+    assert abs(measured_nm[0] - asked) < slack, f"asked for {asked:.2f} N·m: {measured_nm[0]:.3f} N·m"
+    assert abs(measured_nm[1] + asked) < slack, f"asked for {-asked:.2f} N·m: {measured_nm[1]:.3f} N·m"
 
 
 def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> None:
@@ -110,4 +111,4 @@ def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> Non
 def assert_cruising(rig: Rig) -> None:
     """Fail when joint 0 has slowed down."""
     speed = rig.newest_joints.velocity_rad_s[0]
-    assert speed > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, f"{speed:.3f} rad/s, told to keep {t.CRUISE_RAD_S} rad/s"
+    assert speed > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, f"{speed:.3f} rad/s, commanded were {t.CRUISE_RAD_S} rad/s"
