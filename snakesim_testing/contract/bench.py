@@ -136,8 +136,10 @@ class Bench:
 
     def close(self) -> None:
         """Close the open backend."""
-        rig, hosted = self._rig, self._hosted
-        self._rig = self._hosted = None
+        rig = self._rig
+        hosted = self._hosted
+        self._rig = None
+        self._hosted = None
         if hosted is not None:
             hosted.close()
         if rig is not None and not rig.closed:

@@ -17,7 +17,8 @@ from snakesim_testing.contract.rig import Record, Rig
 
 def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:
     """Joints (count, order, names, axes, limits, gains), links, period, lease and safety come from the run's files."""
-    robot, wanted = rig.robot, describe_run_robot(bench.config)
+    robot = rig.robot
+    wanted = describe_run_robot(bench.config)
     assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
     for joint, expected in zip(robot.joints, wanted.joints, strict=True):
         drive = {"serial": joint.serial, "firmware": joint.firmware}  # which the drive says, not the file

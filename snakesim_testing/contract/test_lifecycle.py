@@ -38,11 +38,12 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig
     A simulator need not do this (see `Backend.enact`); the host hands it none.
     """
     asked = {i: (Mode.POSITION, rig.home_rad[i] + 0.5 * t.STEP_RAD) for i in range(rig.count)}
-    before, began = np.array(rig.newest_joints.angle_rad), rig.tick
+    before = np.array(rig.newest_joints.angle_rad)
+    first_tick = rig.tick
     for _ in range(rig.count_periods(t.CRUISE_S)):
         rig.enact_without_limiter(unlimited(rig.make_setpoints(asked)), state)
     rig.idle(t.TRANSPORT_PERIODS)  # disarmed: the only state after a stop
-    moved = float(np.abs(rig.record_since(began).angle_rad - before).max())
+    moved = float(np.abs(rig.record_since(first_tick).angle_rad - before).max())
     if moved >= t.STILL_RAD and bench.clock_mode == "lockstep":
         pytest.skip("a simulator may follow setpoints in every state; the host hands it safe ones only")
     assert moved < t.STILL_RAD, f"{state}, and it moved by {moved:.3f} rad"
@@ -73,9 +74,10 @@ def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
     rig.idle(rig.count_periods(t.SETTLE_S))
     rig.disarm()
     rig.idle(t.TRANSPORT_PERIODS)
-    before, began = np.array(rig.newest_joints.angle_rad), rig.tick
+    before = np.array(rig.newest_joints.angle_rad)
+    first_tick = rig.tick
     rig.arm()
-    record = rig.record_since(began)
+    record = rig.record_since(first_tick)
     assert np.abs(record.angle_rad - before).max() < t.STILL_RAD, f"{record.angle_rad[-1] - before} rad"
     assert np.abs(np.diff(record.torque_nm, axis=0)).max() < t.BUMP_SHARE * rig.full_torque_nm[0]
 

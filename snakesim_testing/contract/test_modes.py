@@ -35,7 +35,8 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> 
     rig.arm()
     joint = rig.count - 1
     record = rig.drive({joint: (Mode.VELOCITY, -t.CRUISE_RAD_S)}, rig.count_periods(t.CRUISE_S))
-    velocity, angle = record.velocity_rad_s, record.angle_rad
+    velocity = record.velocity_rad_s
+    angle = record.angle_rad
     integral = 0.5 * (velocity[1:] + velocity[:-1]).sum(axis=0) * rig.period_ns * 1e-9
     turned = angle[-1] - angle[0]
     assert turned[joint] < -t.STILL_RAD, "the joint did not move, so nothing can be compared"
@@ -66,7 +67,8 @@ def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> 
 def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
     """Position, velocity, passive and position again, side by side: each does its own."""
     rig.arm()
-    step, speed = rig.home_rad[0] - t.STEP_RAD, t.CRUISE_RAD_S
+    step = rig.home_rad[0] - t.STEP_RAD
+    speed = t.CRUISE_RAD_S
     asked = {0: (Mode.POSITION, step), 1: (Mode.VELOCITY, speed), rig.count - 1: (Mode.PASSIVE, 0.0)}
     record = rig.drive(asked, rig.count_periods(t.CRUISE_S))
     assert abs(record.angle_rad[-1, 0] - step) < 2 * t.REACHED_RAD  # still on its way
