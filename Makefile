@@ -1,19 +1,17 @@
 # What a contributor does, and what CI does. `make` alone lists it.
 #   PYTHON=python3.12   the interpreter that `make setup` builds on
 #   ARGS="-k limiter"      further arguments for demo, test and bench
-#   QUICK=      takes the slow tests in
-#   WORKERS=1           how many tests run side by side (3)
+#   WORKERS=1           how many tests run side by side (2)
 #   UPGRADE=1           lets `make lock` take the newest versions allowed
 
 PYTHON ?=
 ARGS ?=
 UPGRADE ?=
-# More than cores: half of the time of `make test` is robots in real time, and waiting for them.
-WORKERS ?= 3
+WORKERS ?= 2
 PAYLOADS ?= 1000000
 MINUTES ?= 30
 TRIALS ?= 300
-QUICK ?= 1
+FOLDERS ?= tests/unit tests/contract
 
 # A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
@@ -27,7 +25,7 @@ packages := snakesim $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo compiled test test-all test-here test-vcan attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs lock clean FORCE
+.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs release lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -40,50 +38,60 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	  '  $(bin)/snakesim run triplet --console --clock-mode realtime      the paper'\''s case study: one joint at a time pushes' \
 	  '  docs/tutorial.md, 3: write a controller                       push it your way'
 
-test: test-here test-vcan ## Run the tests, but for those that are slow
+test: test-unit test-contract test-system test-can ## Run the tests that every change must pass (4 minutes on two cores)
 
-test-all: ## Run all tests, as before a release
-	SNAKESIM_HYPOTHESIS=explore $(MAKE) test-here test-vcan QUICK=
+test-unit: compiled ## Run the pure tests: no process, no socket, no waiting (ARGS="-k limiter")
+	$(pytest) tests/unit -n $(WORKERS) --dist worksteal $(ARGS)
 
-test-here: compiled ## Run the tests that need no CAN bus (ARGS="-k limiter")
-	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)
+test-contract: compiled ## Run the contracts of backends and drives
+	$(pytest) tests/contract -n $(WORKERS) --dist loadfile $(ARGS)
 
-test-vcan: compiled ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet, openings)
-	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) $(again)'
+test-system: compiled ## Run the tests with real processes, but those on a CAN bus
+	$(pytest) tests/system --ignore tests/system/can -n $(WORKERS) --dist worksteal $(ARGS)
+
+test-can: compiled ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none
+	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- $(pytest) tests/system/can --timeout 900 $(ARGS)
+
+coverage: compiled ## Print the lines and branches that the tests miss (FOLDERS="tests/unit tests/contract")
+	@mkdir -p build/coverage
+	$(bin)/python -m coverage erase
+	$(bin)/python -m coverage run -m pytest $(FOLDERS) -n $(WORKERS) $(ARGS)
+	$(bin)/python -m coverage combine -q
+	$(bin)/python -m coverage report
+
+verify: compiled ## Run the campaign, nightly and before a release: what takes hours or a quiet machine (ARGS="--list")
+	$(bin)/python -m verification $(ARGS)
 
 # Once: each worker would compile all that it imports, and the emulated machine would take many times as long.
 compiled: .venv/.compiled
-	-@$(bin)/python -m compileall -qq -j 0 $(packages) tests
+	-@$(bin)/python -m compileall -qq -j 0 $(packages) tests verification
 
 .venv/.compiled: $(stamp)
 	-@$(bin)/python -m compileall -qq -j 0 -x '/(OpenGL|fontTools|onnx|setuptools|sqlalchemy|tests?|testing)/' .venv/lib
 	@touch $@
 
-# Robots in real time stumble on a busy machine, an emulated one most of all. What failed is tried once more: here, alone.
-again = --last-failed --last-failed-no-failures none
-here = $(bin)/python -m pytest --ignore tests/vcan $(if $(QUICK),-m "not slow") $(ARGS)
-on_vcan = $(bin)/python -m pytest -o cache_dir=build/pytest-vcan tests/vcan tests/contract $(if $(QUICK),-m "not slow") --timeout 900 $(ARGS)
+pytest = $(bin)/python -m pytest
 
-faults: $(stamp) ## Measure the fault table and write docs/faults.md (ARGS="--rows NAME --trials 3")
-	$(bin)/python -m tests.faults --write $(ARGS)
+faults: $(stamp) ## Measure the fault table and write docs/faults.md and its CSV (ARGS="--rows NAME --trials 3")
+	$(bin)/python -m verification.faults --write $(ARGS)
 
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
-	$(bin)/python -m tests.mutation --workers $(WORKERS) $(ARGS)
+	$(bin)/python -m verification.mutation --workers $(WORKERS) $(ARGS)
 
 fuzz: $(stamp) ## Bad payloads into every decoder, then over the network of a robot that runs (PAYLOADS=1000000)
-	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) $(ARGS)
-	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) --network $(ARGS)
+	$(bin)/python -m verification.fuzz --payloads $(PAYLOADS) $(ARGS)
+	$(bin)/python -m verification.fuzz --payloads $(PAYLOADS) --network $(ARGS)
 
-attack: $(stamp) ## Every attack of a stranger on the network, in full (ARGS="-k a4"); make test has the quick form
-	SNAKESIM_ATTACK=full $(bin)/python -m pytest tests/attack --timeout 900 $(ARGS)
+attack: $(stamp) ## Every attack of an unauthorized client on the network, in full (ARGS="-k a4")
+	$(bin)/python -m verification.attack $(ARGS)
 
-kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear and end (TRIALS=300, ARGS="--seed 2")
-	$(bin)/python -m tests.soak.kills --trials $(TRIALS) $(ARGS)
+kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, reset and end (TRIALS=300, ARGS="--seed 2")
+	$(bin)/python -m verification.soak.kills --trials $(TRIALS) $(ARGS)
 
 soak: $(stamp) ## A long run with faults at random, and an operator who recovers (MINUTES=30, ARGS="--backend can --seed 2")
-	$(bin)/python -m tests.soak --minutes $(MINUTES) $(ARGS)
+	$(bin)/python -m verification.soak --minutes $(MINUTES) $(ARGS)
 
-check: $(stamp) ## Lint, format, types and import rules, without changing anything
+check: $(stamp) ## Lint, format, types, import rules and English, without changing anything
 	$(bin)/ruff check
 	$(bin)/ruff format --check
 	$(bin)/basedpyright
@@ -92,6 +100,7 @@ check: $(stamp) ## Lint, format, types and import rules, without changing anythi
 	    { echo "check: add $$package to root_packages under [tool.importlinter] in pyproject.toml"; exit 1; }; \
 	done
 	$(bin)/lint-imports
+	$(bin)/zizmor --quiet --offline .github
 
 bench: $(stamp) ## Measure the ratios in benchmarks/
 	$(bin)/python -m benchmarks $(ARGS)
@@ -100,20 +109,26 @@ bench-peers: $(stamp) ## Measure the loop beside raw Zenoh, dora-rs and rospy (i
 	$(bin)/python -m benchmarks.peers $(ARGS)
 
 links: $(stamp) ## Measure bad links between a robot and its controller, and write docs/lab-links.md (root; ARGS="--trials 4")
-	$(bin)/python -m tests.links --write $(ARGS)
+	$(bin)/python -m verification.links --write $(ARGS)
 
 bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link beside raw Zenoh (root)
 	$(bin)/python -m benchmarks.paths $(ARGS)
 
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
-	$(bin)/python -m tests.golden
+	$(bin)/python -m verification.golden
 
-schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
-	$(bin)/snakesim schemas --write schemas
-	$(bin)/python -m tests.kinds_table
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables of faults and errors
+	$(bin)/snakesim schema --out schemas
+	$(bin)/python -m docs.site.kinds_table
+	$(bin)/python -m docs.site.error_pages
+	$(bin)/python -m docs.site.configuration_page
+	$(bin)/python -m docs.site.commands_page
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py
+
+release: $(stamp) ## Build and check what a release publishes, into build/release
+	$(bin)/python deploy/release.py $(ARGS)
 
 lock: ## Resolve the lock files again (UPGRADE=1 for newer versions)
 	$(bootstrap) lock $(if $(UPGRADE),--upgrade)

@@ -7,3 +7,5 @@ of ratios.
 from snakesim_hal.base.arithmetic import pin
 
 pin()  # before NumPy is imported: a run in this process then stays on one thread, where it can be measured
+
+import snakesim_testing.isolation  # noqa: E402, F401 - latched stops and lists of robots stay apart from the user's

@@ -18,7 +18,7 @@ REPEATS = 3
 LATENCY_REPEATS = 9  # more: how fast a virtual machine wakes up changes within seconds
 LATENCY_ECHO_ROUNDS = 300
 TIMESTEPS_S = ("0.002", "0.001")  # of the physics; the first is the default
-EXTRAS = ("", "can", "sim", "record", "report", "console", "evaluate", "all")
+EXTRAS = ("", "can", "sim", "record", "report", "console", "train", "all")
 LISTED_PACKAGES = 6  # the largest ones of each installation
 
 

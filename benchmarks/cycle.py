@@ -14,7 +14,7 @@ from benchmarks.whole import run
 from snakesim_can_backend.bus.load import MAX_LOAD, ReportSchedule, bus_load
 from snakesim_can_backend.protocol.definitions import Opcode, parse_opcode
 from snakesim_hal.base.arrays import Floats
-from tests.unit.can_backend.emulator.rig import run_at
+from snakesim_testing.can.module_rig import run_at
 
 WARM_UP_CYCLES = 100  # left out at both ends of the run
 RATE_HZ = 100

@@ -11,7 +11,7 @@ from typing import Any
 import zenoh
 
 from snakesim_hal.base.process import child_environment, python_command
-from tests.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 BLOCK = zenoh.CongestionControl.BLOCK

@@ -2,7 +2,7 @@
 
 import sys
 
-from tests.physics.solved_and_felt import main
+from snakesim_testing.runs.solved_and_measured import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -15,9 +15,9 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
-from tests.harness.endpoint import free_endpoint
-from tests.unit.hal.rig import clock, command
-from tests.whole_run import run as run_in_process
+from snakesim_testing.hal.small_robots import clock, command
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.runs.whole_run import run as run_in_process
 
 TICKS_A_BLOCK = 50  # measured in one go, before the next kind of measurement has its turn
 LONG_NUMBER = 10**6  # a tick and sequence number of a run of some hours: it takes more bytes than 0

@@ -2,7 +2,7 @@
 
 from importlib.metadata import distribution
 
-from tests.distributions import required
+from verification.installation.distributions import required
 
 BYTES_A_MB = 1e6
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.process import child_environment, python_command
-from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 
 ATTEMPTS = 3  # a machine that pauses for 50 ms stops a run in real time

@@ -52,8 +52,8 @@ with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
     for _ in range(5):  # commands flow before the robot is armed
         command()
     meant = {key: robot[key] for key in ("robot", "backend", "config_hash", "host")}
-    ask("hal/lifecycle", "LifecycleRequest", command, action="arm", who="client.py", **meant)
+    ask("hal/lifecycle", "LifecycleRequest", command, action="arm", requester="client.py", **meant)
     for tick in range(2 * round(1e9 / robot["period_ns"])):  # a second to turn, and one to arrive
         command(min(tick * robot["period_ns"] * 1e-9, 1.0) * TURN_RAD)
-    ask("hal/lifecycle", "LifecycleRequest", lambda: command(TURN_RAD), action="disarm", who="client.py", **meant)
+    ask("hal/lifecycle", "LifecycleRequest", lambda: command(TURN_RAD), action="disarm", requester="client.py", **meant)
     print(f"{JOINT} turned by {state['angle_rad'][number] - start[number]:+.3f} rad; the robot is disarmed")

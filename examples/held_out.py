@@ -19,7 +19,7 @@ from snakesim_hal.model.scenario import parse_set
 
 SCENARIO = "surveyed_clutter"
 DURATION_S = 40.0
-STUCK_S = 12.0  # without progress until an episode ends, as in `snakesim evaluate`
+STUCK_S = 12.0  # without progress until an episode ends, as in `snakesim study evaluate`
 PROGRESS_M = 0.03  # what counts as progress
 
 

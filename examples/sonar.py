@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.wire.messages import Ranges
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.rays import Rays
@@ -19,7 +20,7 @@ from snakesim_sim_backend.sensors.rays import Rays
 RAYS = 200
 
 
-class Sonar:
+class Sonar(SensorModel):
     class Settings(FileStruct, frozen=True):
         cone_rad: float = 0.5  # from edge to edge
 

@@ -17,7 +17,7 @@ with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
         now_ns = msgpack.unpackb(clocks.recv().payload.to_bytes())["timestamp_ns"]
         wish = {
             "timestamp_ns": now_ns,
-            "who": "steer.py",
+            "requester": "steer.py",
             "speed_m_s": 0.1,
             "heading_w_rad": 0.3,
             "valid_for_ns": 500000000,

@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.wire.messages import OwnSample
 from snakesim_hal.wire.quantities import about, bounded
 
@@ -34,7 +35,7 @@ class Whisker(OwnSample, frozen=True, kw_only=True):
         return f"bent by {self.bend_rad} rad, and it bends no further than {self.bend_max_rad} rad"
 
 
-class WhiskerModel:
+class WhiskerModel(SensorModel):
     """A straight hair with a hinge at its root, which gives way to the nearer side, as far as it must."""
 
     class Settings(FileStruct, frozen=True):

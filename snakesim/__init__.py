@@ -5,18 +5,21 @@
     result = snakesim.run("triplet", duration=8, set={"control.propulsion_n": 35})
     result["angle_rad"], result.metrics["path_distance_m"], result.plot("torque_nm")
 
-`run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running. `View`, `Action`,
-`Report`, `positions` and `Settings` are for controllers. `docs/python.md` is the reference. Nothing of SnakeSIM imports
-this package.
+`run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running.
+`Controller` is the base class of controllers; `Observation`, `ControllerCommand`, `Telemetry`, `Parameters` and
+`positions` go with it. `docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
 
-Names are loaded when they are first used. A program that imports this package before NumPy computes as `snakesim run`
-does, so that one seed gives one digest; one that has imported NumPy already gets its runs from a child process.
+Names are loaded when they are first used, and importing this package changes nothing in the process. A run gives the
+digest of `snakesim run`, because it is computed in a child process where this process would round otherwise. Only a run
+with a controller that is an object of this program stays in the process: call `use_common_arithmetic` before NumPy is
+imported, so that this process rounds as `snakesim run` does.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.base.arithmetic import pin
+from snakesim_hal.base.arithmetic import is_pinned, pin
 from snakesim_hal.base.errors import (
     ConfigError,
     ControllerError,
@@ -30,37 +33,57 @@ if TYPE_CHECKING:
     from snakesim.result import Result
     from snakesim.robot import Robot
     from snakesim.runs import run
-    from snakesim_gnc.control.controller import Action, Report, View, positions
-    from snakesim_hal.model.files import FileStruct as Settings
+    from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
+    from snakesim_hal.model.files import FileStruct as Parameters
 
 __all__ = [
-    "Action",
     "ConfigError",
+    "Controller",
+    "ControllerCommand",
     "ControllerError",
     "NotConnectedError",
+    "Observation",
+    "Parameters",
     "RefusedError",
-    "Report",
     "Result",
     "Robot",
-    "Settings",
     "SnakesimError",
     "StalledError",
-    "View",
+    "Telemetry",
     "positions",
     "run",
+    "use_common_arithmetic",
 ]
-CONTROLLER = "snakesim_gnc.control.controller"
+CONTROLLER = "snakesim_hal.controller"
 LAZY = {
-    "Action": (CONTROLLER, "Action"),
-    "Report": (CONTROLLER, "Report"),
+    "Controller": (CONTROLLER, "Controller"),
+    "ControllerCommand": (CONTROLLER, "ControllerCommand"),
+    "Observation": (CONTROLLER, "Observation"),
+    "Parameters": ("snakesim_hal.model.files", "FileStruct"),
     "Result": ("snakesim.result", "Result"),
     "Robot": ("snakesim.robot", "Robot"),
-    "Settings": ("snakesim_hal.model.files", "FileStruct"),
-    "View": (CONTROLLER, "View"),
+    "Telemetry": (CONTROLLER, "Telemetry"),
     "positions": (CONTROLLER, "positions"),
     "run": ("snakesim.runs", "run"),
 }
-pin()
+
+
+def use_common_arithmetic() -> None:
+    """Let this process and its children round as `snakesim run` does, so that one seed gives one digest.
+
+    NumPy chooses its code by the processor when it is imported, and another choice rounds otherwise. This function sets
+    environment variables that select the code for processors with AVX2. Call it before NumPy is imported, by this
+    program or by another package. On a processor that cannot run this code it has no effect.
+
+    Raises:
+        ConfigError: NumPy is imported already, and rounds otherwise.
+    """
+    pin()
+    if "numpy" in sys.modules and not is_pinned():
+        raise ConfigError(
+            "use_common_arithmetic(): NumPy is imported already, and rounds otherwise than `snakesim run`; call this "
+            "function at the beginning of the program, before NumPy is imported"
+        )
 
 
 def __getattr__(name: str) -> Any:

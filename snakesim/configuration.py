@@ -22,7 +22,10 @@ def list_overrides(given: Mapping[str, Any] | None, **arguments: Any) -> list[Ov
     if given is None:
         given = {}
     if not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
-        raise ConfigError(f"set={given!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}")
+        raise ConfigError(
+            f"set={given!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}",
+            code="python/invalid-argument",
+        )
     overrides: list[Override] = []
     for key, value in arguments.items():
         if value is not None:
@@ -60,11 +63,13 @@ def load_checked(scenario: str, overrides: list[Override], *, processes: bool) -
     loaded = load(scenario, overrides)
     if clock_mode is not None and not processes and loaded.config.clock_mode != "lockstep":
         raise ConfigError(
-            f"{clock_mode.flag}: in one process the clock mode is lockstep; leave it out, or add processes=True"
+            f"{clock_mode.flag}: in one process the clock mode is lockstep; leave it out, or add processes=True",
+            code="backend/wrong-clock-mode",
         )
     config = check_plugins(loaded.config, loaded.table)
     if clock_mode is not None and config.clock_mode != clock_mode.value:
         raise ConfigError(
-            f"{clock_mode.flag}: backend {config.backend!r} cannot keep this clock mode, only {config.clock_mode}"
+            f"{clock_mode.flag}: backend {config.backend!r} cannot keep this clock mode, only {config.clock_mode}",
+            code="backend/wrong-clock-mode",
         )
     return config

@@ -8,10 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.base.errors import ConfigError, ControllerError
-from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    NoParameters,
+    Observation,
+    Telemetry,
+    positions,
+    require_controller,
+)
+from snakesim_hal.wire.messages import JointState
 
 JointFunction = Callable[[float, JointState], Sequence[float]]
 """Maps the time since arming in s and the state of the joints to an angle in rad for each joint, tail to head."""
@@ -19,11 +26,11 @@ ControllerArgument = str | os.PathLike[str] | type[Any] | JointFunction
 TAKES = "a shipped name, a path './file.py:Class', a class, or a function f(time_s, joints) -> angles_rad"
 
 
-def name_controller(controller: ControllerArgument) -> tuple[str, Any | None]:
+def name_controller(controller: ControllerArgument) -> tuple[str, type[Controller[Any]] | None]:
     """Return the name of a controller in a configuration, and its class.
 
     Args:
-        controller: A shipped name, a path "./file.py:Class", a class with a method `update`, or a function.
+        controller: A shipped name, a path "./file.py:Class", a class derived from `Controller`, or a function.
 
     Returns:
         The name, and the class that must be offered under this name; None if the name alone is enough.
@@ -33,39 +40,44 @@ def name_controller(controller: ControllerArgument) -> tuple[str, Any | None]:
     """
     if isinstance(controller, str | os.PathLike):
         return os.fspath(controller), None
-    name = re.sub(r"\W+", "", getattr(controller, "__name__", type(controller).__name__)) or "function"
     if isinstance(controller, type):
-        if not callable(getattr(controller, "update", None)):
-            raise ConfigError(f"controller={name}: a controller class needs a method update(view); see docs/python.md")
-        return f"program:{name}", controller
-    if callable(getattr(controller, "update", None)):
-        raise ConfigError(f"controller={controller!r:.60}: give its class; every arming makes an object of it")
+        name = f"program:{controller.__name__}"
+        return name, require_controller(controller, name)
+    if isinstance(controller, Controller):
+        raise ConfigError(
+            f"controller={controller!r:.60}: give its class; every arming makes an object of it",
+            code="python/invalid-argument",
+        )
     if not callable(controller):
-        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}")
+        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}", code="python/invalid-argument")
+    name = _name_function(controller)
     try:
         inspect.signature(controller).bind(0.0, None)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"controller={name}: is called as f(time_s, joints), which does not fit: {error}") from None
+        raise ConfigError(
+            f"controller={name}: is called as f(time_s, joints), which does not fit: {error}",
+            code="python/invalid-argument",
+        ) from None
     return f"program:{name}", _wrap_function(controller, name)
 
 
-def _wrap_function(function: JointFunction, name: str) -> Any:
+def _name_function(function: Any) -> str:
+    """Return the name of a function without characters that a name must not have, such as those of `<lambda>`."""
+    name = getattr(function, "__name__", type(function).__name__)
+    return re.sub(r"\W+", "", name) or "function"
+
+
+def _wrap_function(function: JointFunction, name: str) -> type[Controller[Any]]:
     """Return a controller class that calls a function in every tick."""
 
-    class FunctionController:
-        NEEDS = "joints"
+    class FunctionController(Controller[NoParameters]):
+        needs_world = False
 
-        class Settings(FileStruct, frozen=True):
-            """A function has none."""
-
-        def __init__(self, robot: Description, settings: Settings) -> None:
-            self._robot = robot
-
-        def update(self, view: View) -> Action:
-            returned = function(view.time_s, view.joints)
-            angles_rad = _check_angles(returned, len(self._robot.joints), name)
-            report = Report(why=f"{name} moves the joints", reference_rad=angles_rad)
-            return Action(positions(self._robot, angles_rad), report)
+        def update(self, observation: Observation) -> ControllerCommand:
+            returned = function(observation.time_s, observation.joints)
+            angles_rad = _check_angles(returned, len(self.robot.joints), name)
+            telemetry = Telemetry(reason=f"{name} moves the joints", reference_rad=angles_rad)
+            return ControllerCommand(positions(self.robot, angles_rad), telemetry)
 
     FunctionController.__name__ = name
     FunctionController.__module__ = getattr(function, "__module__", None) or FunctionController.__module__

@@ -19,8 +19,8 @@ from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
 from snakesim_operator.results.page.charts import Line, lines
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.run_ending import COMPLETE
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, distance_m
 
 PLAYBACK_PX = 580
@@ -45,7 +45,7 @@ class Result:
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All signals split into columns by name, each (ticks,), as in the tables of `snakesim export`."""
+        """All signals split into columns by name, each (ticks,), as in the tables of `snakesim recording export`."""
         return table(self.record)
 
     @property
@@ -104,7 +104,8 @@ class Result:
         if name not in self.signal_names:
             raise ConfigError(
                 f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
-                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`"
+                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`",
+                code="recording/unknown-signal",
             )
         return self.arrays[name] if name in self.arrays else self.columns[name]
 
@@ -121,7 +122,8 @@ class Result:
             pandas = importlib.import_module("pandas")
         except ImportError as error:
             raise ConfigError(
-                f"to_pandas() needs pandas ({error}); install it with: {sys.executable} -m pip install pandas"
+                f"to_pandas() needs pandas ({error}); install it with: {sys.executable} -m pip install pandas",
+                code="extra/not-installed",
             ) from None
         frame = pandas.DataFrame(self.columns).set_index("time_s")
         frame.attrs["units"] = {name: self.units[name] for name in frame.columns}
@@ -180,7 +182,7 @@ class Result:
             The path of the file.
 
         Raises:
-            ConfigError: The run has no pose, or the extra `video` is not installed.
+            ConfigError: The run has no pose, or the extra `report` is not installed.
         """
         from snakesim_operator.playback.video import film
 
@@ -188,7 +190,7 @@ class Result:
         return Path(path)
 
     def compare(self, other: "Result") -> str:
-        """Return the differences between this run and another one, as `snakesim compare` prints them."""
+        """Return the differences between this run and another one, as `snakesim study compare` prints them."""
         from snakesim_operator.results.compare.difference import differ
         from snakesim_operator.results.compare.table import table as format_table
 
@@ -213,7 +215,7 @@ class Result:
         """The record; if its folder is gone, one whose pages link to no files in the folder."""
         if self.record.folder.exists():
             return self.record
-        return dataclasses.replace(self.record, alone=True)
+        return dataclasses.replace(self.record, config_path=None)
 
     def _figure(self, name: str) -> dict[str, Any]:
         """Return the figure of a signal over time."""

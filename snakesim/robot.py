@@ -15,9 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from snakesim_gnc.control.controller import positions
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, suggest_word
 from snakesim_hal.base.process import get_user_name
+from snakesim_hal.controller import positions
 from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import find_mismatch
@@ -40,9 +40,14 @@ from snakesim_hal.wire.own_sample import find_message_type
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots
-from snakesim_operator.recording.process import record_to_file
+from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.robot_commands.command import request_while_driving
-from snakesim_operator.robot_commands.parameters import Parameter, change_parameters, read_parameters, read_settings
+from snakesim_operator.robot_commands.parameters import (
+    Parameter,
+    change_parameters,
+    read_parameters,
+    read_parameters_in_force,
+)
 from snakesim_operator.robot_commands.stop import estop
 
 CONNECT_TIMEOUT_S = 5.0  # a robot may be starting
@@ -124,10 +129,13 @@ class Robot:
             links = find_robots(selection)
         if not links:
             named = "" if selection.namespace is None else f" named {selection.namespace}"
-            raise NotConnectedError(f"no robot{named} on {', '.join(selection.endpoints())}; is its HAL host running?")
+            raise NotConnectedError(
+                f"no robot{named} on {', '.join(selection.endpoints())}; is its HAL host running?",
+                code="network/no-robot",
+            )
         if len(links) > 1:
             choices = [f"  endpoint={link.endpoint!r}, name={link.namespace!r}" for link in links]
-            raise RefusedError("several robots found; choose one:", *choices)
+            raise RefusedError("several robots found; choose one:", *choices, code="network/several-robots")
         return Robot(links[0])
 
     def __enter__(self) -> Self:
@@ -205,7 +213,10 @@ class Robot:
         message = keys.find_message(key)
         if message is None or "*" in key:
             known = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
-            raise ConfigError(f"no key {key!r} in the key space; {suggest_word(key, known)}see schemas/keys.md")
+            raise ConfigError(
+                f"no key {key!r} in the key space; {suggest_word(key, known)}see schemas/keys.md",
+                code="network/unknown-key",
+            )
         message = find_message_type(key, self.description) or message
         may_wait = key not in self._readers and self._control is None
         return self._read_newest(key, message, FIRST_MESSAGE_TIMEOUT_S if may_wait else 0.0)
@@ -225,7 +236,10 @@ class Robot:
         clock = self._control.wait()
         if self._armed and clock.lifecycle != "armed":
             self._armed = False
-            raise RefusedError(f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.why}")
+            raise RefusedError(
+                f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}",
+                code="robot/not-armed",
+            )
         return clock.timestamp_ns * 1e-9
 
     def command(self, angles_rad: Sequence[float] | RequestedSetpoints) -> None:
@@ -259,14 +273,16 @@ class Robot:
         control = self._start_commanding()
 
         def explain_not_armed() -> str:
-            return f"not armed: {self.status.why}"
+            return f"not armed: {self.status.reason}"
 
         control.turn_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
         previous_session = self._clock.arm_session
         self._send_request(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
         control.turn_until(lambda: self._clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed)
         if self._clock.lifecycle != "armed":
-            raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")
+            raise RefusedError(
+                f"not armed any more, but {self._clock.lifecycle}: {self.status.reason}", code="robot/not-armed"
+            )
         self._armed = True
 
     def disarm(self) -> None:
@@ -275,7 +291,7 @@ class Robot:
         Raises:
             RefusedError: The robot refuses, or does not confirm.
         """
-        self._send_request(LifecycleRequest(action="disarm", who=get_user_name()), "disarmed")
+        self._send_request(LifecycleRequest(action="disarm", requester=get_user_name()), "disarmed")
         self._armed = False
 
     def reset_fault(self) -> None:
@@ -284,7 +300,7 @@ class Robot:
         Raises:
             RefusedError: The cause is still present, or the robot does not confirm.
         """
-        self._send_request(LifecycleRequest(action="clear", who=get_user_name()), "cleared")
+        self._send_request(LifecycleRequest(action="reset", requester=get_user_name()), "reset")
 
     def estop(self) -> None:
         """Trigger the emergency stop, over the stop port and over the network.
@@ -297,7 +313,7 @@ class Robot:
         selection = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
         exit_code = estop(selection, output.append)
         if exit_code:
-            raise RefusedError(*output)
+            raise RefusedError(*output, code="robot/not-confirmed")
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -306,7 +322,7 @@ class Robot:
         Raises:
             NotConnectedError: No controller is running.
         """
-        parameters = read_parameters(read_settings(self._session))
+        parameters = read_parameters(read_parameters_in_force(self._session))
         return {f"control.{parameter.name}": parameter for parameter in parameters}
 
     def set(self, changes: Mapping[str, Any]) -> None:
@@ -361,9 +377,9 @@ class Robot:
         count = len(self.joint_names)
         expected = f"{name} is {values!r:.80}, must be {count} finite numbers, tail to head"
         if len(values) != count:
-            raise ConfigError(f"{expected}; got {len(values)}")
+            raise ConfigError(f"{expected}; got {len(values)}", code="python/invalid-argument")
         if not all(math.isfinite(value) for value in values):
-            raise ConfigError(expected)
+            raise ConfigError(expected, code="python/invalid-argument")
 
     def _send_request(self, request: LifecycleRequest, done: str) -> None:
         """Send a lifecycle request and wait for its effect, while the lease is renewed."""
@@ -398,7 +414,9 @@ class Robot:
         """Return the newest message of a key that every robot publishes. Raises NotConnectedError."""
         newest = self._read_newest(key, message, CONNECT_TIMEOUT_S)
         if newest is None:
-            raise NotConnectedError(f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?")
+            raise NotConnectedError(
+                f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?", code="network/no-robot"
+            )
         return newest
 
     def _read_newest(self, key: str, message: type[Message], first_timeout_s: float) -> Any:
@@ -441,6 +459,9 @@ def _select_robot(endpoint: str | None, name: str | None, session: str | os.Path
     if session is None:
         return RobotSelection(endpoint, name)
     if endpoint is not None:
-        raise ConfigError("endpoint and session: the session file names the endpoint; leave one out")
+        raise ConfigError(
+            "endpoint and session: the session file names the endpoint; leave one out",
+            code="command/conflicting-options",
+        )
     file = read_session(Path(session))
     return RobotSelection(file.endpoints[0], file.namespace_for(name), file)

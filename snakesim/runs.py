@@ -15,7 +15,8 @@ from snakesim.result import Result
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, shorten
 from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import Override, RunConfig
-from snakesim_operator.results.record import SUMMARY, RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.in_process import simulate
@@ -57,7 +58,10 @@ def run(
         SnakesimError: The run could not begin.
     """
     if not isinstance(scenario, str | os.PathLike):
-        raise ConfigError(f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file")
+        raise ConfigError(
+            f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file",
+            code="python/invalid-argument",
+        )
     overrides = list_overrides(set, duration_s=duration, seed=seed, backend=backend)
     with contextlib.ExitStack() as opened:
         if controller is not None:
@@ -67,7 +71,8 @@ def run(
                 if processes:
                     raise ConfigError(
                         f"controller={name.removeprefix('program:')}: processes of their own cannot reach an object of "
-                        "this program; save it in a file, and give its path, such as controller='./mine.py:Mine'"
+                        "this program; save it in a file, and give its path, such as controller='./mine.py:Mine'",
+                        code="python/invalid-argument",
                     )
                 opened.enter_context(offer_plugin(CONTROLLERS, name, plugin))
         config = load_checked(os.fspath(scenario), overrides, processes=processes)

@@ -5,7 +5,7 @@
 `bus`        one CAN bus: SocketCAN, or python-can's virtual bus where the kernel has no CAN
 `emulator`       emulated modules: the firmware's behavior on a real bus, with any physics model driven by the motors
 `driver`     CanBackend, the entry point `can`: samples, enacts and advances, tick by tick
-`can_command` is `snakesim can`
+`can_command` is `snakesim drive`
 
 Imports the HAL, python-can and cantools, never the simulator, GNC or Zenoh.
 """

@@ -1,17 +1,17 @@
-"""`snakesim can`: bus load of a configuration, modules that answer on a bus, a log replayed, the expanded DBC file."""
+"""What `snakesim drive` does for joint modules: bus load, scan, replay of a log, the expanded DBC file."""
 
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from math import ceil
 from pathlib import Path
+from typing import Any
 
+from snakesim_can_backend.arguments import EXPANDED
 from snakesim_can_backend.bus.adapter import check_channel, open_bus, open_wire
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.bus.load import (
-    BIT_RATE,
     MAX_LOAD,
-    MIN_RATE_HZ,
     ReportSchedule,
     bus_load,
     busiest_period_s,
@@ -31,23 +31,21 @@ from snakesim_can_backend.driver.offline import LogReplay, compare_with_run_log
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
-from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
+from snakesim_can_backend.protocol.expanded import expanded_dbc
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import align_columns, print_line
+from snakesim_hal.base.terminal import align_columns, discard_line, print_json, print_line
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.programs.arguments import number_type
 from snakesim_hal.run_log.black_box import read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX
 
 OK, FAILED = 0, 1
 MODULES = "can"  # the backend of joint modules
 LISTEN_S = 0.3  # for others on a bus; most devices say something five times a second or more
-MAX_RATE_HZ = 5000  # of a scenario
 COLUMNS = (
     *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
     *("voltage", "motor", "board", "shaft"),
@@ -55,66 +53,57 @@ COLUMNS = (
 UNKNOWN = "-"
 
 
-def main(argv: Sequence[str]) -> int:
-    """Exit code: 0 done, 1 does not fit or no module answers. Raises SnakesimError."""
-    arguments = parser().parse_args(list(argv))
-    return arguments.act(arguments)
-
-
-def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
-    parser = argparse.ArgumentParser(prog="snakesim can", description="Joint modules and their buses.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    asked = commands.add_parser("load", help="print the worst-case load of a scenario's buses")
-    asked.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
-    asked.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value")
-    joints, rate_hz = number_type(1, LAST_NODE, "joints"), number_type(float(MIN_RATE_HZ), MAX_RATE_HZ, "Hz")
-    asked.add_argument("--joints", type=joints, nargs="+", metavar="N", help="for a robot with this many joints")
-    asked.add_argument("--rates", type=rate_hz, nargs="+", metavar="HZ", help="for these control rates")
-    asked.set_defaults(act=_load)
-
-    answering = commands.add_parser(
-        "scan", help="list every module that answers; sends only identify, and nothing where others use the bus"
-    )
-    answering.add_argument("channel", nargs="+", help="SocketCAN interface such as can0, or slcan:/dev/ttyACM0")
-    answering.add_argument(
-        "--bit-rate", type=number_type(10_000, 1_000_000, "bit/s"), default=BIT_RATE, help="of an adapter (1000000)"
-    )
-    seconds = number_type(0.001, 3600, "s")
-    answering.add_argument("--seconds", type=seconds, default=1.0, help="how long to listen on each (default: 1)")
-    answering.add_argument("--anyway", action="store_true", help="send identify also where others use the bus")
-    answering.set_defaults(act=_scan)
-
-    again = commands.add_parser(
-        "replay", help="read a log of the bus as the driver does, and compare its joint states with the run's record"
-    )
-    again.add_argument("run", type=Path, help="folder of the run, with config.json and its black box")
-    again.add_argument("log", type=Path, help="log of its bus: .log (candump; backends.can.log of a run), .asc, .blf")
-    again.set_defaults(act=_replay)
-
-    expand = commands.add_parser("expand", help="write the DBC file with every message of every node")
-    expand.add_argument("--out", type=Path, default=Path(EXPANDED), metavar="FILE", help=f"(default: {EXPANDED})")
-    expand.set_defaults(act=_expand)
-    return parser
-
-
 # --- load --------------------------------------------------------------------------------------------------
 
 
-def _load(arguments: argparse.Namespace) -> int:
-    overrides = [Override("backend", "can", "snakesim can"), *(parse_set(text) for text in arguments.set)]
+def print_load(arguments: argparse.Namespace) -> int:
+    """Print the worst-case load of a scenario's buses. Returns 1 if it does not fit."""
+    overrides = [Override("backend", "can", "drive load can"), *(parse_set(text) for text in arguments.set)]
     loaded = load_scenario(arguments.scenario, overrides)
     settings = settings_of(loaded)
-    if arguments.joints is None and arguments.rates is None:
-        lines, all_fit = one(loaded.config, settings)
-        for line in lines:
-            print_line(line)
-        return OK if all_fit else FAILED
     config = loaded.config
-    for line in table(config, settings, arguments.joints or [config.robot.chain.modules], arguments.rates):
+    if arguments.joints is None and arguments.hz is None:
+        return _print_scenario_load(config, settings, as_json=arguments.json)
+    joints = arguments.joints or [config.robot.chain.modules]
+    if arguments.json:
+        print_json({"loads": list(_list_loads(config, settings, joints, arguments.hz))})
+        return OK
+    for line in table(config, settings, joints, arguments.hz):
         print_line(line)
     return OK
+
+
+def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: bool) -> int:
+    """Print the load of every bus of a scenario. Returns the exit code."""
+    lines, all_fit = one(config, settings)
+    if as_json:
+        channels = settings.channels or ["one bus"]
+        buses = [
+            {"channel": channel, "joints": bus[0], "load": bus_load(*bus), "fits": is_feasible(*bus)}
+            for channel, bus in zip(channels, plan_buses(config, settings), strict=True)
+        ]
+        print_json({"rate_hz": config.rate_hz, "buses": buses, "fits": all_fit})
+    else:
+        for line in lines:
+            print_line(line)
+    return OK if all_fit else FAILED
+
+
+def _list_loads(
+    config: RunConfig, settings: CanSettings, joints: Sequence[int], rates_hz: Sequence[float] | None
+) -> Iterator[dict[str, Any]]:
+    """Yield the load of the fullest bus for every number of joints and every rate."""
+    buses = max(len(settings.channels), 1)
+    for count in joints:
+        on_fullest = ceil(count / buses)
+        for rate_hz in rates_hz or [config.rate_hz]:
+            reports = plan_reports_at(rate_hz, config, settings)
+            yield {
+                "joints": count,
+                "rate_hz": rate_hz,
+                "load": bus_load(on_fullest, reports),
+                "fits": is_feasible(on_fullest, reports),
+            }
 
 
 def settings_of(loaded: Loaded) -> CanSettings:
@@ -158,24 +147,28 @@ def _cell(joints: int, reports: ReportSchedule) -> str:
 # --- scan --------------------------------------------------------------------------------------------------
 
 
-def _scan(arguments: argparse.Namespace) -> int:
-    found = 0
+def scan_channels(arguments: argparse.Namespace) -> int:
+    """List the modules that answer on some buses. Returns 1 if none answers."""
+    found: list[dict[str, str]] = []
+    in_use: list[str] = []
+    say = discard_line if arguments.json else print_line
     for channel in arguments.channel:
         if not arguments.anyway and (others := overheard(channel, arguments.bit_rate)):
-            print_line(
-                f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway"
-            )
+            in_use.append(channel)
+            say(f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway")
             for other in others:
-                print_line(f"  {other}")
+                say(f"  {other}")
             continue
         wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
-            rows = scan(wire, arguments.seconds)
+            rows = scan(wire, arguments.duration)
         finally:
             wire.close()
         for line in align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
-            print_line(line)
-        found += len(rows)
+            say(line)
+        found += rows
+    if arguments.json:
+        print_json({"drives": found, "in_use_by_others": in_use})
     return OK if found else FAILED
 
 
@@ -226,12 +219,14 @@ def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
 # --- replay ------------------------------------------------------------------------------------------------
 
 
-def _replay(arguments: argparse.Namespace) -> int:
+def replay_log(arguments: argparse.Namespace) -> int:
+    """Compare the log of a bus with the record of its run. Returns 1 if they differ."""
     loaded = load_scenario(str(arguments.run / "config.json"), [])
     if loaded.config.backend != MODULES:
         raise ConfigError(
-            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim can replay` reads "
-            f"the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run"
+            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim drive replay can` "
+            f"reads the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run",
+            code="recording/missing-data",
         )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)
@@ -269,10 +264,12 @@ def looks(foreign: Counter[str]) -> str:
     return f"; {count} frames look like {kind}" if count else ""
 
 
-# --- expand ------------------------------------------------------------------------------------------------
+# --- dbc ---------------------------------------------------------------------------------------------------
 
 
-def _expand(arguments: argparse.Namespace) -> int:
-    write_text(arguments.out, expanded_dbc(), encoding="cp1252")
-    print_line(str(arguments.out))
+def write_dbc(arguments: argparse.Namespace) -> int:
+    """Write the DBC file with every message of every node."""
+    path = arguments.out or Path(EXPANDED)
+    write_text(path, expanded_dbc(), encoding="cp1252")
+    print_line(str(path))
     return OK

@@ -13,39 +13,65 @@ from snakesim_hal.wire.quantities import from_zero
 class MountedModule(Mounted, frozen=True, kw_only=True):
     """How an emulated module is really mounted and wired, where that is not what the robot file says."""
 
-    id: Annotated[int, Meta(ge=1, le=LAST_NODE)] | None = None  # that it has: of another joint
-    connected: bool = True  # False: its motor gets no current
+    id: Annotated[int, Meta(ge=1, le=LAST_NODE)] | None = None
+    """Id that the emulated module has instead of the one in the robot file; none: as in the robot file."""
+
+    connected: bool = True
+    """False: the motor of the emulated module gets no current."""
 
 
 class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
-    # Buses, tail to head: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can, such as
-    # slcan:/dev/ttyACM0. Empty: a virtual bus in this process, with emulated joint modules on it.
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
-    # Of the buses: loads are computed for it, and adapters set to it. A kernel interface has that of `ip link`.
+    """CAN buses, tail to head: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can; empty: a virtual
+    bus in this process with emulated joint modules.
+    """
+
     bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
-    # Number of joints of each channel, tail to head. Empty: distributed evenly.
+    """Bit rate of the buses, for which loads are computed and to which adapters are set; a kernel interface has that of
+    `ip link`.
+    """
+
     joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
-    # Where emulated joint modules run: `here` (virtual bus), as a `process` that this one starts, or `none`: real
-    # modules, or `snakesim modules` in another terminal. Default: `here` without channels, `none` with them.
+    """Number of joints of each channel, tail to head; empty: joints are distributed evenly."""
+
     emulators: Literal["here", "process", "none"] | None = None
-    physics_model: str = (
-        "mujoco"  # body that the emulators' motors move: an entry point in the group `snakesim.physics_models`
-    )
+    """Where emulated joint modules run: `here`, in a `process` that the driver starts, or `none` for real modules and
+    those of `snakesim drive emulate can`; not given: `here` without channels, `none` with them.
+    """
+
+    physics_model: str = "mujoco"
+    """Body that the emulators' motors move: `mujoco`, `inertia`, or another installed physics model."""
+
     physics_model_settings: dict[str, Any] = {}
-    # Of the emulators: joint -> how its module is mounted in truth, to see what a wrong robot file does.
+    """Settings of the physics model, which checks them."""
+
     mounted: dict[str, MountedModule] = {}
-    faults: list[str] = []  # of the emulators, such as "mute:joint_3@2"; `snakesim modules --help` lists them
-    contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # default: the robot file's
+    """For joints of emulated modules, how each is really mounted, to see what a wrong robot file does."""
+
+    faults: list[str] = []
+    """Faults of the emulators, such as "mute:joint_3@2"; `snakesim drive emulate can --help` lists them."""
+
+    contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None
+    """Rate at which modules report contacts; none: that of the contact sensor in the robot file."""
+
     imu_rate_hz: Annotated[float, from_zero(1e4, "Hz")] = 5.0
+    """Rate at which modules report their IMU; 0: they do not report it."""
+
     watchdog_s: Annotated[float, Meta(ge=0.02, le=0.1, extra_json_schema={"unit": "s"})] = 0.1
-    # Time limit for discovery and parameters of the modules.
+    """Time without a setpoint after which a module stops by itself."""
+
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    # UDP address for the base's pose from motion capture: HOST:PORT. Port 0: known only to own emulators.
-    # Default: "127.0.0.1:0" with own emulators, none otherwise.
+    """Time limit for finding the modules and reading their parameters at the start."""
+
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None
-    log: str = ""  # candump file of all frames sent and received; empty: none
+    """UDP address HOST:PORT at which the pose from motion capture arrives; none: a free port for emulators that this
+    process starts, otherwise no motion capture.
+    """
+
+    log: str = ""
+    """Candump file of all frames that are sent and received; empty: no file is written."""
 
     @property
     def emulators_run(self) -> Literal["here", "process", "none"]:

@@ -1,11 +1,12 @@
-"""Between joints and the shafts of their drives: sign, zero and gear of every joint, as vectors.
+"""Converts between joints and the shafts of their drives: sign, zero and gear of every joint, as vectors.
 
     drive angle    = zero_rad + sign * gear * joint angle
     drive velocity = sign * gear * joint velocity
-    drive torque   = joint torque / (sign * gear)           friction of the gear is the motor's `friction_nm`
+    drive torque   = joint torque / (sign * gear)
 
-A driver speaks to its drives in the numbers on the left, and to everybody else in those on the right. All vectors are
-(n_joints,) float64, tail to head. With sign 1, zero 0 and gear 1 they are the same, to the bit.
+Friction of the gear is not here: it is the motor's `friction_nm`. A driver exchanges the values on the left with its
+drives, and those on the right with the rest of SnakeSIM. All vectors are (n_joints,) float64, from tail to head. With
+sign 1, zero 0 and gear 1 both are the same, to the bit.
 """
 
 from collections.abc import Sequence
@@ -18,68 +19,90 @@ from snakesim_hal.wire.messages import Mode
 
 
 class Mounting:
-    """How all drives of a robot are mounted, as its file says."""
+    """How the drives of some joints are mounted, as the robot file describes it."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
-        """joints: `RobotFile.joint_table`, or those that one bus has."""
+        """Read the mounting of joints.
+
+        Args:
+            joints: `RobotFile.joint_table`, or those joints that one bus has.
+        """
         self.sign: Floats = np.array([float(joint.drive.sign) for joint in joints])
         self.zero_rad: Floats = np.array([joint.drive.zero_rad for joint in joints])
         self.gear: Floats = np.array([joint.drive.gear for joint in joints])
-        self._turns = self.sign * self.gear
+        self._ratio = self.sign * self.gear  # revolutions of the shaft for one of the joint
 
-    # --- to the drive ----------------------------------------------------------------------------------------
+    # --- from joints to drives --------------------------------------------------------------------------------
 
-    def drive_angle_rad(self, joint_angle_rad: Floats) -> Floats:
-        """Angles of the drives' shafts."""
-        return self.zero_rad + self._turns * joint_angle_rad
+    def to_drive_angle_rad(self, joint_angle_rad: Floats) -> Floats:
+        """Convert joint angles to angles of the drives' shafts."""
+        return self.zero_rad + self._ratio * joint_angle_rad
 
-    def drive_velocity_rad_s(self, joint_velocity_rad_s: Floats) -> Floats:
-        """Velocities of the drives' shafts."""
-        return self._turns * joint_velocity_rad_s
+    def to_drive_velocity_rad_s(self, joint_velocity_rad_s: Floats) -> Floats:
+        """Convert joint velocities to velocities of the drives' shafts."""
+        return self._ratio * joint_velocity_rad_s
 
-    def drive_torque_nm(self, joint_torque_nm: Floats) -> Floats:
-        """Torques at the drives' shafts."""
-        return joint_torque_nm / self._turns
+    def to_drive_torque_nm(self, joint_torque_nm: Floats) -> Floats:
+        """Convert joint torques to torques at the drives' shafts."""
+        return joint_torque_nm / self._ratio
 
-    def drive_targets(self, modes: Sequence[Mode], targets: Sequence[float]) -> Floats:
-        """SafeSetpoints in the unit of each joint's mode; of a passive joint 0."""
-        mode, target = np.array(modes, dtype=np.intp), np.array(targets)
-        choices = (
-            np.zeros(len(target)),
-            self.drive_angle_rad(target),
-            self.drive_velocity_rad_s(target),
-            self.drive_torque_nm(target),
-        )
-        return np.choose(mode, choices)
-
-    def drive_torque_limit_nm(self, joint_limit_nm: Floats) -> Floats:
-        """Limits, which have no sign."""
+    def to_drive_torque_limit_nm(self, joint_limit_nm: Floats) -> Floats:
+        """Convert torque limits of joints to those at the drives' shafts. Limits have no sign."""
         return joint_limit_nm / self.gear
 
-    # --- from the drive --------------------------------------------------------------------------------------
+    def to_drive_targets(self, modes: Sequence[Mode], targets: Sequence[float]) -> Floats:
+        """Convert targets of joints to targets of the drives' shafts.
 
-    def joint_angle_rad(self, drive_angle_rad: Floats) -> Floats:
-        """Angles of the joints."""
-        return (drive_angle_rad - self.zero_rad) / self._turns
+        Args:
+            modes: The mode of every joint.
+            targets: The target of every joint in rad, rad/s or N·m, by its mode.
 
-    def joint_velocity_rad_s(self, drive_velocity_rad_s: Floats) -> Floats:
-        """Velocities of the joints."""
-        return drive_velocity_rad_s / self._turns
+        Returns:
+            (n_joints,) in the same units; 0 for passive joints.
+        """
+        mode_numbers = np.array(modes, dtype=np.intp)
+        joint_targets = np.array(targets)
+        target_by_mode = (
+            np.zeros(len(joint_targets)),
+            self.to_drive_angle_rad(joint_targets),
+            self.to_drive_velocity_rad_s(joint_targets),
+            self.to_drive_torque_nm(joint_targets),
+        )
+        return np.choose(mode_numbers, target_by_mode)
 
-    def joint_torque_nm(self, drive_torque_nm: Floats) -> Floats:
-        """Torques at the joints."""
-        return drive_torque_nm * self._turns
+    # --- from drives to joints --------------------------------------------------------------------------------
+
+    def to_joint_angle_rad(self, drive_angle_rad: Floats) -> Floats:
+        """Convert angles of the drives' shafts to joint angles."""
+        return (drive_angle_rad - self.zero_rad) / self._ratio
+
+    def to_joint_velocity_rad_s(self, drive_velocity_rad_s: Floats) -> Floats:
+        """Convert velocities of the drives' shafts to joint velocities."""
+        return drive_velocity_rad_s / self._ratio
+
+    def to_joint_torque_nm(self, drive_torque_nm: Floats) -> Floats:
+        """Convert torques at the drives' shafts to joint torques."""
+        return drive_torque_nm * self._ratio
 
 
-def joint_target(drive: Drive, mode: Mode, target: float) -> float:
-    """What a target of a module's shaft is at the joint, in the mode's unit."""
-    turns = drive.sign * drive.gear
+def to_joint_target(drive: Drive, mode: Mode, target: float) -> float:
+    """Convert the target of one drive's shaft to that of its joint.
+
+    Args:
+        drive: How the drive is mounted.
+        mode: The mode of the target.
+        target: At the shaft, in rad, rad/s or N·m.
+
+    Returns:
+        The target at the joint, in the same unit; 0 if passive.
+    """
+    ratio = drive.sign * drive.gear
     match mode:
         case Mode.POSITION:
-            return (target - drive.zero_rad) / turns
+            return (target - drive.zero_rad) / ratio
         case Mode.VELOCITY:
-            return target / turns
+            return target / ratio
         case Mode.TORQUE:
-            return target * turns
+            return target * ratio
         case Mode.PASSIVE:
             return 0.0

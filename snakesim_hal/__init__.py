@@ -7,6 +7,7 @@ From the ground up:
 `model`      what people write in files (robot, scene, scenario), its geometry, and kinds and plans of faults
 `physics`    heat, motors, hills, the physics-model interface: for simulators, emulated drives and viewers
 `backend`    the contract that a simulator or a driver implements
+`controller` the base class of controllers, with its observations and commands
 `safety`     who may move the robot, by how much, and what stops it; pure
 `network`    Zenoh, which nothing else imports: sessions, the client of controllers, the stop port
 `faults`     carries out injected faults, where they are allowed

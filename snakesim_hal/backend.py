@@ -1,25 +1,51 @@
-"""The interface of a backend.
+"""The interface of a backend: a robot, simulated or real.
 
-A backend is opened from the run's settings, asked for samples once a tick, given setpoints once a tick, and advanced
-by one period at a time. It never sees Zenoh or leases: the host handles those, for every backend alike.
+`Backend` is the base class of every backend. This file shows each of its members with its arguments, their units, when
+it is called, by which thread, and how long it may take. A backend never uses Zenoh or leases: the host handles those,
+for every backend alike.
+
+Call order
+    Before a run, on the class alone: `Settings`, `supported_modes` or `limit_modes`, then `check`. They open nothing.
+    To start: the constructor, then `describe`.
+    In every control cycle: `sample`, `enact`, `advance`, `faults`. Until the robot is armed for the first time in
+    lockstep, the host may repeat a tick.
+    At any time between two of these calls: `describe`, `inject`.
+    To end: `close`, also after an error.
+
+Threads
+    One thread, that of the host, makes all calls. No two calls overlap, so a backend without threads needs no lock.
+
+Time
+    `sample`, `enact`, `advance` and `faults` together may take up to four fifths of a control period. The host measures
+    them. If they take longer, `snakesim status` names the backend with the rate that it could hold, and the robot is
+    not armed. The rest of the period is for the controller. The host waits for the next period itself, so that a
+    backend need not sleep.
+
+Errors
+    An exception of any call ends the run safely: the host reports it as a latched fault `backend_failed`, calls `close`
+    and keeps the record. Raise `BackendError` with a message that says what to do, and `ConfigError` for a value of the
+    configuration. An exception of another class is reported with the name of the call.
+
+Units are SI, and vectors have one entry for each joint, from tail to head.
 """
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, ClassVar
 
 import msgspec
 
+from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.joints import DriveMode
+from snakesim_hal.model.robot import RobotFile, with_modes
+from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode, Description, Fault, JointState, LifecycleState, Message, Mode
-
-if TYPE_CHECKING:
-    from snakesim_hal.model.fault_kinds import Injection
-    from snakesim_hal.model.scenario import RunConfig
 
 
 @dataclass(frozen=True)
 class SafeSetpoints:
-    """SafeSetpoints of all joints from now on, tail to head, after the limiter.
+    """Setpoints of all joints that have passed the limiter; they hold until the next ones.
 
     Only the limiter creates them, so the type checker proves that no backend gets setpoints that were not limited.
     Controllers return `snakesim_hal.wire.setpoints.RequestedSetpoints` instead.
@@ -40,59 +66,143 @@ class Samples:
     encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # `others`; filled in by the host
 
 
-class Backend(Protocol):
-    """A robot, simulated or real."""
+class Backend(ABC):
+    """A robot, simulated or real. Derive from it, and implement the abstract methods.
 
+    The members above the constructor belong to the class: they are used before a run, when no backend is open.
+    """
+
+    Settings: ClassVar[type[msgspec.Struct]]  # the scenario's `[backends.<name>]` section; may be an empty Struct
+    supported_modes: ClassVar[Collection[DriveMode] | None] = None  # of every joint; None: those of the robot file
+
+    @classmethod
+    def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
+        """Check a configuration, and return the clock modes that are possible with it.
+
+        Called before anything starts, perhaps on a computer without the robot, and perhaps several times. Opens
+        nothing. May take a second.
+
+        Args:
+            config: The run, with a robot that has only the modes of this backend.
+            settings: An instance of `Settings`.
+
+        Returns:
+            The possible clock modes, the preferred one first. The default is real time alone, as for a real robot. A
+            simulation can also wait for slow services: "lockstep", and run faster than real time: "free".
+
+        Raises:
+            ConfigError: This backend supports the run in no clock mode. The run does not start.
+        """
+        del config, settings
+        return ("realtime",)
+
+    @classmethod
+    def limit_modes(cls, robot: RobotFile) -> RobotFile:
+        """Return the robot with only those control modes that its joints have on this backend.
+
+        Called before `check`. The default applies `supported_modes` to all joints alike. Override it only if joints
+        differ. A controller that needs a mode that a joint does not have is refused before the run.
+
+        Args:
+            robot: The robot as its file describes it.
+
+        Raises:
+            ConfigError: The backend cannot drive this robot.
+        """
+        if cls.supported_modes is None:
+            return robot
+        return with_modes(robot, cls.supported_modes)
+
+    def __init__(self, config: RunConfig, settings: Any) -> None:
+        """Open the robot; no motor is switched on. May take seconds or minutes.
+
+        Args:
+            config: The run that `check` has accepted, in one of the clock modes that it returned.
+            settings: An instance of `Settings`.
+
+        Raises:
+            BackendError: A device is missing or does not answer. Whatever was opened is closed again, because the host
+                cannot call `close` without an object.
+        """
+        del config, settings
+
+    @abstractmethod
     def describe(self) -> Description:
-        """The description of the robot; available right after opening."""
-        ...
+        """Return the description of the robot: the same one at every call, at once.
 
+        `snakesim_hal.model.robot.describe_robot` makes it from the robot file. It lists exactly those sensors whose
+        samples `sample` returns.
+        """
+
+    @abstractmethod
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """Read every sensor that is due at `tick`. Raises BackendError when it has no valid state any more."""
-        ...
+        """Read the joints, and every other sensor that is due.
 
+        A joint that does not answer keeps its last values with a growing `age_ns`, or is not `valid`. That is no error.
+
+        Args:
+            tick: Number of the control cycle, which goes into every sample.
+            timestamp_ns: The robot's time, which goes into every sample that was measured now.
+
+        Raises:
+            BackendError: There is no valid state any more. The run ends.
+        """
+
+    @abstractmethod
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Hand setpoints to the motors; they hold until the next call.
 
-        The setpoints are safe in every state, so a simulator needs no more. A robot whose modules have states of their
-        own makes them follow `lifecycle`: armed on "armed", and stopped by itself on anything else.
-        """
-        ...
+        The setpoints are safe in every state, so a simulator needs no more. A robot whose drives have states of their
+        own makes them follow `lifecycle`.
 
+        Args:
+            setpoints: Setpoints within every limit. Isolated joints are passive in them.
+            lifecycle: "armed": drives may be switched on. "fault": drives that follow go on, to brake, and no other is
+                switched on. "disarmed" and "estop": all drives are off.
+
+        Raises:
+            BackendError: The setpoints cannot be sent. The run ends.
+        """
+
+    @abstractmethod
     def advance(self) -> None:
-        """Let one control period pass: a simulator steps, a driver sends and listens. Raises BackendError."""
-        ...
+        """Let one control period pass: a simulator steps, a driver sends and receives, without sleeping.
+
+        Raises:
+            BackendError: The robot cannot go on. The run ends.
+        """
 
     def faults(self) -> list[Fault]:
-        """Faults detected since the last call; empty in normal operation."""
-        ...
+        """Return the faults that were detected since the last call, each once until the operator's reset.
 
-    def close(self) -> None:
-        """Make the joints safe and release all resources. Called once, also after an error."""
-        ...
-
-
-@runtime_checkable
-class Injectable(Protocol):
-    """A backend that injects faults itself, more realistically than the host could."""
-
-    def inject(self, injection: "Injection", *, begins: bool) -> bool:
-        """Begin or end an injected fault; False when this backend has no such fault. Raises ConfigError."""
-        ...
-
-
-class BackendFactory(Protocol):
-    """The object of an entry point in the group `snakesim.backends`: usually the backend's class."""
-
-    Settings: type[msgspec.Struct]  # the scenario's [backends.<name>] section
-
-    def check(self, config: "RunConfig", settings: Any) -> tuple[ClockMode, ...]:
-        """The supported clock modes, the preferred one first; a real robot supports real time only. Opens nothing.
-
-        Raises ConfigError for a run that this backend does not support at any clock mode, so that nothing is started.
+        A fault with `reach="joint"` isolates its joint if the robot file allows that; one with `reach="none"` is only
+        noted; any other stops the robot. The default is a robot that detects none.
         """
-        ...
+        return []
 
-    def __call__(self, config: "RunConfig", settings: Any) -> Backend:
-        """Open the backend for a run."""
-        ...
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Begin or end an injected fault, where the backend can do so more realistically than the host.
+
+        Called between two control cycles, and only if the robot is emulated or the scenario allows it.
+
+        Args:
+            injection: The fault.
+            begins: True to begin it, False to end it.
+
+        Returns:
+            False if this backend does not have this fault: the host then changes samples instead, if it can. This is
+            the default.
+
+        Raises:
+            ConfigError: The fault cannot be injected into this robot. It is refused, and the run continues.
+        """
+        del injection, begins
+        return False
+
+    @abstractmethod
+    def close(self) -> None:
+        """Switch off all motors, and release all resources. May take seconds.
+
+        Called once by the host, also after an error; a second call does nothing. Afterwards no call moves anything:
+        each returns or raises BackendError.
+        """

@@ -6,15 +6,15 @@ host that the tick is done.
 
 import contextlib
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import ClassVar
 
 import msgspec
 
 from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimError, WireError, describe_exception
 from snakesim_hal.faults.allowed import create_service_faults
-from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.scenario import Service as Schedule
+from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.session import Session
@@ -29,32 +29,60 @@ SERVICE_START_LIMIT_S = (
 )
 
 
-class Service(Protocol):
-    """The class behind an entry point in the group `snakesim.services`, and `[services.NAME]` of a scenario.
+class Service(ABC):
+    """A service of a robot: the class behind an entry point in the group `snakesim.services`, and `[services.NAME]`.
 
-    The constructor subscribes to everything that the service will read.
+    Derive from it, give it a `name`, and implement `outputs`. One thread makes all calls, one after the other: the
+    constructor, then `configure`, then for every due tick `outputs`. While the clock is silent it calls `silence`, and
+    while a simulator is paused `pause`. An exception of any call ends the service, and its log names the call.
     """
 
-    name: str
-    urgent: bool = False  # whether the robot waits for this service in every tick
+    name: ClassVar[str] = ""  # of its section in a scenario, and the first part of the keys that it writes
+    urgent: ClassVar[bool] = False  # True: the robot waits for this service in every tick, so it gets a high priority
     too_slow: str = ""  # evidence that it is too slow for real time; empty: none
 
-    def __init__(self, client: Client, config: RunConfig) -> None: ...
+    def __init__(self, client: Client, config: RunConfig) -> None:
+        """Subscribe to everything that the service will read. Called before the robot is known.
+
+        Args:
+            client: Connection to the robot, for subscriptions and requests.
+            config: The run.
+        """
+        del client, config
 
     def configure(self, robot: Description) -> None:
-        """Prepare for a robot. Called before the first tick, and again after a restart of the HAL host."""
-        ...
+        """Prepare for a robot. Called before the first tick, and again after a restart of the HAL host.
 
+        Args:
+            robot: Description of the robot.
+        """
+        del robot
+
+    @abstractmethod
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """Return what to publish for a tick, as (key, message); None while the service has no output yet."""
-        ...
+        """Return what to publish for a tick.
+
+        May take `decimation` control periods, and in lockstep any time: the run waits for it. Until the robot is armed
+        the same tick may come again.
+
+        Args:
+            clock: The tick, with the robot's time and lifecycle.
+
+        Returns:
+            Pairs of key and message; None while the service has no output yet, so that the robot is not armed.
+        """
 
     def silence(self) -> list[tuple[str, Message]]:
         """Return what to publish when the HAL's clock has been silent for a second, as (key, message)."""
         return []
 
     def pause(self, clock: Clock) -> None:
-        """Serve requests that need no tick. Called about 20 times a second while a simulator is paused."""
+        """Serve requests that need no tick. Called about 20 times a second while a simulator is paused.
+
+        Args:
+            clock: The tick at which the simulator is paused.
+        """
+        del clock
 
 
 class ServiceLoop:
@@ -80,11 +108,10 @@ class ServiceLoop:
             ServiceError: The service raised an error. The error names the service.
         """
         name = service_type.name
-        schedule = config.services.get(name, Schedule())
+        schedule = config.services.get(name, ServiceSchedule())
 
         # For errors.
-        class_name = getattr(service_type, "__name__", service_type)
-        self._label = f"service {schedule.code or name} (class {class_name})"
+        self._label = f"service {schedule.code or name} (class {service_type.__name__})"
         self._module = service_type.__module__
 
         # The service, which subscribes in its constructor, before the robot is there.

@@ -1,5 +1,6 @@
 """Entry point of the `snakesim` command."""
 
+import errno
 import os
 import sys
 
@@ -31,7 +32,7 @@ def main() -> int:
     """The command's exit code.
 
     Ctrl-C ends a command at once, by the signal itself, also during import and exit, where
-    Python would print a traceback. `snakesim run` and `snakesim modules`, which must shut
+    Python would print a traceback. `snakesim run` and `snakesim drive emulate can`, which must shut
     down in order, handle the signal themselves.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
@@ -45,7 +46,9 @@ def main() -> int:
         from snakesim_operator.cli import main as command
 
         return command()
-    except (MemoryError, ImportError, SystemError) as error:
+    except (MemoryError, ImportError, SystemError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ENOMEM:
+            raise
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if not isinstance(error, MemoryError) and limit == resource.RLIM_INFINITY:  # not for lack of memory
             raise

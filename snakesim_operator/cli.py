@@ -1,19 +1,21 @@
-"""The `snakesim` command: its own commands, and those that entry points in the group `snakesim.commands` add.
+"""The `snakesim` command: its parser, made of the commands that all packages register.
 
-An entry point names `add_commands(commands)`, in whose module `TASK` is the heading for the help, or `main(argv)` of a
-command that parses its own arguments. Entry points are looked up only for the help, completion, and a command that is
-not known here: an emergency stop does not wait for them.
+Each package lists its commands as `snakesim_hal.programs.commands` describes. This package names its most important
+lists in `BUILT_IN`; all others are found by entry points in the group `snakesim.commands`. Entry points are looked up
+only for the help, completion, and a command that is not built in: an emergency stop does not wait for them.
 """
 
 import argparse
 import errno
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.base.terminal import discard_output, print_line, print_stderr, report_error, run_tool
+from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.monitoring import watching
 from snakesim_operator.playback import arguments as playback
 from snakesim_operator.robot_commands import commanding
@@ -21,7 +23,7 @@ from snakesim_operator.run import arguments as run
 from snakesim_operator.this_computer import setup
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
-ADDS = "add_commands"  # the name of an entry point's function that adds to the parser
+HEADINGS = ("daily work", "robot", "runs and studies", "files and computers")  # in the order of the help
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None))
+        return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None), as_json="--json" in words)
     except ModuleNotFoundError as error:
         from snakesim_operator.base.extras import explained
 
@@ -63,20 +65,16 @@ def _report_os_error(error: OSError) -> int:
 def _run_command(words: list[str], *, owns_process: bool) -> int:
     """Find the command, parse its arguments and run it. Raises ConfigError for wrong input."""
     if not words:
-        parser().print_help()
+        make_parser().print_help()
         return OK
     _refuse_empty_words(words)
-    commands = Commands()
-    name = words[0]
-    if name.startswith("-"):
-        commands.add_installed()
-    elif name not in commands.commands.choices:
-        own_main = _find_installed_command(commands, name)
-        if own_main is not None:
-            return own_main(words[1:])
-    arguments, unknown = commands.parse_known_args(words)
+    parser = MainParser()
+    if not parser.has_command(words):
+        parser.add_installed()
+        _refuse_unknown_command(words[0], parser)
+    arguments, unknown = parser.parse_known_args(words)
     if unknown:
-        _refuse_unknown_word(unknown[0], commands.find_parser(words))
+        _refuse_unknown_word(unknown[0], parser.find_parser(words))
     arguments.owns_process = owns_process
     return arguments.act(arguments)
 
@@ -86,112 +84,171 @@ def _refuse_empty_words(words: list[str]) -> None:
     for previous, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
             option = word.rstrip("=") or previous or "the command"
-            raise ConfigError(f"{option}: empty; give a value, or leave it out")
+            raise ConfigError(f"{option}: empty; give a value, or leave it out", code="command/invalid-option")
 
 
-def _find_installed_command(commands: "Commands", name: str) -> Callable[[list[str]], int] | None:
-    """Find a command of an entry point. Raises ConfigError when there is no such command.
-
-    Returns:
-        Its main function, if it parses its own arguments; None if the command was added to the parser.
-    """
-    from snakesim_hal.model.plugins import COMMANDS, find_plugin, list_installed
-
-    if name not in list_installed(COMMANDS):
-        commands.add_installed()
-        hint = suggest_word(name, [*commands.commands.choices, *list_installed(COMMANDS)])
-        raise ConfigError(f"no command {shorten(name)!r}; {hint}`snakesim` alone lists all")
-    plugin = find_plugin(COMMANDS, name)
-    if getattr(plugin, "__name__", "") != ADDS:
-        return plugin
-    plugin(commands.commands)
-    return None
+def _refuse_unknown_command(name: str, parser: "MainParser") -> None:
+    """Raise ConfigError if the first word is no command."""
+    names = list(parser.commands.choices)
+    if name.startswith("-") or name in names:
+        return
+    raise ConfigError(
+        f"no command {shorten(name)!r}; {suggest_word(name, names)}`snakesim` alone lists all",
+        code="command/unknown-command",
+    )
 
 
 def _refuse_unknown_word(word: str, parser: argparse.ArgumentParser) -> NoReturn:
     """Raise ConfigError for an argument that the command does not have."""
     options = [option for action in parser._actions for option in action.option_strings]
     hint = suggest_word(word.partition("=")[0], options) if word.startswith("-") else ""
+    command = parser.prog.removeprefix("snakesim ")
     raise ConfigError(
-        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {shorten(word)!r}; {hint}see `{parser.prog} --help`"
+        f"{command}: unknown argument {shorten(word)!r}; {hint}see `{parser.prog} --help`",
+        code="command/unknown-argument",
     )
 
 
-class Command(argparse.ArgumentParser):
+class HelpFormatter(argparse.HelpFormatter):
+    """Wraps each line of a description or an epilog by itself; an indented line stays as it is."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines: list[str] = []
+        for line in text.splitlines():
+            if not line or line.startswith(" "):
+                lines.append(line)
+            else:
+                lines += textwrap.wrap(line, width)
+        return "\n".join(indent + line for line in lines)
+
+
+class CommandParser(argparse.ArgumentParser):
     """The parser of one command."""
 
     def error(self, message: str) -> NoReturn:
         """End the process with one line instead of the whole usage."""
         plain = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
         plain = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain)
-        print_stderr(f"{self.prog}: {plain}; see `{self.prog} --help`")
+        report_error(ConfigError(f"{plain}; see `{self.prog} --help`", code="command/invalid-option"), self.prog)
         sys.exit(BAD_INPUT)
 
 
-class Commands(Command):
-    """The parser of all commands but those of installed packages; its help lists the commands by task."""
+class MainParser(CommandParser):
+    """The parser of all commands. Its help lists the commands by heading."""
 
     def __init__(self) -> None:
+        """Add the commands that are built in."""
         super().__init__(
             prog="snakesim",
             description="Snake robots that push themselves off obstacles: one controller, simulator or robot.",
-            epilog="`snakesim COMMAND --help` tells more. Begin with: snakesim run triplet --console",
+            epilog="`snakesim COMMAND --help` explains a command. Begin with: snakesim run triplet --console",
         )
         self.add_argument("--version", action=_Version, nargs=0, help="print the version")
-        self.commands = self.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Command)
-        self._tasks: dict[str, list[argparse.Action]] = {}
-        for task, adders in TASKS.items():
-            before = len(self.commands._choices_actions)
-            for add in adders:
-                add(self.commands)
-            self._tasks[task] = self.commands._choices_actions[before:]
+        self.commands: Any = self.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
+        self._nouns: dict[str, Any] = {"": self.commands}  # the commands below each noun
+        self._headings: dict[str, list[argparse.Action]] = {heading: [] for heading in HEADINGS}
+        for registered in BUILT_IN:
+            self._add_all(registered)
 
     def add_installed(self) -> None:
-        """Add the commands of entry points. A command that cannot be loaded is reported, and the others are added."""
-        from importlib.metadata import entry_points
+        """Add the commands of entry points. A package that cannot be loaded is reported, and the others are added."""
+        from snakesim_hal.model.plugins import COMMANDS, find_plugin, list_installed
 
-        from snakesim_hal.model.plugins import COMMANDS, find_plugin
-
-        for entry in sorted(entry_points(group=COMMANDS)):
-            if entry.attr != ADDS or entry.name in self.commands.choices:  # one `add_commands` may add several
-                continue
+        for name in list_installed(COMMANDS):
             try:
-                add = find_plugin(COMMANDS, entry.name)
+                self._add_all(find_plugin(COMMANDS, name))
             except ConfigError as error:
                 report_error(error, "snakesim")
+
+    def _add_all(self, registered: Commands) -> None:
+        """Add nouns and commands. Those that are there already stay as they are. Raises ConfigError."""
+        for entry in registered:
+            noun, _, word = entry.name.rpartition(" ")
+            if noun not in self._nouns:
+                raise ConfigError(f"command {entry.name!r} cannot be added: no Noun {noun!r} is registered before it")
+            siblings = self._nouns[noun]
+            if word in siblings.choices:
                 continue
-            before = len(self.commands._choices_actions)
-            add(self.commands)
-            task = getattr(sys.modules[add.__module__], "TASK", "more")
-            self._tasks.setdefault(task, []).extend(self.commands._choices_actions[before:])
+            if isinstance(entry, Noun):
+                self._add_noun(entry, siblings, word)
+            else:
+                _add_command(entry, siblings, word)
+            if not noun:
+                self._headings.setdefault(entry.heading, []).append(siblings._choices_actions[-1])
+
+    def _add_noun(self, noun: Noun, siblings: Any, word: str) -> None:
+        parser = siblings.add_parser(word, help=_begin_small(noun.help), description=noun.help)
+        parser.epilog = f"`{parser.prog} COMMAND --help` explains a command."
+        self._nouns[noun.name] = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
+
+    def commands_by_heading(self) -> list[tuple[str, list[argparse.Action]]]:
+        """Return the headings of the help, each with its nouns and commands."""
+        return [(heading, actions) for heading, actions in self._headings.items() if actions]
+
+    def has_command(self, words: Sequence[str]) -> bool:
+        """Return whether the words begin with a command that has been added, not only with a noun."""
+        noun = ""
+        for word in words:
+            path = f"{noun} {word}".strip()
+            if path not in self._nouns:
+                return word in self._nouns[noun].choices
+            noun = path
+        return False
+
+    def find_parser(self, words: Sequence[str]) -> argparse.ArgumentParser:
+        """Return the parser of the command, or of the noun, that the words begin with."""
+        parser: argparse.ArgumentParser = self
+        for word in words:
+            below = find_subparsers(parser)
+            if word in below:
+                parser = below[word]
+        return parser
 
     def format_help(self) -> str:
-        """Return the help: the commands by task, and those of installed packages by name."""
-        from snakesim_hal.model.plugins import COMMANDS, list_installed
-
-        others = [name for name in list_installed(COMMANDS) if name not in self.commands.choices]
+        """Return the help, with the commands by heading."""
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
-        for task, actions in self._tasks.items():
-            formatter.start_section(task)
+        for heading, actions in self.commands_by_heading():
+            formatter.start_section(heading)
             formatter.add_arguments(actions)
             formatter.end_section()
-        formatter.start_section("from installed backends")
-        formatter.add_text(f"{', '.join(others) or 'none'}; see their --help")
-        formatter.end_section()
         formatter.add_text(self.epilog)
         return formatter.format_help()
 
-    def find_parser(self, words: Sequence[str]) -> argparse.ArgumentParser:
-        """Return the parser of the command, or of the part of a command, that the words name."""
-        parser: argparse.ArgumentParser = self
-        for word in words:
-            for action in parser._actions:
-                if isinstance(action, argparse._SubParsersAction) and word in action.choices:
-                    parser = action.choices[word]
-                    break
-        return parser
+
+def _add_command(command: Command, siblings: Any, word: str) -> None:
+    """Add the parser of a command."""
+    parser = siblings.add_parser(
+        word,
+        help=_begin_small(command.help),
+        description=command.help,
+        epilog=_describe_examples(command),
+        formatter_class=HelpFormatter,
+    )
+    command.add(parser)
+    parser.set_defaults(act=command.run)
+
+
+def _begin_small(sentence: str) -> str:
+    """Return a sentence as an entry of a list: it begins with a small letter, and has no full stop."""
+    first_word = sentence.partition(" ")[0]
+    text = sentence.removesuffix(".")
+    return text if first_word.isupper() else text[0].lower() + text[1:]
+
+
+def _describe_examples(command: Command) -> str:
+    """Return what stands below the options: details, and the examples, one a line."""
+    lines = [command.details, ""] if command.details else []
+    return "\n".join([*lines, "examples:", *(f"  snakesim {example}" for example in command.examples)])
+
+
+def find_subparsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+    """Return the parsers below a parser, by name; none below a command."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return action.choices
+    return {}
 
 
 class _Version(argparse.Action):
@@ -202,32 +259,39 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def parser() -> Commands:
+def make_parser() -> MainParser:
     """Return the parser of all commands, with those of entry points."""
-    commands = Commands()
-    commands.add_installed()
-    return commands
+    parser = MainParser()
+    parser.add_installed()
+    return parser
 
 
-def _add_completion(commands: Any) -> None:
-    completion = commands.add_parser("completion", help="print a script for tab completion: source <(snakesim ...)")
-    completion.add_argument("shell", choices=["bash", "zsh"])
-    completion.set_defaults(act=_completion)
+def _add_completion(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shell", choices=["bash", "zsh"], help="shell that reads the script")
 
 
 def _completion(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.this_computer.completion import completion
+    from snakesim_operator.this_computer.completion import write_completion
 
-    for line in completion(parser(), arguments.shell):
+    for line in write_completion(make_parser(), arguments.shell):
         print_line(line)
     return OK
 
 
-TASKS: Mapping[str, tuple[Callable[[Any], None], ...]] = {
-    "run": (run.add_commands,),
-    "watch": (watching.add_commands,),
-    "command": (commanding.add_commands,),
-    "results": (playback.add_commands,),
-    "scenarios, robots, labs": (setup.add_files,),
-    "this computer": (setup.add_commands, _add_completion),
-}
+COMPLETION = Command(
+    name="completion",
+    heading="files and computers",
+    help="Print a script for tab completion.",
+    add=_add_completion,
+    run=_completion,
+    details="Add to ~/.bashrc: source <(snakesim completion bash)",
+    examples=("completion bash", "completion zsh"),
+)
+BUILT_IN: tuple[Commands, ...] = (
+    run.COMMANDS,
+    playback.COMMANDS,
+    watching.COMMANDS,
+    commanding.COMMANDS,
+    setup.COMMANDS,
+    (COMPLETION,),
+)

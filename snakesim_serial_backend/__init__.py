@@ -1,6 +1,6 @@
 """Drives on serial buses: half-duplex RS-485 or TTL behind a USB adapter.
 
-`serial_command`  `snakesim serial scan`: which servos answer on a port
+`serial_command`  `snakesim drive scan dynamixel`: which servos answer on a port
 `dynamixel/`      the backend `dynamixel`: Dynamixel X, by protocol 2.0
 `wire`            a port, and a pseudo terminal
 

@@ -1,11 +1,11 @@
-"""The command `snakesim serial`, which lists the servos that answer on a port."""
+"""What `snakesim drive scan dynamixel` does: it lists the servos that answer on a port."""
 
 import argparse
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.base.terminal import align_columns, print_line
+from snakesim_hal.base.terminal import align_columns, print_json, print_line
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
@@ -20,29 +20,11 @@ COLUMNS = (
 )
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command, and return its exit code: 0 done, 1 no servo answers. Raises SnakesimError."""
-    arguments = parser().parse_args(list(argv))
-    return arguments.act(arguments)
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command's arguments."""
-    parser = argparse.ArgumentParser(prog="snakesim serial", description="Servos on serial ports.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    scan = commands.add_parser("scan", help="list every Dynamixel that answers; reads only, and moves nothing")
-    scan.add_argument("port", nargs="+", help="serial port, such as /dev/ttyUSB0")
-    scan.add_argument(
-        "--baud", type=int, action="append", choices=list(at.RATE), help="repeat to try several (default: all)"
-    )
-    scan.set_defaults(act=_scan)
-    return parser
-
-
-def _scan(arguments: argparse.Namespace) -> int:
+def scan_ports(arguments: argparse.Namespace) -> int:
+    """List the servos that answer on some ports. Returns 1 if none answers."""
     rows: list[dict[str, str]] = []
     failures: list[str] = []
-    for name in arguments.port:
+    for name in arguments.channel:
         for baud in arguments.baud or list(at.RATE):
             try:
                 wire = SerialWire(name, baud)
@@ -53,13 +35,16 @@ def _scan(arguments: argparse.Namespace) -> int:
                 rows += scan(wire)
             finally:
                 wire.close()
+    if arguments.json:
+        print_json({"drives": rows, "failures": list(dict.fromkeys(failures))})
+        return OK if rows else FAILED
     if rows:
         for line in align_columns(COLUMNS, rows):
             print_line(line)
         return OK
     for failure in dict.fromkeys(failures):  # each once
         print_line(failure)
-    print_line("nobody answers")
+    print_line("no servo answers")
     return FAILED
 
 

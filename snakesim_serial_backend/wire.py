@@ -56,7 +56,9 @@ class Pty:
         while self.expected_bytes is not None and self._received_bytes < self.expected_bytes:
             readable, _, _ = select.select([self._master], [], [], KERNEL_LIMIT_S)
             if not readable:
-                raise BackendError(f"{self.path}: the kernel has not handed on what was written to it")
+                raise BackendError(
+                    f"{self.path}: the kernel has not handed on what was written to it", code="bus/io-failed"
+                )
             data += self._read()
         return data
 
@@ -123,11 +125,16 @@ class SerialWire:
         self._last_try_s: float | None = None  # when a port that is gone was last tried; None: the port is open
         self._is_cut = False  # by an injected fault
         if not Path(port).exists():
-            raise ConfigError(f"port {port!r}: there is none; plug the adapter in, and see `snakesim doctor`")
+            raise ConfigError(
+                f"port {port!r}: there is none; plug the adapter in, and see `snakesim doctor`",
+                code="bus/not-available",
+            )
         try:
             self._serial = self._open()
         except IO_ERRORS as error:
-            raise BackendError(f"{port}: cannot be opened: {error}. Is another program using it?") from error
+            raise BackendError(
+                f"{port}: cannot be opened: {error}. Is another program using it?", code="bus/cannot-open"
+            ) from error
         self.latency_s = latency_s(port)
 
     def send(self, data: bytes) -> None:

@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.backend import SafeSetpoints, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.fault_plan import check_backend_can
@@ -32,18 +32,19 @@ MOTORS_OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
 DIVERGED_SPEED_M_S = 10.0 * MAX_SPEED  # of the base, when a divergence is injected
 
 
-class SimBackend:
-    """A `snakesim_hal.backend.Backend` on MuJoCo. Deterministic: seed and commands decide every byte."""
+class SimBackend(Backend):
+    """The backend on MuJoCo. Deterministic: seed and commands decide every byte."""
 
     Settings = SimSettings
 
-    @staticmethod
-    def check(config: RunConfig, _settings: SimSettings) -> tuple[ClockMode, ...]:
+    @classmethod
+    def check(cls, config: RunConfig, settings: SimSettings) -> tuple[ClockMode, ...]:
         """Check that this backend can run a scenario, and return the clock modes that it supports: all of them.
 
         Raises:
             ConfigError: a gain, a sensor or an injected fault of the run is not possible here.
         """
+        del settings
         check_gains(config.robot)
         check_models(config.robot)
         possible_faults = ["diverge"]
@@ -109,7 +110,7 @@ class SimBackend:
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the sensor samples of `tick`; after a divergence, those of the last good state."""
         if not self._open:
-            raise BackendError(CLOSED)
+            raise BackendError(CLOSED, code="backend/closed")
         return self._sensors.sample(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
@@ -126,7 +127,7 @@ class SimBackend:
             BackendError: the simulation has diverged, or is closed.
         """
         if not self._open:
-            raise BackendError(CLOSED)
+            raise BackendError(CLOSED, code="backend/closed")
         self._motors.before_steps()
         self._tick += 1
         try:
@@ -137,7 +138,9 @@ class SimBackend:
             self._physics.step(self._steps_with_sensors)
             self._watch.check(self._tick)
         except mujoco.FatalError as error:
-            raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
+            raise BackendError(
+                f"MuJoCo cannot go on at tick {self._tick}: {error}", code="simulator/diverged"
+            ) from error
         if self._simulates_heat:
             self._warm_windings()
 

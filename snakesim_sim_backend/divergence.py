@@ -68,7 +68,7 @@ class DivergenceWatch:
             self._error = self._describe_divergence(number)
             self._restore_state()
             self._physics.forward()
-        raise BackendError(self._error)
+        raise BackendError(self._error, code="simulator/diverged")
 
     def _describe_divergence(self, number: int) -> str:
         warnings = [mujoco.mjtWarning(i).name for i in self._warnings.nonzero()[0].tolist()]

@@ -1,6 +1,6 @@
 """Renders pictures of a motion with MuJoCo: the snake at given poses in its scene, without any physics.
 
-`Film` is the object of an entry point in the group `snakesim.films`, which `snakesim video` finds by name.
+`Film` is the object of an entry point in the group `snakesim.films`, which `snakesim recording video` finds by name.
 """
 
 from collections.abc import Sequence

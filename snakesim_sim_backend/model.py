@@ -124,7 +124,8 @@ def _check_contact_time(settings: SimSettings, step_s: float) -> None:
     if settings.contact_time_s < 2 * step_s:
         raise ConfigError(
             f"`contact_time_s` = {settings.contact_time_s} s must be at least two physics steps, here "
-            f"{2 * step_s:g} s; raise it or lower `timestep_s`"
+            f"{2 * step_s:g} s; raise it or lower `timestep_s`",
+            code="config/out-of-range",
         )
 
 
@@ -173,7 +174,9 @@ def _compile(spec: mujoco.MjSpec, robot_name: str) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise ConfigError(f"MuJoCo cannot build robot {robot_name!r} in this scene: {error}") from error
+        raise ConfigError(
+            f"MuJoCo cannot build robot {robot_name!r} in this scene: {error}", code="simulator/cannot-build"
+        ) from error
 
 
 def _obstacle_name(name: str) -> str | None:

@@ -12,7 +12,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import ImuSensor, PoseSensor
-from snakesim_hal.physics.physics_model import LinkLoad
+from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
@@ -30,8 +30,8 @@ MAX_ACCELERATION_SQUARED = MAX_ACCELERATION**2
 NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
-class MujocoPhysicsModel:
-    """A `PhysicsModel` on MuJoCo. Deterministic: the start and the torques decide every byte.
+class MujocoPhysicsModel(PhysicsModel):
+    """The physics model on MuJoCo. Deterministic: the start and the torques decide every byte.
 
     Angles, velocities and the pose are present values. Loads, shaft torques and IMU readings are forces and
     accelerations, so they are those of the last step; before the first one, of the start.
@@ -108,7 +108,9 @@ class MujocoPhysicsModel:
         try:
             self._physics.step(1)
         except mujoco.FatalError as error:
-            raise BackendError(f"MuJoCo cannot go on at step {self._step_count}: {error}") from error
+            raise BackendError(
+                f"MuJoCo cannot go on at step {self._step_count}: {error}", code="simulator/diverged"
+            ) from error
         self._unchecked_steps += 1
         # Divergence shows here first. It is detected in the same step, because firmware would read NaN otherwise.
         plausible = self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED

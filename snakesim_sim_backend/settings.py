@@ -16,33 +16,56 @@ class Tether(FileStruct, frozen=True, kw_only=True):
     """
 
     link: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0
-    point_m: Annotated[float, bounded(-10, 10, "m")] = 0.0  # from the link's rear joint
-    direction_w: tuple[float, float]  # x and y; any length but 0
+    """Number of the link that the rope is fixed to, from 0 at the tail."""
+
+    point_m: Annotated[float, bounded(-10, 10, "m")] = 0.0
+    """Distance of that point from the link's rear joint."""
+
+    direction_w: tuple[float, float]
+    """Direction of the pull in the world frame, as [x, y] of any length but 0."""
+
     reel_in_m_s: Annotated[float, from_zero(10, "m/s")] = 0.0
+    """Speed at which a winch tows the snake; 0: the rope only holds it."""
 
 
 class SimSettings(FileStruct, frozen=True, kw_only=True):
     """Parameters of the physics. The defaults suit robots of centimeters to decimeters and of a few kilograms."""
 
-    # The longest physics step; it is shortened so that a control period is a multiple of it.
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.002
-    # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
+    """Longest physics step; it is shortened so that a control period is a multiple of it."""
+
     contact_time_s: Annotated[float, bounded(1e-4, 0.1, "s")] = 0.005
-    # Between links of the snake itself.
+    """Time constant with which a penetration is pushed out, at least two physics steps; longer: softer contacts, which
+    tolerate long steps.
+    """
+
     self_friction: Annotated[float, from_zero(5, "1 (Coulomb coefficient)")] = 0.3
-    # Value of the simulated body divided by that of the robot file, which all other programs use.
-    mass_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0  # of every link
+    """Coulomb friction between links of the snake."""
+
+    mass_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0
+    """Mass of every simulated link, divided by that in the robot file, which all other programs use."""
+
     motor_gain_scale: Annotated[float, bounded(0.1, 10, "1")] = 1.0
-    # Longest time that the snake may take to come to rest before the run begins.
+    """Gains of every simulated motor, divided by those in the robot file."""
+
     settle_s: Annotated[float, from_zero(60, "s")] = 3.0
-    suspended: bool = False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim identify`
+    """Longest time that the snake may take to come to rest before the run begins."""
+
+    suspended: bool = False
+    """True: the snake hangs from a clamp by its tail link, head down and clear of the ground.
+
+    `snakesim robot identify` needs it.
+    """
+
     tether: Tether | None = None
+    """Rope to an anchor; none: there is no rope."""
 
 
 class PhysicsModelSettings(SimSettings, frozen=True, kw_only=True):
     """The same for the physics under emulated joint modules, whose firmware sets the clock mode: one step at a time."""
 
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.001
+    """Longest physics step; it is shortened so that a control period is a multiple of it."""
 
     def __post_init__(self) -> None:
         """Reject a gain scale: the motors belong to the firmware."""

@@ -29,7 +29,10 @@ def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_ti
         ConfigError: the robot has no such link, or the tether has no direction.
     """
     if tether.link > robot.chain.modules:
-        raise ConfigError(f"`tether.link` = {tether.link}: robot {robot.name!r} has links 0 to {robot.chain.modules}")
+        raise ConfigError(
+            f"`tether.link` = {tether.link}: robot {robot.name!r} has links 0 to {robot.chain.modules}",
+            code="config/out-of-range",
+        )
     if np.hypot(*tether.direction_w) == 0:
         raise ConfigError("`tether.direction_w` = (0, 0) is not a direction; give x and y, such as [-1, 0]")
     spec.body(f"link_{tether.link}").add_site(name=HOOK, pos=[tether.point_m, 0.0, 0.0])

@@ -68,7 +68,8 @@ def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
     if len(placed) > MAX_OBSTACLES:
         raise ConfigError(
             f"scene {scene!r}: {len(placed)} obstacles yield (`stiffness_n_per_m`, `mass_kg`); at most {MAX_OBSTACLES} "
-            f"may: leave some of them rigid and fixed"
+            f"may: leave some of them rigid and fixed",
+            code="scene/invalid",
         )
     for item in placed:
         max_stiffness = max_stiffness_n_per_m(item, step_s)
@@ -77,7 +78,8 @@ def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
                 f"scene {scene!r}: obstacle {item.obstacle.name!r}: `stiffness_n_per_m` = {item.stiffness_n_per_m:g} "
                 f"N/m is too stiff for {compute_mass_kg(item):.3g} kg and physics steps of {step_s * 1e3:g} ms, with "
                 f"which it may be {max_stiffness:.3g}; lower it, give more `mass_kg`, lower `timestep_s`, or leave it "
-                f"away (rigid)"
+                f"away (rigid)",
+                code="scene/invalid",
             )
 
 

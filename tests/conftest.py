@@ -1,16 +1,40 @@
-"""Hypothesis has no time limit per example here: these machines are shared, and a slow moment is no failure.
+"""Every test runs with a state folder of its own and tries the same examples each time. A failure is shown at once."""
 
-It tries the same examples each time, so that the same code gives the same result; `make test-all` tries new ones.
-"""
+import random
 
-import os
+import pytest
 
-from hypothesis import HealthCheck, Phase, settings
+import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
+from snakesim_testing.hypothesis_profiles import load_profile
 
-import tests  # noqa: F401 - before anything else: it sets a state folder apart
+pytest_plugins = ["snakesim_testing.contract.plugin"]
+load_profile()
 
-settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("same", settings.get_profile("explore"), derandomize=True, database=None)
-# For tests/mutation: the first failure is enough.
-settings.register_profile("mutants", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])
-settings.load_profile(os.environ.get("SNAKESIM_HYPOTHESIS", "same"))
+
+class FailuresAtOnce:
+    """Print a failure when it happens; the whole text of all of them follows at the end."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        terminal = self._config.pluginmanager.get_plugin("terminalreporter")
+        if not report.failed or terminal is None:
+            return
+        reasons = [line for line in report.longreprtext.splitlines() if line.startswith("E ")] or [""]
+        terminal.write_line(f"\nFAILED {report.nodeid}: {reasons[0][1:].strip()}", red=True)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run the tests in a random order")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    seed = config.getoption("--shuffle")
+    if seed is not None:
+        random.Random(seed).shuffle(items)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):  # a worker of pytest-xdist prints nothing
+        config.pluginmanager.register(FailuresAtOnce(config), "failures-at-once")

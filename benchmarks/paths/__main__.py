@@ -63,7 +63,15 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
         stack.callback(_end, service)
         mine, its = socket_pair()
         with its:
-            out = ["--once", "--end-after-fault", "1", "--out", str(folder), "--channel", str(its.fileno())]
+            out = [
+                "--end-after-duration",
+                "--end-after-fault",
+                "1",
+                "--out",
+                str(folder),
+                "--parent-socket",
+                str(its.fileno()),
+            ]
             host = way.robot.module(
                 "snakesim_hal.programs.host_program", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
             )
@@ -86,7 +94,7 @@ def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> N
             channel.send_request(make_arm_request(robot, "paths"))
             asked = True
         if time.monotonic() > deadline:
-            raise TimeoutError(f"not done: {status and status.why}")
+            raise TimeoutError(f"not done: {status and status.reason}")
         time.sleep(0.02)
     channel.close()
 

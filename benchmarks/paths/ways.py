@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.machines import Machine, wire
+from snakesim_testing.lab.machines import Machine, wire
 
 PORT = 7447
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}

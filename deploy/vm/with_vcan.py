@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Runs a command where virtual CAN interfaces are up: here, or in a small virtual machine.
 
-    python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/vcan
+    python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/system/can
 
 A kernel with CAN gets a network namespace of its own, in which nothing of the host is touched. Where the kernel has no
 CAN, the command runs in a guest that has the host's files: this checkout may be written, any other change stays in the

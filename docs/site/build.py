@@ -1,9 +1,8 @@
 """Builds the documentation site into build/docs: `make docs`. Pages are taken as they stand, in the repository's tree.
 
-So a link that works in the repository works on the site. Commands and the Python API are written from the code.
+So a link that works in the repository works on the site. The Python API is written from the code.
 """
 
-import argparse
 import os
 import re
 import shutil
@@ -14,9 +13,8 @@ from pathlib import Path
 
 import pdoc
 
-import snakesim  # before NumPy
+import snakesim
 from snakesim_hal.base.process import child_environment, python_command
-from snakesim_operator.cli import parser
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = ROOT / "build" / "site"
@@ -38,14 +36,13 @@ PACKAGES = [path.name for path in sorted(ROOT.glob("snakesim*")) if (path / "__i
 
 
 def main() -> None:
-    """Collect the pages, write the command reference, then build the site and the API's pages."""
+    """Collect the pages, then build the site and the API's pages."""
     shutil.rmtree(PAGES, ignore_errors=True)
     for file in shown_files():
         (PAGES / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / file, PAGES / file)
         if file.suffix == ".md":
             (PAGES / file).write_text(FENCE.sub(titled, (ROOT / file).read_text(encoding="utf-8")), encoding="utf-8")
-    (PAGES / "docs" / "commands.md").write_text(command_reference(), encoding="utf-8")
     (PAGES / "assets").mkdir()
     shutil.copy(ROOT / "docs" / "site" / "iframe-worker.js", PAGES / "assets")
     write_api(PAGES / "api")
@@ -74,26 +71,6 @@ def shown_files() -> Iterator[Path]:
     for name in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
         if (ROOT / name).is_file() and not name.startswith("docs/site/"):
             yield Path(name)
-
-
-def command_reference() -> str:
-    """What `snakesim COMMAND --help` says, of every command and part of one."""
-    os.environ["COLUMNS"] = "80"
-    os.environ["NO_COLOR"] = "1"
-    text = ["# Commands", "", "Written from the code: what `snakesim COMMAND --help` says.", ""]
-    for command in commands(parser()):
-        level = "#" * min(command.prog.count(" ") + 2, 4)
-        text += [f"{level} {command.prog}", "", "```text", command.format_help().rstrip(), "```", ""]
-    return "\n".join(text)
-
-
-def commands(command: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """A command, and all below it."""
-    yield command
-    for action in command._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name in sorted(action.choices):
-                yield from commands(action.choices[name])
 
 
 def run(module: str, *arguments: str, **variables: str) -> None:

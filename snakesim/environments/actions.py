@@ -92,6 +92,7 @@ def corrected_controller(kind: str) -> str | None:
         hint = suggest_word(str(kind), KINDS)
         raise ConfigError(
             f"action={kind!r:.60}: {hint}give 'position', 'velocity', 'torque', or 'residual:' and a controller, such "
-            "as 'residual:obstacle_aided'"
+            "as 'residual:obstacle_aided'",
+            code="python/invalid-argument",
         )
     return None

@@ -7,10 +7,10 @@ from typing import Any
 
 import msgspec
 
-from snakesim_gnc.control.controller import Action, Controller, View
 from snakesim_gnc.control.service import SENSED
 from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offer_plugin
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, load_controller
+from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import CONTROL, RunConfig
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -43,7 +43,7 @@ class AssistedRobot:
         # The corrected controller has the configuration section of the original one.
         self._residual: list[float] = [0.0] * config.robot.chain.modules
         name = f"residual:{config.controller.rpartition(':')[2]}"
-        plugin = _make_corrected(find_plugin(CONTROLLERS, config.controller), self._residual)
+        plugin = _make_corrected(load_controller(config.controller), self._residual)
         longer = msgspec.structs.replace(config, controller=name, duration_s=config.duration_s + SPARE_S)
 
         self._service_output = io.StringIO()  # not shown: the reason of a failure is in `failed` of the run
@@ -75,7 +75,7 @@ class AssistedRobot:
         return self._run.host.authority.state
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Why the robot is in this state."""
         return self._run.host.authority.reason
 
@@ -134,30 +134,25 @@ def _find_cause(errors: Mapping[str, SnakesimError]) -> BaseException | None:
     return None if error is None else error.__cause__
 
 
-def _make_corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:
+def _make_corrected(controller_class: type[Controller[Any]], residual_rad: list[float]) -> type[Controller[Any]]:
     """Return a controller class that adds corrections to the position targets of another one.
 
     Args:
-        plugin: The class of the other controller.
+        controller_class: The class of the other controller.
         residual_rad: (joints,) corrections in rad. The list is read in every tick.
     """
 
-    class Corrected:
-        Settings = plugin.Settings
-        NEEDS = getattr(plugin, "NEEDS", "world")
-        SENSES = getattr(plugin, "SENSES", False)
-
-        def __init__(self, robot: Description, settings: Any) -> None:
-            self._controller = plugin(robot, settings)
-
-        def update(self, view: View) -> Action:
-            action = self._controller.update(view)
-            setpoints = action.setpoints
+    # A subclass, so that it has the declarations, the parameters and the check of the other controller.
+    class Corrected(controller_class):
+        def update(self, observation: Observation) -> ControllerCommand:
+            command = super().update(observation)  # pyright: ignore[reportAbstractUsage] - not abstract here
+            setpoints = command.setpoints
             target = list(setpoints.target)
             for i, residual in enumerate(residual_rad):
                 # A residual of 0 is not added, so that the target stays the same to the bit.
                 if residual and setpoints.mode[i] is Mode.POSITION:
                     target[i] = setpoints.target[i] + residual
-            return Action(RequestedSetpoints(setpoints.mode, target, setpoints.torque_limit_nm), action.report)
+            corrected = RequestedSetpoints(setpoints.mode, target, setpoints.torque_limit_nm)
+            return ControllerCommand(corrected, command.telemetry)
 
     return Corrected

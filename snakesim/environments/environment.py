@@ -16,15 +16,15 @@ from snakesim.environments.actions import Commands, corrected_controller
 from snakesim.environments.assisted import AssistedRobot
 from snakesim.environments.rewards import complete_weights
 from snakesim.environments.stepped import SteppedRobot
-from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.observations import Observer, select_parts
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.controller import Observation, SensorSamples, Task
 from snakesim_hal.model.drawn import make_draws
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.scenario import Override, RunConfig, describe_run_robot
 from snakesim_hal.wire.messages import JointState
 
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+ObservationValues = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 MAX_SEED = 2**31
 Robot = SteppedRobot | AssistedRobot
 MAX_FIELD_ATTEMPTS = 20  # a reset gives up after so many random fields without room for their obstacles
@@ -83,18 +83,31 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         """
         self._arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         if scenario is None:
-            raise ConfigError("SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file")
+            raise ConfigError(
+                "SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file",
+                code="python/invalid-argument",
+            )
         if type(frame_skip) is not int or frame_skip < 1:
-            raise ConfigError(f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more")
+            raise ConfigError(
+                f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more",
+                code="python/invalid-argument",
+            )
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ConfigError(f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out")
+            raise ConfigError(
+                f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out", code="python/invalid-argument"
+            )
         if not residual_rad > 0:
-            raise ConfigError(f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad")
+            raise ConfigError(
+                f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad", code="python/invalid-argument"
+            )
         controller = corrected_controller(action)
         overrides = list_overrides(set, duration_s=duration)
         if controller is not None:
             if not safe:
-                raise ConfigError(f"action={action!r}: a controller commands through the limiter; leave safe=False out")
+                raise ConfigError(
+                    f"action={action!r}: a controller commands through the limiter; leave safe=False out",
+                    code="python/invalid-argument",
+                )
             overrides.insert(0, Override("controller", controller, f"action={action}"))
 
         # The scenario, and what each seed changes in it.
@@ -171,7 +184,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[ObservationValues, dict[str, Any]]:
         """Start an episode: make the robot in its scene, and arm it.
 
         Args:
@@ -190,14 +203,14 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         robot = self._make_robot(seed)
         self._robot = robot
         self._observer = Observer(robot.description, self.parts)
-        self._task = Task.of(self.config)
+        self._task = Task.from_config(self.config)
         self._ticks = 0
         self._ticks_left = round(self.config.duration_s * self.config.rate_hz)
         self._over = False
         observation = self._observe()
         return observation, {"seed": self.config.seed, **self._robot_info()}
 
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[ObservationValues, float, bool, bool, dict[str, Any]]:
         """Command targets for `frame_skip` ticks, or until the robot is stopped or the time is over.
 
         Args:
@@ -251,7 +264,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         return observation, sum(terms.values()), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return a picture of the robot in its scene, (height, width, 3), drawn as by `snakesim video`.
+        """Return a picture of the robot in its scene, (height, width, 3), drawn as by `snakesim recording video`.
 
         Raises:
             gymnasium.error.ResetNeeded: There is no robot before the first `reset`, nor after `close`.
@@ -327,19 +340,19 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             overrides += draw.overrides_for_scene(seed, "draw")
         return load_checked(self._scenario, overrides, processes=False)
 
-    def _observe(self) -> Observation:
+    def _observe(self) -> ObservationValues:
         """Return what a controller would observe at this tick."""
         robot = self._require_robot()
-        view = View(
+        observation = Observation(
             tick=robot.joints.tick,
             time_s=self._time_s,
             period_s=self.config.period_ns * 1e-9,
             joints=robot.joints,
             world=None,
             trajectory=None,
-            senses=Senses(robot.newest, {}, self._task),
+            sensor_samples=SensorSamples(robot.newest, {}, self._task),
         )
-        values = self._observer.update(view)
+        values = self._observer.update(observation)
         if self._slices is None:
             return values
         return {name: values[part] for name, part in self._slices.items()}
@@ -355,7 +368,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         if robot.limited:
             info["limited"] = {self.action_names[joint]: why for joint, why in robot.limited.items()}
         if robot.lifecycle != "armed":
-            info["why"] = robot.why
+            info["reason"] = robot.reason
         return info
 
 

@@ -39,8 +39,14 @@ def complete_weights(given: Mapping[str, float] | None) -> dict[str, float]:
     for name, weight in (given or {}).items():
         if name not in TERMS:
             hint = suggest_word(str(name), TERMS)
-            raise ConfigError(f"reward={shorten(str(given))}: no term {name!r}; {hint}there are {', '.join(TERMS)}")
+            raise ConfigError(
+                f"reward={shorten(str(given))}: no term {name!r}; {hint}there are {', '.join(TERMS)}",
+                code="python/invalid-argument",
+            )
         if not isinstance(weight, int | float):
-            raise ConfigError(f"reward[{name!r}]={weight!r:.60}: give a number, the reward per {TERMS[name].unit}")
+            raise ConfigError(
+                f"reward[{name!r}]={weight!r:.60}: give a number, the reward per {TERMS[name].unit}",
+                code="python/invalid-argument",
+            )
         weights[name] = float(weight)
     return weights

@@ -13,10 +13,9 @@ from snakesim_hal.host.control_cycle import ControlCycle
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.fault_plan import parse_planned
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
-from snakesim_hal.model.scenario import RunConfig, Service
+from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.programs.preflight import backend_settings
+from snakesim_hal.programs.preflight import backend_settings, find_backend
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire.messages import (
@@ -64,7 +63,7 @@ class SteppedRobot:
         self._cycle = ControlCycle(backend, self._authority or self._no_limiter)
 
         self._period_ns = config.period_ns
-        self._service = config.services.get(CONTROL, Service())
+        self._service = config.services.get(CONTROL, ServiceSchedule())
         self._black_box = BlackBox(self.description, memory_bytes=0)
         self._full_torque_nm = [joint.torque_limit_nm for joint in self.description.joints]
         self._tick = 0
@@ -86,7 +85,7 @@ class SteppedRobot:
         return self._cycle.safety.state
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Why the robot is in this state."""
         return self._cycle.safety.reason
 
@@ -145,7 +144,7 @@ class SteppedRobot:
         answer = authority.on_lifecycle(make_arm_request(self.description, REQUESTER), 0)
         if not answer.ok:
             self._backend.close()
-            raise RefusedError(f"not ready to arm: {answer.reason}")
+            raise RefusedError(f"not ready to arm: {answer.reason}", code="robot/not-ready")
 
     def _offer(self, authority: Authority, modes: list[Mode], target: list[float]) -> None:
         """Send a command that answers the present samples."""
@@ -172,17 +171,21 @@ def _check_planned_faults(config: RunConfig) -> None:
         if injection.target_type not in FAULT_TARGETS:
             raise ConfigError(
                 f"fault {str(injection)!r} is one of a {injection.target_type}: without a controller there are "
-                f"only faults of {', '.join(FAULT_TARGETS)}; take action='residual:...', or leave it out"
+                f"only faults of {', '.join(FAULT_TARGETS)}; take action='residual:...', or leave it out",
+                code="injection/not-supported",
             )
 
 
 def _open_simulated_backend(config: RunConfig) -> Backend:
     """Open the backend. Raises RefusedError when it moves something real."""
-    factory = find_plugin(BACKENDS, config.backend)
-    backend = factory(config, backend_settings(config, factory))
+    backend_type = find_backend(config.backend)
+    backend = backend_type(config, backend_settings(config, backend_type))
     if not backend.describe().emulated:
         backend.close()
-        raise RefusedError(f"backend {config.backend!r} moves real hardware; environments are for simulated robots")
+        raise RefusedError(
+            f"backend {config.backend!r} moves real hardware; environments are for simulated robots",
+            code="robot/real-hardware",
+        )
     return backend
 
 

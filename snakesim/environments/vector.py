@@ -47,7 +47,10 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: An argument is wrong. It is raised here rather than in a process.
         """
         if num_envs < 1 or (processes is not None and processes < 1):
-            raise ConfigError(f"num_envs={num_envs!r}, processes={processes!r}: give whole numbers, 1 or more")
+            raise ConfigError(
+                f"num_envs={num_envs!r}, processes={processes!r}: give whole numbers, 1 or more",
+                code="python/invalid-argument",
+            )
         self._arguments = {"num_envs": num_envs, "processes": processes, **arguments}
         example = SnakeEnv(**arguments)
         self._example = example

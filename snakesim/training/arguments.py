@@ -1,68 +1,82 @@
-"""Arguments of `snakesim train`. This module can be imported without the extra that the command needs."""
+"""The commands `snakesim policy`. This module can be imported without the extra that the commands need."""
 
 import argparse
 import dataclasses
-from pathlib import Path
-from typing import Any
 
-from snakesim_hal.programs.arguments import number_type
+from snakesim_hal.programs.arguments import (
+    add_duration,
+    add_fields,
+    add_json,
+    add_out,
+    add_resume,
+    add_scenario_name,
+    add_seed,
+    add_set,
+    add_workers,
+    number_type,
+)
+from snakesim_hal.programs.commands import Command, Commands, Noun
 
-TASK = "run"  # under which `snakesim --help` lists it
 
-
-def add_commands(commands: Any) -> None:
-    """Add `train` to the parser of `snakesim`."""
-    train = commands.add_parser(
-        "train",
-        help="search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE",
-        epilog="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers give the "
-        "same policy, whatever --workers. Exit code: 0; 2 wrong input; 130 stopped by Ctrl-C, and --resume goes on.",
+def _add_train(parser: argparse.ArgumentParser) -> None:
+    add_scenario_name(parser)
+    parser.add_argument(
+        "--form", choices=("feeling", "wave"), default="feeling", help="what is learned (default: feeling)"
     )
-    train.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
-    train.add_argument("--form", choices=("feeling", "wave"), default="feeling", help="what is learned (feeling)")
-    for flag, least, default, about in (
-        ("--generations", 1, 20, "of the search"),
-        ("--population", 4, 12, "policies in a generation"),
-        ("--fields", 1, 4, "for each of them, anew in each generation"),
-        ("--check-fields", 1, 8, "on which the mean of the search is checked"),
-        ("--seed", 0, 1, "of the search"),
-    ):
-        train.add_argument(
-            flag, type=number_type(least, 100_000), default=default, metavar="N", help=f"{about} ({default})"
-        )
-    train.add_argument("--from", dest="begin", metavar="POLICY", help="begin at its numbers: shipped, or policy.onnx")
-    train.add_argument(
+    _add_number(parser, "--generations", 1, 20, "generations of the search")
+    _add_number(parser, "--population", 4, 12, "policies in a generation")
+    add_fields(parser, "for each policy, anew in each generation (default: 4)", 4)
+    _add_number(parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked")
+    add_seed(parser, "of the search; default: 1", 1)
+    parser.add_argument(
+        "--init", dest="begin", metavar="POLICY", help="begin at its numbers: a shipped policy, or policy.onnx"
+    )
+    parser.add_argument(
         "--spread",
         type=number_type(0.01, 10.0),
         default=1.0,
         metavar="X",
-        help="times how far the first generation looks (1)",
+        help="times how far the first generation looks (default: 1)",
     )
-    train.add_argument(
-        "--duration", type=number_type(0.1, 3600.0, "s"), metavar="S", help="of an episode (the scenario's)"
-    )
-    train.add_argument(
+    add_duration(parser, "seconds of an episode (default: the scenario's)", number_type(0.1, 3600.0, "s"))
+    parser.add_argument(
         "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002; may be repeated"
     )
-    train.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="may be repeated")
-    train.add_argument(
+    add_set(parser)
+    parser.add_argument(
         "--draw", action="append", default=[], metavar="KEY=LOW:HIGH", help="a number for each field; may be repeated"
     )
-    train.add_argument("--workers", type=number_type(1, 1000), metavar="N", help="processes (one a core)")
-    train.add_argument("--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster, instead")
-    train.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of what comes of it")
-    train.add_argument("--resume", action="store_true", help="go on with the search that was stopped in --out")
-    train.set_defaults(act=_train)
+    add_workers(parser)
+    add_out(parser, "folder of what comes of it", required=True)
+    add_resume(parser)
+
+
+def _add_number(parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str) -> None:
+    parser.add_argument(
+        option, type=number_type(minimum, 100_000), default=default, metavar="N", help=f"{about} (default: {default})"
+    )
+
+
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("policy", metavar="POLICY", help="path of an ONNX file, or name of a shipped policy")
+    add_json(parser)
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.base import extras
+
+    extras.require("policy", "`snakesim policy info`")
+    from snakesim.training.policy_info import show_policy
+
+    return show_policy(arguments.policy, as_json=arguments.json)
 
 
 def _train(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from snakesim_operator.base import extras
 
-    for extra in ("train", "gym", "plot", "policy"):
-        extras.require(extra, "`snakesim train`")
-    if arguments.cluster:
-        extras.require("evaluate", "`snakesim train`")
+    for extra in ("train", "gym", "report", "policy"):
+        extras.require(extra, "`snakesim policy train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import train
     from snakesim_hal.model.drawn import parse_draw
@@ -84,7 +98,7 @@ def _train(arguments: argparse.Namespace) -> int:
         arguments.out,
         workers=arguments.workers,
         cluster=arguments.cluster,
-        again=["snakesim", "train", arguments.scenario, *_repeat_options(arguments)],
+        again=["snakesim", "policy", "train", arguments.scenario, *_repeat_options(arguments)],
         resume=arguments.resume,
     )
 
@@ -98,10 +112,35 @@ def _repeat_options(arguments: argparse.Namespace) -> list[str]:
         flag = f"--{name.replace('_', '-')}"
         options += [flag, str(getattr(arguments, name))]
     if arguments.begin:
-        options += ["--from", arguments.begin]
+        options += ["--init", arguments.begin]
     if arguments.spread != 1.0:
         options += ["--spread", f"{arguments.spread:g}"]
     for name in ("reward", "set", "draw"):
         for value in getattr(arguments, name):
             options += [f"--{name}", value]
     return options
+
+
+COMMANDS: Commands = (
+    Noun(name="policy", heading="runs and studies", help="Train policies, and show what a policy file says."),
+    Command(
+        name="policy train",
+        help="Search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE.",
+        add=_add_train,
+        run=_train,
+        details="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers "
+        "give the same policy, whatever --workers. Exit code: 0; 2 wrong input; 130 stopped by Ctrl-C, and --resume "
+        "goes on.",
+        examples=(
+            "policy train surveyed_clutter --out runs/policy",
+            "policy train surveyed_clutter --form wave --generations 50 --workers 4 --out runs/policy",
+        ),
+    ),
+    Command(
+        name="policy info",
+        help="Print what a policy file says of itself: robot, observations, actions and source.",
+        add=_add_info,
+        run=_info,
+        examples=("policy info clutter", "policy info runs/policy/policy.onnx --json"),
+    ),
+)

@@ -38,7 +38,7 @@ NODES = (  # operator, inputs, output; together they compute `Policy.targets`
 
 
 def learned_by(policy: str) -> dict[str, float]:
-    """Return the parameters of a policy that `snakesim train` has written.
+    """Return the parameters of a policy that `snakesim policy train` has written.
 
     Args:
         policy: Name of a shipped policy, or path of an ONNX file.
@@ -51,7 +51,8 @@ def learned_by(policy: str) -> dict[str, float]:
         return msgspec.json.decode(metadata.get(LEARNED, ""), type=dict[str, float])
     except msgspec.MsgspecError:
         raise ConfigError(
-            f"--from {policy}: does not tell what `snakesim train` has learned; give a policy.onnx that it has written"
+            f"--init {policy}: holds no numbers of `snakesim policy train`; give a policy.onnx that it has written",
+            code="command/invalid-option",
         ) from None
 
 

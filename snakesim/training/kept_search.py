@@ -68,7 +68,10 @@ def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[Ke
     if resume:
         generations = _read(path, header)
     elif path.exists():
-        raise ConfigError(f"--out {folder} holds a search; go on with it by --resume, or choose another folder")
+        raise ConfigError(
+            f"--out {folder} holds a search; go on with it by --resume, or choose another folder",
+            code="file/already-exists",
+        )
     else:
         generations = []
     try:
@@ -76,7 +79,9 @@ def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[Ke
         write_atomically(path, b"".join(msgspec.json.encode(line) + b"\n" for line in (header, *generations)))
         handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
     except OSError as error:
-        raise ConfigError(f"--out {folder}: {error.strerror}; choose another folder") from None
+        raise ConfigError(
+            f"--out {folder}: {error.strerror}; choose another folder", code="file/not-writable"
+        ) from None
     try:
         yield KeptSearch(handle, generations)
     finally:
@@ -88,16 +93,21 @@ def _read(path: Path, expected: _Header) -> list[KeptGeneration]:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"--resume: {path}: {error.strerror}; leave --resume out to begin a search there") from None
+        raise ConfigError(
+            f"--resume: {path}: {error.strerror}; leave --resume out to begin a search there", code="file/not-writable"
+        ) from None
     try:
         first, *lines = content.split(b"\n")[:-1]
         header = msgspec.json.decode(first, type=_Header)
         generations = [msgspec.json.decode(line, type=KeptGeneration) for line in lines]
     except (ValueError, msgspec.MsgspecError) as error:
-        raise ConfigError(f"--resume: {path} is no search: {error}; choose another --out") from None
+        raise ConfigError(
+            f"--resume: {path} is no search: {error}; choose another --out", code="evaluation/other-search"
+        ) from None
     if header != expected:
         raise ConfigError(
             f"--resume: {path} is of another search: {' '.join(header.command)} (SnakeSIM {header.version}); type that "
-            "command with --resume, or choose another --out"
+            "command with --resume, or choose another --out",
+            code="evaluation/other-search",
         )
     return generations

@@ -1,4 +1,4 @@
-"""Runs the search of `snakesim train`, and keeps its newest state in a folder."""
+"""Runs the search of `snakesim policy train`, and keeps its newest state in a folder."""
 
 import math
 import resource

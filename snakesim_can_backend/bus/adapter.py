@@ -91,10 +91,13 @@ def split_channel(channel: str) -> tuple[str, str]:
         known = sorted(can.VALID_INTERFACES)
         raise ConfigError(
             f"channel {channel!r}: python-can has no interface {interface!r}; {suggest_word(interface, known)}it has "
-            f"{', '.join(known)}"
+            f"{', '.join(known)}",
+            code="bus/invalid-channel",
         )
     if not name:
-        raise ConfigError(f"channel {channel!r}: give INTERFACE:CHANNEL, such as slcan:/dev/ttyACM0")
+        raise ConfigError(
+            f"channel {channel!r}: give INTERFACE:CHANNEL, such as slcan:/dev/ttyACM0", code="bus/invalid-channel"
+        )
     return interface, name
 
 
@@ -112,7 +115,8 @@ def check_channel(channel: str, *, fd: bool = False) -> None:
     if fd and interface not in FD:
         raise ConfigError(
             f"channel {channel!r}: CAN FD is driven through {', '.join(FD)}; on Linux most adapters are interfaces of "
-            f"the kernel, such as can0"
+            f"the kernel, such as can0",
+            code="bus/invalid-channel",
         )
     if interface == "socketcan":
         check_interface(name)
@@ -125,13 +129,17 @@ def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
         check_channel(channel, fd=fd)
         bus = split_channel(channel)
         if bus in channel_of_bus:
-            raise ConfigError(f"channels: {channel_of_bus[bus]!r} and {channel!r} are the same bus; name each bus once")
+            raise ConfigError(
+                f"channels: {channel_of_bus[bus]!r} and {channel!r} are the same bus; name each bus once",
+                code="bus/invalid-channel",
+            )
         channel_of_bus[bus] = channel
     groups = [channel for channel in channels if _is_multicast(channel)]
     if len(groups) > 1 and not GROUPS_ARE_SEPARATE:
         raise ConfigError(
             f"channels: {', '.join(groups)} share one UDP port, and only Linux keeps their groups apart: name one of "
-            f"them"
+            f"them",
+            code="bus/invalid-channel",
         )
 
 
@@ -157,7 +165,7 @@ def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> c
         needs = f"; {interface} needs {NEEDS[interface]}" if interface in NEEDS else ""
         library_is_missing = isinstance(error, NameError | AttributeError)
         reason = "its library is missing" if library_is_missing else str(error)
-        raise BackendError(f"{channel}: cannot be opened: {reason}{needs}") from error
+        raise BackendError(f"{channel}: cannot be opened: {reason}{needs}", code="bus/cannot-open") from error
     if interface == "udp_multicast":
         receive_own_group_only(bus)
     return bus
@@ -220,7 +228,7 @@ class AdapterWire:
             self._errors.append(BusError("not_sent", self.channel, str(error)))
             return False
         except (OSError, ValueError) as error:
-            raise BackendError(f"{self.channel}: cannot send: {error}") from error
+            raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
         if self._echoes is not None:
             self._echoes[frame] += 1
         return True
@@ -240,7 +248,7 @@ class AdapterWire:
                 if self._is_wanted(message, frame):
                     frames.append(frame)
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot receive: {error}") from error
+            raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
         return frames
 
     def errors(self) -> list[BusError]:
@@ -259,14 +267,17 @@ class AdapterWire:
 
     def inject(self, kind: str, *, begins: bool) -> None:
         """Raise ConfigError, because no fault can be injected from this end."""
-        raise ConfigError(f"{self.channel}: the fault {kind} can be injected on a virtual bus or on vcan, not here")
+        raise ConfigError(
+            f"{self.channel}: the fault {kind} can be injected on a virtual bus or on vcan, not here",
+            code="injection/not-supported",
+        )
 
     def close(self) -> None:
         """Close the adapter."""
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
+            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
 
     def _decode_errors(self, message: can.Message) -> list[BusError]:
         interface, _ = split_channel(self.channel)

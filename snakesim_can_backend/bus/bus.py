@@ -115,7 +115,7 @@ class SocketCanWire:
             self._set_filters()
             self._socket.setblocking(False)
         except IO_ERRORS as error:
-            raise BackendError(f"{channel}: cannot be opened: {error}") from error
+            raise BackendError(f"{channel}: cannot be opened: {error}", code="bus/cannot-open") from error
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(_wire_format.size)
@@ -174,7 +174,7 @@ class SocketCanWire:
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
+            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
 
     def _set_filters(self) -> None:
         """Let the kernel drop all messages that this end does not need."""
@@ -199,7 +199,7 @@ class SocketCanWire:
                 self._gone = True
                 self._note_down()
             case _:
-                raise BackendError(f"{self.channel}: {error.strerror}") from error
+                raise BackendError(f"{self.channel}: {error.strerror}", code="bus/io-failed") from error
 
     def _note_down(self) -> None:
         if not self._down:
@@ -299,7 +299,7 @@ class VirtualWire:
         try:
             self._bus.send(to_python_can(frame, fd=self._fd))
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot send: {error}") from error
+            raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
         return True
 
     def receive(self) -> list[Frame]:
@@ -309,7 +309,7 @@ class VirtualWire:
             while (message := self._bus.recv(0)) is not None:
                 frames.append(Frame(message.arbitration_id, bytes(message.data)))
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot receive: {error}") from error
+            raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
         if self._faults.active:
             return self._faults.filter_received(frames)
         return frames
@@ -338,7 +338,7 @@ class VirtualWire:
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
+            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
 
 
 def drain_socket(
@@ -394,7 +394,7 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
             select.select(descriptors, [], [], wait_s)
         except IO_ERRORS as error:
             channels = ", ".join(wire.channel for wire in wires)
-            raise BackendError(f"{channels}: cannot be waited for: {error}") from error
+            raise BackendError(f"{channels}: cannot be waited for: {error}", code="bus/io-failed") from error
     elif wait_s > 0:
         time.sleep(wait_s)
     return True
@@ -421,7 +421,9 @@ def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) ->
     if injection.target_type != "bus":
         return False
     if injection.number >= len(wires):
-        raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(wires)}")
+        raise ConfigError(
+            f"there is no {injection.target}; this robot has bus_1 to bus_{len(wires)}", code="injection/unknown-target"
+        )
     wires[injection.number].inject(injection.kind, begins=begins)
     return True
 
@@ -431,13 +433,19 @@ def check_interface(channel: str) -> None:
     if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
         raise ConfigError(
             f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "
-            f"run in a VM that has CAN: see docs/hil.md"
+            f"run in a VM that has CAN: see docs/hil.md",
+            code="bus/not-available",
         )
     bring_up = "deploy/can/up.sh"
     if not Path("/sys/class/net", channel).exists():
-        raise ConfigError(f"channel {channel!r}: there is no such interface; `{bring_up} {channel}` creates it")
+        raise ConfigError(
+            f"channel {channel!r}: there is no such interface; `{bring_up} {channel}` creates it",
+            code="bus/not-available",
+        )
     if not is_up(channel):
-        raise ConfigError(f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up")
+        raise ConfigError(
+            f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up", code="bus/not-available"
+        )
 
 
 def is_up(channel: str) -> bool:

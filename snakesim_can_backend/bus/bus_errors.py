@@ -30,10 +30,10 @@ OTHER_ERROR: Kind = "error_frames"
 # What a person can do about the errors that are faults of the robot.
 BUS_FAULTS = {
     "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
-    "terminator; bring the interface down and up again, then clear and arm",
+    "terminator; bring the interface down and up again, then reset and arm",
     "error_passive": "more than 127 errors: the bus is about to fail; look at cables, terminators and bit rate",
-    "interface_down": "nothing is sent or received; bring it up again, then clear and arm",
-    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is in order",
+    "interface_down": "nothing is sent or received; bring it up again, then reset and arm",
+    "restarted": "the controller has restarted after bus-off; reset and arm when the bus is in order",
     "receive_overflow": "states may be missing",
 }
 

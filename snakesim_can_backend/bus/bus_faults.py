@@ -115,7 +115,8 @@ def inject_into_interface(channel: str, kind: str, *, begins: bool) -> None:
     elif kind == "full":
         raise ConfigError(
             f"{channel}: a program cannot fill an interface's queue and release it again; a traffic limit does: "
-            f"`tc qdisc add dev {channel} root tbf rate 8bit burst 16 limit 32`, and `tc qdisc del dev {channel} root`"
+            f"`tc qdisc add dev {channel} root tbf rate 8bit burst 16 limit 32`, and `tc qdisc del dev {channel} root`",
+            code="injection/not-supported",
         )
 
 
@@ -130,13 +131,19 @@ def _set_link(channel: str, state: str) -> None:
     except (OSError, subprocess.TimeoutExpired) as error:
         problem = str(error)
     if problem:
-        raise ConfigError(f"`{' '.join(command)}`: {problem}; it needs CAP_NET_ADMIN, and iproute2 installed")
+        raise ConfigError(
+            f"`{' '.join(command)}`: {problem}; it needs CAP_NET_ADMIN, and iproute2 installed",
+            code="machine/not-permitted",
+        )
 
 
 def _send_error_frame(channel: str, error_class: int, controller_state: int, transmit_errors: int) -> None:
     """Send an error frame as the driver of a controller does. Only virtual interfaces carry one from a program."""
     if not channel.startswith(VIRTUAL):
-        raise ConfigError(f"{channel}: error frames can only be sent on virtual interfaces, called {VIRTUAL}...")
+        raise ConfigError(
+            f"{channel}: error frames can only be sent on virtual interfaces, called {VIRTUAL}...",
+            code="injection/not-supported",
+        )
     data = bytes([0, controller_state, 0, 0, 0, 0, transmit_errors, 0])
     frame = struct.pack("=IB3x8s", ERROR_FRAME | error_class, len(data), data)
     with contextlib.closing(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)) as sender:
@@ -144,4 +151,6 @@ def _send_error_frame(channel: str, error_class: int, controller_state: int, tra
             sender.bind((channel,))
             sender.send(frame)
         except OSError as error:
-            raise ConfigError(f"{channel}: cannot send an error frame: {error.strerror}") from error
+            raise ConfigError(
+                f"{channel}: cannot send an error frame: {error.strerror}", code="injection/not-supported"
+            ) from error

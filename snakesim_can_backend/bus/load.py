@@ -161,19 +161,25 @@ def joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
     joints = config.robot.chain.modules
     buses = max(len(settings.channels), 1)
     if len(set(settings.channels)) < len(settings.channels):
-        raise ConfigError(f"`backends.can.channels` = {settings.channels} names a channel twice")
+        raise ConfigError(
+            f"`backends.can.channels` = {settings.channels} names a channel twice", code="bus/invalid-channel"
+        )
     if joints > LAST_NODE:
         raise ConfigError(
-            f"robot {config.robot.name!r} has {joints} joints; node ids of protocol version 1 go to {LAST_NODE}"
+            f"robot {config.robot.name!r} has {joints} joints; node ids of protocol version 1 go to {LAST_NODE}",
+            code="drive/unsupported-setting",
         )
     given = settings.joints_per_channel
     if given and (len(given) != buses or sum(given) != joints):
         raise ConfigError(
             f"`backends.can.joints_per_channel` = {given} must be {buses} numbers that add up to the {joints} joints "
-            f"of robot {config.robot.name!r}"
+            f"of robot {config.robot.name!r}",
+            code="bus/invalid-channel",
         )
     if buses > joints:
-        raise ConfigError(f"`backends.can.channels` names {buses} channels for {joints} joints")
+        raise ConfigError(
+            f"`backends.can.channels` names {buses} channels for {joints} joints", code="bus/invalid-channel"
+        )
     if given:
         return list(given)
     each, left_over = divmod(joints, buses)
@@ -212,6 +218,7 @@ def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
             f"{joints[fullest]} joints at {config.rate_hz:g} Hz do not fit on {_bus_name(settings, fullest)}:",
             *explain_load(*buses[fullest]),
             suggest_alternatives(joints, config, settings),
+            code="bus/overloaded",
         )
     periods_s = [busiest_period_s(*bus) for bus in buses]
     longest = max(range(len(buses)), key=lambda i: periods_s[i])
@@ -221,6 +228,7 @@ def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
             f"with force reports takes {periods_s[longest] * 1000:.2f} ms of bus time and lasts "
             f"{1000 / config.rate_hz:.2f} ms.",
             suggest_alternatives(joints, config, settings),
+            code="bus/overloaded",
         )
     return loads
 

@@ -34,7 +34,9 @@ def open_log(path: Path, backend: str = "can") -> TextIO:
     try:
         return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)
     except OSError as error:
-        raise ConfigError(f"`backends.{backend}.log` = {str(path)!r}: {error.strerror}; choose another file") from error
+        raise ConfigError(
+            f"`backends.{backend}.log` = {str(path)!r}: {error.strerror}; choose another file", code="file/not-writable"
+        ) from error
 
 
 class LoggedWire:

@@ -164,7 +164,9 @@ class BusLog:
         self.dropped.append(DroppedLine(where, shown))
 
     def _refusal(self, reason: str) -> ConfigError:
-        return ConfigError(f"{self.path} cannot be read as a log of a CAN bus ({KINDS}): {reason}")
+        return ConfigError(
+            f"{self.path} cannot be read as a log of a CAN bus ({KINDS}): {reason}", code="recording/not-readable"
+        )
 
 
 def parse_line(line: str) -> can.Message | None:

@@ -69,7 +69,7 @@ def listen_for_unknown_frames(bus: can.BusABC, seconds: float) -> list[UnknownFr
             counts[key] += 1
             newest[key] = message
     except (OSError, ValueError, can.CanError) as error:
-        raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}") from error
+        raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}", code="bus/io-failed") from error
     unknown: list[UnknownFrames] = []
     for (identifier, extended), count in sorted(counts.items()):
         message = newest[identifier, extended]

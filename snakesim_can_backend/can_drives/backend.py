@@ -1,6 +1,6 @@
 """A backend over a driver type of drives on CAN: settings, checks, and the buses that it opens."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -11,13 +11,12 @@ from snakesim_can_backend.bus.bus import VirtualWire, Wire, make_virtual_channel
 from snakesim_can_backend.bus.load import format_bit_rate, worst_frame_s
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
-from snakesim_can_backend.can_drives.emulator import CanEmulator
+from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
 from snakesim_can_backend.can_drives.traffic import BusLoad, CycleTraffic, compute_load
-from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, assign_ports, joint_label, make_body
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import KINDS
@@ -28,10 +27,16 @@ from snakesim_hal.model.scenario import RunConfig
 class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
     """Settings that every driver type on CAN has."""
 
-    # Buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: emulated drives, here.
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
+    """CAN buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can; empty: emulated drives in this
+    process.
+    """
+
     bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
-    log: str = ""  # candump file of all frames; empty: none
+    """Bit rate of the buses, for which loads are computed and to which adapters are set."""
+
+    log: str = ""
+    """Candump file of all frames; empty: no file is written."""
 
     @property
     def fd_rate(self) -> int | None:
@@ -40,14 +45,14 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
 
 
 class CanDriveBackend(DriverTypeBackend):
-    """A backend for drives on CAN, real or emulated. A driver type sets the class variables and adds `check_joint`."""
+    """A backend for drives on CAN, real or emulated.
 
-    Settings: ClassVar[type[Any]]  # a subclass of `CanDriveSettings`
+    A driver type sets the class variables, with a subclass of `CanDriveSettings` as `Settings`, and may override
+    `check_joint`.
+    """
+
     drives_class: ClassVar[Callable[[CanDrivesContext], CanDrives]]
-    # (joints of the driver type, settings, body, bus of every joint, clock in ns)
-    emulator_class: ClassVar[
-        Callable[[Sequence[Joint], Any, EmulatedBody, Sequence[Wire], Callable[[], int]], CanEmulator]
-    ]
+    emulator_class: ClassVar[Callable[[CanEmulatorContext], CanEmulator]]
     plural_noun: ClassVar[str]  # what the driver type calls its drives in messages, such as "axes"
     first_id: ClassVar[int] = 0
     last_id: ClassVar[int]
@@ -62,13 +67,14 @@ class CanDriveBackend(DriverTypeBackend):
         Raises:
             ConfigError: it does not.
         """
+        del config, settings, joint
 
     @classmethod
-    def ports(cls, settings: Any) -> Sequence[str]:
+    def list_ports(cls, settings: Any) -> Sequence[str]:
         return settings.channels
 
     @classmethod
-    def bus_faults(cls, settings: Any) -> Collection[str]:
+    def list_bus_faults(cls, settings: Any) -> Collection[str]:
         """Return the kinds of faults that can be injected. A full queue is one of the kernel, which a real bus has."""
         impossible = {"slow"}
         if settings.channels:
@@ -88,7 +94,8 @@ class CanDriveBackend(DriverTypeBackend):
                 raise ConfigError(
                     f"{joint_label(config, joint)}: `id` = {joint.id}, and {cls.plural_noun} have ids of "
                     f"{cls.first_id} to {cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as "
-                    f"`id` of the joint"
+                    f"`id` of the joint",
+                    code="drive/unsupported-setting",
                 )
             cls.check_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.decimation
@@ -132,18 +139,16 @@ class CanDriveBackend(DriverTypeBackend):
         body = make_body(config, settings, cls.name, pose_address)
         joints = config.robot.joint_table
         wire_of_joint = [wires[bus] for bus in assign_ports(joints, settings.channels)]
-        return cls.emulator_class(joints, settings, body, wire_of_joint, clock.now_ns)
+        return cls.emulator_class(CanEmulatorContext(joints, settings, body, wire_of_joint, clock.now_ns))
 
     @classmethod
-    def buses(
-        cls,
-        config: RunConfig,
-        settings: Any,
-        joints: Mapping[int, Joint],
-        clock: DriverClock,
-        body: EmulatedBody | None,
-    ) -> list[BusSpec]:
+    def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
         """Return one bus for each channel, or a virtual one with emulated drives."""
+        config = context.config
+        settings = context.settings
+        joints = context.joints
+        clock = context.clock
+        body = context.body
         all_joints = list(joints.values())
         uses_fd = settings.fd_rate is not None
         report_period_ns = config.period_ns * settings.decimation
@@ -156,13 +161,13 @@ class CanDriveBackend(DriverTypeBackend):
             if body is not None:
                 other_end = VirtualWire(channel, fd=uses_fd)
                 wires = [other_end] * len(all_joints)
-                emulator = cls.emulator_class(all_joints, settings, body, wires, clock.now_ns)
+                emulator = cls.emulator_class(CanEmulatorContext(all_joints, settings, body, wires, clock.now_ns))
                 wire: Wire = VirtualWire(channel, emulator, fd=uses_fd)
             else:
                 wire = open_wire(channel, None, settings.bit_rate, settings.fd_rate)
             if log is not None:
                 wire = LoggedWire(wire, log, fd=uses_fd)
-            context = CanDrivesContext(
+            drives_context = CanDrivesContext(
                 all_joints=all_joints,
                 joints=[joints[index] for index in indices],
                 settings=settings,
@@ -175,7 +180,7 @@ class CanDriveBackend(DriverTypeBackend):
                 report_period_ns=report_period_ns,
                 clock_ns=clock.now_ns,
             )
-            return cls.drives_class(context)
+            return cls.drives_class(drives_context)
 
         channels = settings.channels if body is None else [make_virtual_channel()]
         return group_by_port(joints, settings, channels, open_drives)

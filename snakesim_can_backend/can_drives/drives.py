@@ -6,7 +6,7 @@ to send motion and torque, and one drive in turn to send its health.
 
 import struct
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.drive_states import DriveCommand, DriveStates
+from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.joints import Joint
@@ -48,7 +48,7 @@ class CanDrivesContext:
     clock_ns: Callable[[], int]
 
 
-class CanDrives(ABC):
+class CanDrives(Drives):
     """All drives of a bus, from tail to head. In all methods `i` is the index of a drive on the bus.
 
     The abstract methods are what a driver type implements. They are called in the thread of the bus, in this order:
@@ -175,9 +175,11 @@ class CanDrives(ABC):
         self._wait_for_duplicates()
         problems = [f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_problems(i)]
         if self._second_host:
-            raise BackendError("another program commands drives on this bus; end it first. Nothing was sent")
+            raise BackendError(
+                "another program commands drives on this bus; end it first. Nothing was sent", code="bus/second-host"
+            )
         if problems:
-            raise BackendError("the robot is not complete; nothing was enabled:", *problems)
+            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
         self._may_write = True
         for i in drives:
             self.send_command(i, "idle")
@@ -186,7 +188,7 @@ class CanDrives(ABC):
         self._request_until(self.readings.is_known, self.request_motion)
         silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
         if silent:
-            raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled")
+            raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled", code="drive/silent")
         for i in drives:
             self.request_health(i)
         self._receive()
@@ -237,23 +239,15 @@ class CanDrives(ABC):
                 break
             self._receive()
 
-    def command(
-        self,
-        following: frozenset[int],
-        modes: list[Mode],
-        targets: Floats,
-        limits_nm: Floats,
-        *,
-        may_enable: bool,
-        emergency: bool,
-    ) -> None:
+    def send_setpoints(self, command: BusCommand) -> None:
         """Send setpoints to the drives that follow, then commands to those that change or did not obey."""
-        if not may_enable:
+        following = command.following
+        if not command.may_enable:
             following &= self.states.following_drives()
         for i in sorted(following):
-            self.send_setpoint(i, modes[i], float(targets[i]), float(limits_nm[i]))
-        for i, command in self.states.next_commands(following, emergency=emergency):
-            self.send_command(i, command)
+            self.send_setpoint(i, command.modes[i], float(command.targets[i]), float(command.limits_nm[i]))
+        for i, drive_command in self.states.next_commands(following, emergency=command.emergency):
+            self.send_command(i, drive_command)
 
     def poll(self) -> None:
         """Receive what has arrived; drives that are emulated here simulate up to the present time."""

@@ -4,17 +4,30 @@ import contextlib
 import struct
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.emulation.emulated_body import DriveEmulator, EmulatedBody
-from snakesim_drivers.kit.drive_settings import DriveSettings
+from snakesim_drivers.emulation.drive_emulator import DriveEmulator
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
+from snakesim_hal.model.joints import Joint
 
 NO_BROADCAST = -1  # no frame has this address
 
 
-class CanEmulator(DriveEmulator):
+@dataclass(frozen=True)
+class CanEmulatorContext:
+    """What a driver type gets to emulate its drives."""
+
+    joints: Sequence[Joint]  # of the driver type, as the robot file describes them
+    settings: Any  # an instance of the driver type's own `Settings`
+    body: EmulatedBody  # moved by these drives; it has the same joints as they are in truth
+    wires: Sequence[Wire]  # the bus of every drive; drives of one bus have the same object
+    clock_ns: Callable[[], int]  # a steady time, with any origin
+
+
+class CanEmulator(DriveEmulator[Wire]):
     """All drives of a driver type on CAN. In all methods `i` is the index of a drive, from tail to head.
 
     A driver type implements the abstract methods, and `restart` and `on_step` of `DriveEmulator`. The thread that
@@ -23,23 +36,15 @@ class CanEmulator(DriveEmulator):
 
     broadcast_id: ClassVar[int] = NO_BROADCAST  # the address of frames that every drive receives
 
-    def __init__(
-        self, settings: DriveSettings, body: EmulatedBody, wires: Sequence[Wire], clock_ns: Callable[[], int]
-    ) -> None:
-        """Begin to receive.
-
-        Args:
-            settings: The settings of the driver type.
-            body: The body that these drives move.
-            wires: The bus of every drive; drives of one bus have the same object.
-            clock_ns: A steady time, with any origin.
-        """
-        self.wires = list(wires)
-        self.watchdog_us = settings.watchdog_s * 1e6
+    def __init__(self, context: CanEmulatorContext) -> None:
+        """Begin to receive."""
+        body = context.body
+        self.wires = list(context.wires)
+        self.watchdog_us = context.settings.watchdog_s * 1e6
         self._index_of_node: dict[tuple[int, int], int] = {}  # by id() of the wire, and node
-        for i, (wire, joint) in enumerate(zip(wires, body.joints, strict=True)):
+        for i, (wire, joint) in enumerate(zip(self.wires, body.joints, strict=True)):
             self._index_of_node[id(wire), joint.id] = i
-        super().__init__(body, wires, clock_ns)
+        super().__init__(body, self.wires, context.clock_ns)
 
     @abstractmethod
     def find_addressee(self, frame: Frame) -> int:
@@ -71,12 +76,12 @@ class CanEmulator(DriveEmulator):
         if self.body.is_silent(i):
             return
         self.wires[i].send(frame)
-        if self.body.is_doubled(i):
+        if self.body.is_duplicated(i):
             self.wires[i].send(self.duplicate_frame(frame))
 
     def _handle_arrivals(self) -> None:
         self.catch_up()
-        for wire in self._ends:
+        for wire in self._bus_ends:
             for frame in wire.receive():
                 for i in self._find_receivers(wire, frame):
                     if self.body.is_booting(i):

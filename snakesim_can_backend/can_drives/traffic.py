@@ -40,7 +40,8 @@ class BusLoad:
         if self.share > MAX_LOAD:
             raise ConfigError(
                 f"{self.drives} drives at {rate_hz:g} Hz need {self.share:.0%} of a bus of {bus}, at worst-case "
-                f"stuffing; at most {MAX_LOAD:.0%}: use rate_hz = {self.fits_hz}, or more `backends.{name}.channels`"
+                f"stuffing; at most {MAX_LOAD:.0%}: use rate_hz = {self.fits_hz}, or more `backends.{name}.channels`",
+                code="bus/overloaded",
             )
 
 

@@ -8,7 +8,7 @@ from snakesim_can_backend.driver.parameters import check_drives, check_ratings, 
 from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import check_mounted
-from snakesim_drivers.kit.drive_backend import DriveBackend, DriverClock
+from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, DriverClock
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import check_pose, make_receiver
@@ -21,15 +21,15 @@ NAME = "can"
 
 
 class CanBackend(DriveBackend):
-    """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
+    """The backend on joint modules, real or emulated."""
 
     Settings = CanSettings
-    reset_grace_cycles = 0  # the monitor itself gives modules time to follow a clear
+    reset_grace_cycles = 0  # the monitor itself gives modules time to follow a reset
     modules: JointModules
     _sample_builder: SampleBuilder
 
-    @staticmethod
-    def check(config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
+    @classmethod
+    def check(cls, config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
         """Check that a run is possible with these settings.
 
         Returns:
@@ -63,15 +63,21 @@ class CanBackend(DriveBackend):
         )
         self._reports = plan_reports(config, settings)
 
-        def make_modules(readings: DriveReadings) -> JointModules:
+        def open_modules(readings: DriveReadings) -> JointModules:
             pose = mocap.address if mocap is not None else None
             self.modules = JointModules(config, settings, clock, pose, readings)
             self._sample_builder = SampleBuilder(config, self._reports, self.modules.reading, mocap)
             return self.modules
 
-        hardware = "+".join(settings.channels)
-        watchdogs_s = [settings.watchdog_s] * len(config.robot.joint_table)
-        super().__init__(config, NAME, hardware, clock, mocap, make_modules, watchdogs_s)
+        parts = DriveBackendParts(
+            name=NAME,
+            hardware="+".join(settings.channels),
+            clock=clock,
+            mocap=mocap,
+            open_drives=open_modules,
+            watchdogs_s=[settings.watchdog_s] * len(config.robot.joint_table),
+        )
+        super().__init__(config, parts)
 
     def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
         self.modules.announce(lifecycle, isolated)

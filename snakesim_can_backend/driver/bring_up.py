@@ -202,7 +202,10 @@ def configure_modules(
     while due:
         now_s = time.monotonic()
         if now_s > end_s:
-            raise BackendError(f"no answer about parameters from node {', '.join(map(str, due))} within {limit_s:g} s")
+            raise BackendError(
+                f"no answer about parameters from node {', '.join(map(str, due))} within {limit_s:g} s",
+                code="drive/silent",
+            )
         for node, parameters in due.items():
             if now_s - asked_at_s.get(node, -1.0) > ASK_EVERY_S:
                 parameter = parameters[0]
@@ -246,5 +249,6 @@ def _check_result(node: int, parameter: ModuleParameter, value: float | None, re
         reason = ParameterResult(result).name.lower().replace("_", " ")
     raise BackendError(
         f"node {node} refuses parameter {parameter.name.lower()} = {value} {allowed.unit}: "
-        f"{reason} (allowed: {allowed.low:g} to {allowed.high:g})"
+        f"{reason} (allowed: {allowed.low:g} to {allowed.high:g})",
+        code="drive/parameter-refused",
     )

@@ -1,7 +1,7 @@
 """Detects faults of joint modules and buses, and reports each with a cause that helps a person to locate it.
 
 This module is pure: once in every control cycle it checks the `ModuleReports` and the bus errors. It reports each
-finding once, until the robot's fault is cleared; a finding that persists is then reported again.
+finding once, until the robot's fault is reset; a finding that persists is then reported again.
 """
 
 from collections.abc import Callable, Iterable, Sequence, Set
@@ -47,12 +47,12 @@ class ModuleMonitor:
         self._restarts = [0] * len(joints)  # uptime decreases that were seen before
         self._unarmed = [0] * len(joints)  # consecutive Syncs in which a module did not follow the robot's arming
         self._restart_sync: dict[int, int] = {}  # Sync at which a module's uptime decreased
-        self._restarted: set[int] = set()  # modules that restarted since the last clear
+        self._restarted: set[int] = set()  # modules that restarted since the last reset
         self._changed: set[int] = set()  # modules whose parameters may have changed
         self._was_armed: set[int] = set()  # modules that have been armed in this arm session
 
         # Of the robot.
-        self._quiet_until = -1  # last Sync at which modules may not have followed a clear yet
+        self._quiet_until = -1  # last Sync at which modules may not have followed a reset yet
         self._armed_sync: int | None = None  # first Sync of this arm session
 
         # By bus.
@@ -63,7 +63,7 @@ class ModuleMonitor:
         self.minor_error_counts: dict[str, int] = {}  # bus errors that are not faults, by kind
 
     def reset(self, sync: int) -> None:
-        """Report persistent findings again, because the robot's fault was cleared at this Sync.
+        """Report persistent findings again, because the robot's fault was reset at this Sync.
 
         The modules get CLEAR_GRACE Syncs to follow the clear.
         """
@@ -150,7 +150,7 @@ class ModuleMonitor:
             uptime_s = module.uptime_ms / 1000
             report(
                 "module_restarted",
-                f"has restarted, its uptime is {uptime_s:.2f} s: a clear writes its parameters again",
+                f"has restarted, its uptime is {uptime_s:.2f} s: a reset writes its parameters again",
             )
 
     def _check_frames(self, module: ModuleStatus, reading: ModuleReports, report: Report) -> None:
@@ -236,7 +236,7 @@ class ModuleMonitor:
         return self._unarmed[joint] >= needed_syncs
 
     def _unconfigured_finding(self, joint: int) -> Finding:
-        cause = f"{self._names[joint]} has not accepted its parameters, and is not armed; clear, or power-cycle it"
+        cause = f"{self._names[joint]} has not accepted its parameters, and is not armed; reset, or power-cycle it"
         return Finding("module_not_configured", cause, joint)
 
     # --- the buses --------------------------------------------------------------------------------------------

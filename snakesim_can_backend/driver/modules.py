@@ -1,4 +1,4 @@
-"""The joint modules of a robot on their buses, as `snakesim_drivers.kit.drive_backend.Drives`.
+"""The joint modules of a robot on their buses, as `snakesim_drivers.kit.drives.Drives`.
 
 In every control cycle the driver sends a Sync. Every module answers with its samples of that instant, and then follows
 the setpoint that it received in the period before. So a command acts exactly one period after the state that it
@@ -24,13 +24,13 @@ from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import LifecycleState
 
 ANSWER_MARGIN = 1.25  # on the bus time that all answers take
 ANSWER_SLACK_S = 0.002  # latency of the adapter and of this process
@@ -53,10 +53,8 @@ class ArmSession:
     armed_joints: set[int] = field(default_factory=set[int])
 
 
-class JointModules:
+class JointModules(Drives):
     """All joint modules of a robot. Joint i is node i + 1."""
-
-    emulated = False  # until all modules have identified themselves as emulated
 
     def __init__(
         self, config: RunConfig, settings: CanSettings, clock: DriverClock, pose: str | None, readings: DriveReadings
@@ -123,10 +121,17 @@ class JointModules:
         limit_s = self._settings.bring_up_limit_s
         identities = find_modules(self._buses, limit_s, self.reading.process_frame)
         if self.reading.from_other_host:
-            raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
+            raise BackendError(
+                "another program commands the modules on this bus; end it first. Nothing was sent",
+                code="bus/second-host",
+            )
         errors = discovery_errors(self._buses, identities, self._names, lockstep=self._lockstep)
         if errors:
-            raise BackendError("the robot is not complete; nothing was enabled:", *(f"  {error}" for error in errors))
+            raise BackendError(
+                "the robot is not complete; nothing was enabled:",
+                *(f"  {error}" for error in errors),
+                code="drive/not-complete",
+            )
         self._is_only_host = True
         self.emulated = all(identity.emulated for identity in identities)
         for identity in identities:
@@ -161,7 +166,7 @@ class JointModules:
             self._receive()
 
     def announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
-        """Send the commands that follow from the robot's lifecycle, except Arm, which `command` sends.
+        """Send the commands that follow from the robot's lifecycle, except Arm, which `send_setpoints` sends.
 
         Call it before anything else in a cycle, because the rest may take a while. Modules that missed an earlier
         command get it again.
@@ -205,25 +210,10 @@ class JointModules:
             except BackendError as error:
                 _log.warning("after a clear: %s", error)
 
-    def command(
-        self,
-        following: frozenset[int],
-        modes: list[Mode],
-        targets: Floats,
-        limits_nm: Floats,
-        *,
-        may_enable: bool,
-        emergency: bool,
-    ) -> None:
+    def send_setpoints(self, command: BusCommand) -> None:
         """Send the setpoints while the robot is armed. Otherwise send none, and the modules come to rest by themselves.
 
-        Args:
-            following: joints that get their setpoint.
-            modes: control mode of every joint.
-            targets: (n_joints,) rad, rad/s or N·m at the module's shaft, as the mode says.
-            limits_nm: (n_joints,) torque limits at the module's shaft.
-            may_enable: not used here, because modules are armed and disarmed by `announce`.
-            emergency: not used here, for the same reason.
+        `may_enable` and `emergency` are not used, because `announce` arms, disarms and stops modules.
         """
         must_not_arm = self._unconfigured - self._isolated
         if self._arm_is_due and not must_not_arm:
@@ -231,8 +221,8 @@ class JointModules:
         self._arm_is_due = False
         if self._lifecycle != "armed":
             return
-        for joint, frame in enumerate(self._setpoints.encode(modes, targets, limits_nm)):
-            if joint not in following:
+        for joint, frame in enumerate(self._setpoints.encode(command.modes, command.targets, command.limits_nm)):
+            if joint not in command.following:
                 continue
             wire = self._wire_of[joint]
             if wire.send(frame):
@@ -342,7 +332,9 @@ class JointModules:
                 return
         modules = zip(self._names, self.reading.modules, strict=True)
         silent = [name for name, module in modules if module.sync < 0]
-        raise BackendError(f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled")
+        raise BackendError(
+            f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled", code="drive/silent"
+        )
 
     def _clear_faults_of_killed_driver(self) -> None:
         """Clear the faults that a killed driver has left; but not heat, leaks and emergencies."""

@@ -33,16 +33,21 @@ def check_emulators(config: RunConfig, settings: CanSettings) -> None:
         raise ConfigError(
             f'`backends.can.emulators` = "here" is a virtual bus inside the driver, and `channels` = '
             f"{settings.channels} "
-            f'names real ones: leave `channels` empty, or set emulators = "process"'
+            f'names real ones: leave `channels` empty, or set emulators = "process"',
+            code="bus/not-virtual",
         )
     if settings.emulators_run != "here" and not settings.channels:
         raise ConfigError(
             f'`backends.can.emulators` = "{settings.emulators_run}" needs a bus: name it in '
             "`backends.can.channels`, such as "
-            f'["vcan0"]'
+            f'["vcan0"]',
+            code="bus/not-virtual",
         )
     if settings.faults and settings.emulators_run == "none":
-        raise ConfigError("`backends.can.faults` are for emulators; give them to `snakesim modules --fault` instead")
+        raise ConfigError(
+            "`backends.can.faults` are for emulators; give them to `snakesim drive emulate can --fault` instead",
+            code="injection/not-supported",
+        )
     for text in settings.faults:
         parse_fault(text, config.robot.chain.modules)
 
@@ -95,7 +100,7 @@ def start_local_emulators(
 
 
 class EmulatorProcess:
-    """`snakesim modules` as a child that dies with this process."""
+    """`snakesim drive emulate can` as a child that dies with this process."""
 
     def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
         """Start the child, and wait until its modules are on the bus.
@@ -121,7 +126,9 @@ class EmulatorProcess:
             self._output = Path(self._folder.name, "modules.log")
             self._process = self._start(child_config, arguments)
         except OSError as error:
-            raise BackendError(f"the emulated joint modules cannot be started: {error}") from error
+            raise BackendError(
+                f"the emulated joint modules cannot be started: {error}", code="emulator/not-started"
+            ) from error
         self._await_ready()
 
     def _start(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
@@ -149,7 +156,9 @@ class EmulatorProcess:
                 break
             time.sleep(POLL_S)
         self.stop()
-        raise BackendError("the emulated joint modules did not start; see their output above")
+        raise BackendError(
+            "the emulated joint modules did not start; see their output above", code="emulator/not-started"
+        )
 
     def describe_exit(self) -> str | None:
         """Return a sentence about the exit of the child; None while it runs."""
@@ -168,7 +177,9 @@ class EmulatorProcess:
             self._process.stdin.write(line.encode())
             self._process.stdin.flush()
         except (OSError, ValueError) as error:  # the latter when it was stopped
-            raise BackendError(f"the emulated joint modules do not accept {fault}: {error}") from error
+            raise BackendError(
+                f"the emulated joint modules do not accept {fault}: {error}", code="injection/not-supported"
+            ) from error
 
     def stop(self) -> None:
         """Terminate the child, and kill it if it does not end. Its output goes to this process's stderr."""

@@ -55,17 +55,20 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
         if joint.id != number:
             raise ConfigError(
                 f"robot {robot.name!r}: `joints.{joint.name}.id` = {joint.id}: modules on CAN have their joint's "
-                f"number as node id, here {number}; give the module that one, and leave `id` out"
+                f"number as node id, here {number}; give the module that one, and leave `id` out",
+                code="drive/unsupported-setting",
             )
         if joint.limits.cable_turns is not None:
             raise ConfigError(
                 f"robot {robot.name!r}: `cable_turns` of {joint.name}: modules on CAN say angles up to 3.2767 rad, so "
-                f"turns cannot be counted; give the joint end stops, and leave `cable_turns` out"
+                f"turns cannot be counted; give the joint end stops, and leave `cable_turns` out",
+                code="drive/unsupported-setting",
             )
         if joint.drive.port and joint.drive.port not in settings.channels:
             raise ConfigError(
                 f"robot {robot.name!r}, {joint.name}: `port` = {joint.drive.port!r} is not among "
-                f"`backends.can.channels` = {settings.channels}"
+                f"`backends.can.channels` = {settings.channels}",
+                code="bus/invalid-channel",
             )
 
 
@@ -86,7 +89,8 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[ModuleParamet
     if robot.safety.action == "hold":
         raise ConfigError(
             f'robot {robot.name!r}: `safety.action` = "hold" is not supported by joint modules: servos '
-            f'that hold stiffly overheat. Use "damp" or "passive"'
+            f'that hold stiffly overheat. Use "damp" or "passive"',
+            code="drive/unsupported-setting",
         )
     for node, values in (in_force or {}).items():
         _check_module(robot, node, values)
@@ -100,7 +104,8 @@ def _check_ranges(robot: RobotFile, joint: Joint) -> None:
             place = "" if has_default_drive else " at the module's shaft, by `gear` and `zero_rad`,"
             raise ConfigError(
                 f"robot {robot.name!r}, {joint.name}: `{key}` = {value} {unit}{place} exceeds the range of the "
-                f"bus protocol, which ends at {max_value:.3g} {unit}"
+                f"bus protocol, which ends at {max_value:.3g} {unit}",
+                code="drive/unsupported-setting",
             )
 
 
@@ -125,7 +130,8 @@ def _check_contact_range(robot: RobotFile) -> None:
         raise ConfigError(
             f"robot {robot.name!r}: a contact at a link's end, {max_distance_m:.3g} m from its joint "
             f"(`module.length_m` + `module.radius_m`), exceeds the range of the bus protocol, which ends at "
-            f"{max_along_m:.3g} m"
+            f"{max_along_m:.3g} m",
+            code="drive/unsupported-setting",
         )
 
 
@@ -141,7 +147,8 @@ def _check_module(robot: RobotFile, node: int, values: Mapping[ModuleParameter, 
         if not is_sufficient:
             raise BackendError(
                 f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
-                f"{needed:g}: lower the limit in the robot file"
+                f"{needed:g}: lower the limit in the robot file",
+                code="drive/unsupported-setting",
             )
 
 
@@ -153,5 +160,6 @@ def check_watchdog(config: RunConfig, settings: CanSettings) -> None:
         raise ConfigError(
             f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
             f"setpoint would stop the modules; give them {min_watchdog_s:.3g} s or more, or a rate from "
-            f"{min_rate_hz:.0f} Hz on"
+            f"{min_rate_hz:.0f} Hz on",
+            code="drive/watchdog-too-short",
         )

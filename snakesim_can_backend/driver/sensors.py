@@ -186,9 +186,9 @@ def joint_values(reading: ModuleReports, mounting: Mounting) -> Floats:
     """
     shaft_angle, shaft_velocity, shaft_torque = reading.shaft_values()
     at_joints = (
-        mounting.joint_angle_rad(shaft_angle),
-        mounting.joint_velocity_rad_s(shaft_velocity),
-        mounting.joint_torque_nm(shaft_torque),
+        mounting.to_joint_angle_rad(shaft_angle),
+        mounting.to_joint_velocity_rad_s(shaft_velocity),
+        mounting.to_joint_torque_nm(shaft_torque),
     )
     return np.stack(at_joints)
 

@@ -1,6 +1,6 @@
 """Emulated joint modules. On the bus they differ from real ones only by one bit in Identity.
 
-`command`         `snakesim modules`: the emulators of a whole robot as a process on SocketCAN interfaces
+`command`         `snakesim drive emulate can`: the emulators of a whole robot as a process on SocketCAN interfaces
 `server`          serves one or more buses; also inside another process
 `chain`           all modules of a robot, their motors, and the physics model; wall-clock or stepped time
 `module_slot`     a module's place on a bus: node id, joint, and injected faults

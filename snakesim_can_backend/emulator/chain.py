@@ -34,7 +34,7 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import build_config, build_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
-from snakesim_drivers.mounting import Mounting, joint_target
+from snakesim_drivers.mounting import Mounting, to_joint_target
 from snakesim_hal.model.fault_kinds import Change, Injection, InjectionPlan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motors import Motors
@@ -360,7 +360,7 @@ class ModuleChain:
         self.motors.set_demand(
             slot.joint,
             demand.mode,
-            joint_target(drive, demand.mode, demand.target),
+            to_joint_target(drive, demand.mode, demand.target),
             torque_limit_nm,
             values[ModuleParameter.STIFFNESS] * gear**2,
             values[damping] * gear**2,

@@ -1,4 +1,4 @@
-"""`snakesim modules`: the joint modules of a robot, emulated, as a process on SocketCAN interfaces."""
+"""`snakesim drive emulate can`: the joint modules of a robot, emulated, as a process on SocketCAN interfaces."""
 
 import argparse
 import math
@@ -10,16 +10,17 @@ from contextlib import ExitStack, closing
 
 import msgspec
 
+from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
 from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import Wire, wait
 from snakesim_can_backend.bus.load import format_bit_rate, joints_per_bus
 from snakesim_can_backend.emulator.bus_time import Traffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
-from snakesim_can_backend.emulator.faults import describe_faults, parse_fault, parse_typed_fault
+from snakesim_can_backend.emulator.faults import parse_fault, parse_typed_fault
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.emulated_body import make_physics_model
+from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent, on_stop_signal, tune_garbage_collector
@@ -27,62 +28,28 @@ from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
 
-DEFAULT_CHANNEL = "vcan0"
-DEFAULT_POSE = "127.0.0.1:7450"
+TOOL = "snakesim drive emulate can"
 NO_POSE = "none"
 STATS_EVERY_S = 1.0
 MAX_PAUSE_S = 0.5  # until a stop signal is checked
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command.
+    """Run the emulator as a program of its own, for a driver that starts its emulators.
 
     Returns:
         Exit code: 0 when stopped or done, 1 after a fault, 2 for wrong input, when nothing was started.
     """
-    arguments = parser().parse_args(argv)
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_module_emulation(parser)
+    arguments = parser.parse_args(argv)
+    return run_tool(TOOL, lambda: emulate(arguments))
+
+
+def emulate(arguments: argparse.Namespace) -> int:
+    """Check everything, open the buses, and serve the emulators until the command is stopped. Returns 0."""
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    return run_tool("snakesim modules", lambda: _serve(arguments))
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command's arguments."""
-    parser = argparse.ArgumentParser(
-        prog="snakesim modules",
-        description=__doc__,
-        epilog=f"faults:\n{describe_faults()}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = parser.add_argument
-    add("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
-    add(
-        "--channel",
-        action="append",
-        metavar="vcan0",
-        help="interface, or INTERFACE:CHANNEL of python-can; repeat, tail to head",
-    )
-    add("--physics-model", help="body that the motors move: mujoco, inertia, or ./file.py:Class")
-    add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value; may be repeated")
-    add("--fault", action="append", default=[], metavar="KIND:JOINT@START[-END]", help="inject a fault, at this time")
-    add("--interactive", action="store_true", help="read `KIND joint_N` and `KIND joint_N off` from the terminal")
-    add("--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep")
-    add(
-        "--pose",
-        default=DEFAULT_POSE,
-        metavar="HOST:PORT",
-        help=f"where to send poses, or none (default: {DEFAULT_POSE})",
-    )
-    add("--duration", type=float, metavar="S", help="end after this many seconds")
-    add("--seed", type=int, help="of the sensors' noise and the serial numbers")
-    add("--stats", action="store_true", help="print the load of every bus once a second")
-    add("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
-    add("--parent", type=int, help="process id of the parent; this process dies with it")
-    return parser
-
-
-def _serve(arguments: argparse.Namespace) -> int:
-    """Check everything, open the buses, and serve the emulators until the command is stopped."""
     loaded = _load_configuration(arguments)
     settings = _make_settings(arguments, loaded)
     module_count = loaded.config.robot.chain.modules
@@ -113,7 +80,7 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 def _load_configuration(arguments: argparse.Namespace) -> Loaded:
     """Load the scenario for the backend `can`, whatever backend it runs on otherwise."""
-    overrides = [Override("backend", "can", "snakesim modules")]
+    overrides = [Override("backend", "can", TOOL)]
     overrides += [parse_set(text) for text in arguments.set]
     if arguments.seed is not None:
         overrides.append(Override("seed", arguments.seed, f"--seed {arguments.seed}"))
@@ -138,7 +105,8 @@ def _check_names(channels: Sequence[str], *, on_real_bus: bool) -> None:
         if not is_emulated(channel) and not on_real_bus:
             raise ConfigError(
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
-                "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus"
+                "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus",
+                code="bus/not-virtual",
             )
 
 

@@ -46,11 +46,17 @@ def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, 
         ConfigError: the text has another form, or modules of this robot do not support the fault.
     """
     if len(text) > injection.LONGEST_TEXT:
-        raise ConfigError(f"{text[:SHOWN_CHARACTERS]!r}...: {len(text)} characters, at most {injection.LONGEST_TEXT}")
+        raise ConfigError(
+            f"{text[:SHOWN_CHARACTERS]!r}...: {len(text)} characters, at most {injection.LONGEST_TEXT}",
+            code="injection/unknown-fault",
+        )
     match = _typed.fullmatch(text.strip())
     if match is None:
         kinds = ", ".join(FAULT_DESCRIPTIONS)
-        raise ConfigError(f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {kinds}")
+        raise ConfigError(
+            f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {kinds}",
+            code="injection/unknown-fault",
+        )
     fault = injection.check_injection(Injection(match["kind"], match["joint"], now_s), text.strip())
     begins = match["off"] is None
     return check_fault(fault, joints), begins
@@ -68,7 +74,8 @@ def check_fault(fault: Injection, joints: int) -> Injection:
     if fault.target_type != "joint" or fault.kind not in FAULT_DESCRIPTIONS:
         raise ConfigError(
             f"fault {str(fault)!r}: modules support {', '.join(FAULT_DESCRIPTIONS)}, as {FORM}; put other kinds into "
-            f"the scenario's `faults`"
+            f"the scenario's `faults`",
+            code="injection/unknown-fault",
         )
     injection.check_targets([fault], services=(), joints=joints, buses=0)
     return fault

@@ -82,9 +82,9 @@ class ModuleSensors:
             joints += self._joint_sigma * self._noise((3, self._count))
         angle_rad, velocity_rad_s, joint_torque_nm = joints
         rows = zip(
-            ANGLE.to_raw_array(self._mounting.drive_angle_rad(angle_rad)),
-            VELOCITY.to_raw_array(self._mounting.drive_velocity_rad_s(velocity_rad_s)),
-            TORQUE.to_raw_array(self._mounting.drive_torque_nm(joint_torque_nm)),
+            ANGLE.to_raw_array(self._mounting.to_drive_angle_rad(angle_rad)),
+            VELOCITY.to_raw_array(self._mounting.to_drive_velocity_rad_s(velocity_rad_s)),
+            TORQUE.to_raw_array(self._mounting.to_drive_torque_nm(joint_torque_nm)),
             derated[here],
             strict=True,
         )
@@ -123,7 +123,7 @@ class ModuleSensors:
         """Add shaft load, gyro and accelerometer to the readings of the modules that report them."""
         shaft_torque_nm = self._physics_model.shaft_torque_nm()[self._joints]
         noise_nm = self._torque_sigma_nm * self._noise(self._count)
-        shaft_loads = SHAFT_LOAD.to_raw_array(self._mounting.drive_torque_nm(shaft_torque_nm + noise_nm))
+        shaft_loads = SHAFT_LOAD.to_raw_array(self._mounting.to_drive_torque_nm(shaft_torque_nm + noise_nm))
         imu = self._physics_model.imu() if self._imu_sensor is not None else None
         for i, reading in enumerate(readings):
             if not due[i]:

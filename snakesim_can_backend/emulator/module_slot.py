@@ -114,6 +114,7 @@ def assign_node_ids(robot: RobotFile, settings: CanSettings) -> list[int]:
             node_ids[names.index(name)] = mount.id
     if sorted(node_ids) != expected_ids:
         raise ConfigError(
-            f"`backends.can.mounted`: the modules would have the ids {node_ids}; give each from 1 to {len(names)} once"
+            f"`backends.can.mounted`: the modules would have the ids {node_ids}; give each from 1 to {len(names)} once",
+            code="drive/unsupported-setting",
         )
     return node_ids

@@ -13,7 +13,7 @@ from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.emulated_body import make_physics_model
+from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
@@ -29,7 +29,9 @@ class EmulatorServer:
     def __init__(self, wires: Sequence[Wire], chain: ModuleChain) -> None:
         """Connect a chain to its buses. Raises ConfigError if their numbers differ."""
         if len(wires) != len(chain.modules_per_bus):
-            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses")
+            raise ConfigError(
+                f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses", code="bus/invalid-channel"
+            )
         self.wires = wires
         self.chain = chain
         self.unsent = 0  # frames that an interface did not accept

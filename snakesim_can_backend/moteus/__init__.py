@@ -1,6 +1,7 @@
 """The backend `moteus`: mjbots' controllers, by registers on CAN FD.
 
-`backend`      MoteusBackend: settings and checks
+`backend`      MoteusBackend: checks
+`settings`     the scenario's section of this driver type
 `controllers`  what the driver sends to a controller in each control cycle, and how it handles the answers
 `protocol`     registers and frames as bytes
 `emulator`     emulated controllers

@@ -1,16 +1,13 @@
-"""The backend `moteus`, and `snakesim moteus`, which emulates controllers as a process."""
+"""The backend `moteus`: moteus controllers, real or emulated."""
 
 from collections.abc import Sequence
-from typing import Annotated
 
-from msgspec import Meta
-
-from snakesim_can_backend.can_drives.backend import CanDriveBackend, CanDriveSettings
-from snakesim_can_backend.can_drives.command import run
+from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured_gains, needed_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
+from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -18,23 +15,8 @@ from snakesim_hal.model.scenario import RunConfig
 ROUNDING = 1.001  # factor: people round the gains that they copy
 
 
-class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
-    """The scenario's `[backends.moteus]` section. `watchdog_s` goes into every command."""
-
-    data_bit_rate: Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})] = 5_000_000
-    # What all controllers have in `servo.pid_position.kp` and `.kd`; the robot file's gains are sent as shares of them.
-    # Emulated ones have by default what the robot needs.
-    kp_nm_per_turn: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "N·m/turn"})] | None = None
-    kd_nm_s_per_turn: Annotated[float, Meta(gt=0, le=1e4, extra_json_schema={"unit": "N·m·s/turn"})] | None = None
-
-    @property
-    def fd_rate(self) -> int | None:
-        """Bit rate of the data on CAN FD."""
-        return self.data_bit_rate
-
-
 class MoteusBackend(CanDriveBackend):
-    """A `snakesim_hal.backend.Backend` on moteus controllers, real or emulated."""
+    """The backend on moteus controllers, real or emulated."""
 
     Settings = MoteusSettings
     drives_class = Controllers
@@ -67,10 +49,6 @@ class MoteusBackend(CanDriveBackend):
             raise ConfigError(
                 f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {needed_kp:.4g} N·m/turn on, and "
                 f"`.kd` from {needed_kd:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
-                f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`"
+                f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`",
+                code="drive/unsupported-setting",
             )
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `snakesim moteus`."""
-    return run(MoteusBackend, "moteus", argv)

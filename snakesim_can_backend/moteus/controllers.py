@@ -8,7 +8,7 @@ Answers report mode and fault.
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from snakesim_can_backend.can_drives.drives import HOST, CanDrives, CanDrivesContext
 from snakesim_can_backend.moteus.protocol import (
@@ -29,6 +29,7 @@ from snakesim_can_backend.moteus.protocol import (
     make_frame,
     split_addresses,
 )
+from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
@@ -265,7 +266,7 @@ def needed_gains(joints: Sequence[Joint]) -> tuple[float, float]:
     return kp, kd
 
 
-def configured_gains(joints: Sequence[Joint], settings: Any) -> tuple[float, float]:
+def configured_gains(joints: Sequence[Joint], settings: MoteusSettings) -> tuple[float, float]:
     """Return the `servo.pid_position.kp` and `kd` that the controllers have.
 
     Args:

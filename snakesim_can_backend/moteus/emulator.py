@@ -5,12 +5,9 @@ feed-forward beside gains, position limits, the time that a start takes, arbitra
 """
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-from snakesim_can_backend.bus.bus import Wire
-from snakesim_can_backend.can_drives.emulator import CanEmulator
+from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
 from snakesim_can_backend.moteus.controllers import SERIAL_WORDS, TURN, configured_gains
 from snakesim_can_backend.moteus.protocol import (
     BROADCAST_ID,
@@ -29,8 +26,6 @@ from snakesim_can_backend.moteus.protocol import (
     split_addresses,
 )
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
 OVER_TEMPERATURE = 38  # fault number
@@ -75,18 +70,11 @@ class EmulatedMoteus(CanEmulator):
 
     broadcast_id = BROADCAST_ID
 
-    def __init__(
-        self,
-        joints: Sequence[Joint],
-        settings: Any,
-        body: EmulatedBody,
-        wires: Sequence[Wire],
-        clock_ns: Callable[[], int],
-    ) -> None:
-        """Start all controllers; `joints` are as the robot file describes them, those of the body as in truth."""
-        super().__init__(settings, body, wires, clock_ns)
-        self.controllers = [EmulatedController(joint.id) for joint in body.joints]
-        self._kp_nm_per_turn, self._kd_nm_s_per_turn = configured_gains(joints, settings)
+    def __init__(self, context: CanEmulatorContext) -> None:
+        """Start all controllers."""
+        super().__init__(context)
+        self.controllers = [EmulatedController(joint.id) for joint in context.body.joints]
+        self._kp_nm_per_turn, self._kd_nm_s_per_turn = configured_gains(context.joints, context.settings)
 
     def find_addressee(self, frame: Frame) -> int:
         """Return the destination of a frame."""

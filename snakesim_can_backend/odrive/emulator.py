@@ -5,12 +5,10 @@ error of overspeed, trajectories, arbitration and bit rate.
 """
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from snakesim_can_backend.bus.bus import Wire
-from snakesim_can_backend.can_drives.emulator import CanEmulator
+from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
 from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, TURN, needed_current_a
 from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
@@ -26,8 +24,8 @@ from snakesim_can_backend.odrive.protocol import (
     encode_setting_answer,
     split_id,
 )
+from snakesim_can_backend.odrive.settings import MountedAxis, OdriveSettings
 from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
@@ -96,16 +94,10 @@ class EmulatedAxis:
 class EmulatedOdrive(CanEmulator):
     """All axes of a driver type."""
 
-    def __init__(
-        self,
-        joints: Sequence[Joint],
-        settings: Any,
-        body: EmulatedBody,
-        wires: Sequence[Wire],
-        clock_ns: Callable[[], int],
-    ) -> None:
-        """Start all axes; `joints` are as the robot file describes them, those of the body as they are in truth."""
-        super().__init__(settings, body, wires, clock_ns)
+    def __init__(self, context: CanEmulatorContext) -> None:
+        """Start all axes."""
+        super().__init__(context)
+        settings: OdriveSettings = context.settings
         self._endpoints = EMULATED
         for file in read_all_endpoints(settings.endpoints):
             if (file.firmware, file.hardware) == (EMULATED.firmware, EMULATED.hardware):
@@ -117,7 +109,7 @@ class EmulatedOdrive(CanEmulator):
                 torque_constant=true_joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
                 saved=make_configuration(joint, settings),
             )
-            for joint, true_joint in zip(joints, body.joints, strict=True)
+            for joint, true_joint in zip(context.joints, context.body.joints, strict=True)
         ]
         self._heartbeat_us = -math.inf
         self.on_step(0.0)
@@ -262,19 +254,21 @@ class EmulatedOdrive(CanEmulator):
         self._drive_motor(i, axis)
 
 
-def make_configuration(joint: Joint, settings: Any) -> AxisConfiguration:
+def make_configuration(joint: Joint, settings: OdriveSettings) -> AxisConfiguration:
     """Return what an axis is configured for: what its joint in the robot file needs, unless the scenario differs."""
-    mounted = settings.mounted.get(joint.name)
-    speed_turns_s = joint.limits.speed_rad_s * joint.drive.gear / TURN
-    watchdog_timeout_s = _read_mounted(mounted, "watchdog_timeout_s", settings.watchdog_s)
+    mounted = settings.mounted.get(joint.name, MountedAxis())
+    watchdog_timeout_s = settings.watchdog_s
+    if mounted.watchdog_timeout_s is not None:
+        watchdog_timeout_s = mounted.watchdog_timeout_s
+    current_soft_max_a = needed_current_a(joint)
+    if mounted.current_soft_max_a is not None:
+        current_soft_max_a = mounted.current_soft_max_a
+    vel_limit_turns_s = joint.limits.speed_rad_s * joint.drive.gear / TURN
+    if mounted.vel_limit_turns_s is not None:
+        vel_limit_turns_s = mounted.vel_limit_turns_s
     return AxisConfiguration(
         watchdog_enabled=watchdog_timeout_s > 0,
         watchdog_timeout_s=watchdog_timeout_s,
-        current_soft_max_a=_read_mounted(mounted, "current_soft_max_a", needed_current_a(joint)),
-        vel_limit_turns_s=_read_mounted(mounted, "vel_limit_turns_s", speed_turns_s),
+        current_soft_max_a=current_soft_max_a,
+        vel_limit_turns_s=vel_limit_turns_s,
     )
-
-
-def _read_mounted(mounted: Any, field: str, default: float) -> float:
-    value = getattr(mounted, field, None)  # in the backend `mixed` the scenario has no such fields
-    return default if value is None else value

@@ -73,18 +73,22 @@ def read_endpoints(path: str) -> Endpoints:
     try:
         file = msgspec.json.decode(read_text(Path(path)), type=_File)
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}; {advice}") from None
+        raise ConfigError(f"{where}: {error}; {advice}", code="file/not-readable") from None
     except (msgspec.DecodeError, RecursionError) as error:
-        raise ConfigError(f"{where}: {path}: {error}; {advice}") from None
+        raise ConfigError(f"{where}: {path}: {error}; {advice}", code="file/not-readable") from None
     ids: dict[AxisSetting, int] = {}
     for setting in AxisSetting:
         endpoint = file.endpoints.get(setting)
         if endpoint is None or not 0 <= endpoint.id <= 0xFFFF:
-            raise ConfigError(f"{where}: {path} has no endpoint {setting} with an id of 0 to 65535; {advice}")
+            raise ConfigError(
+                f"{where}: {path} has no endpoint {setting} with an id of 0 to 65535; {advice}",
+                code="file/not-readable",
+            )
         if endpoint.type != TYPES[setting]:
             raise ConfigError(
                 f"{where}: {path}: {setting} has the type {endpoint.type!r}, and this driver needs {TYPES[setting]!r}; "
-                f"{advice}"
+                f"{advice}",
+                code="file/not-readable",
             )
         ids[setting] = endpoint.id
     firmware = file.fw_version.partition("-")[0]  # a release may have a suffix, which axes do not say

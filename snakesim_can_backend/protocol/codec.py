@@ -40,6 +40,8 @@ Writer = Callable[[int, Sequence[int]], Frame]  # node, raw numbers -> frame
 class CodecError(SnakesimError, ValueError):
     """A value does not fit its signal, or a frame does not fit its message."""
 
+    code = "message/rejected"
+
 
 @dataclass(frozen=True)
 class Signal:

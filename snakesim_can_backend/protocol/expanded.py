@@ -11,7 +11,6 @@ from cantools.database.can import Database, Message
 from snakesim_can_backend.protocol.codec import load_database
 from snakesim_can_backend.protocol.definitions import BROADCAST, FIRST_NODE, LAST_NODE, NODE_BITS, Opcode
 
-EXPANDED = "snakesim-expanded.dbc"
 TO_ALL = (Opcode.EMERGENCY, Opcode.SYNC)
 TO_ONE_OR_ALL = (Opcode.COMMAND,)
 

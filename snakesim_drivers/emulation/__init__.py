@@ -1,6 +1,8 @@
 """The body behind emulated drives: a physics model that moves under the drives' motors.
 
-`emulated_body`   the body of any driver type: a physics model, motors and their heat on one clock
-`mounted`     how the emulated drives are really mounted, which a robot file may state wrongly
-`inertia`     the simplest physics model: every joint turns an inertia of its own
+`emulated_body`    the body of any driver type, as its emulator uses it: shafts, supply, heat and injected faults
+`shared_physics`   what all emulated drives of a robot share: physics model, motors, heat and camera, on one clock
+`drive_emulator`   base class of the emulated drives of a driver type
+`mounted`          how the emulated drives are really mounted, which a robot file may state wrongly
+`inertia`          the simplest physics model: every joint rotates an inertia of its own
 """

@@ -8,15 +8,12 @@ the state of every drive, and only then sends anything; see `drive_guard`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from snakesim_drivers.kit.drive_guard import RESET_GRACE_CYCLES, DriveGuard
-from snakesim_drivers.kit.drives import Drives
+from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
 
 MAX_GAP_WATCHDOGS = 0.5  # a longer pause, as a fraction of the watchdog's time, may have let watchdogs expire
 MAX_READS_AFTER_PAUSE = 3  # the computer may pause again while the states are read
@@ -31,17 +28,6 @@ class BusSpec:
     open: Callable[[DriveReadings], Drives]  # gets the readings of these drives; raises ConfigError and BackendError
     decimation: int = 1  # control cycles from one reading of this bus to the next
     watchdog_s: float = 0.1  # of its drives
-
-
-class BusCommand(NamedTuple):
-    """SafeSetpoints of the drives of one bus, at their shafts. The fields are the arguments of `Drives.command`."""
-
-    following: frozenset[int]
-    modes: list[Mode]
-    targets: Floats
-    limits_nm: Floats
-    may_enable: bool
-    emergency: bool
 
 
 class InlineBus:
@@ -104,14 +90,7 @@ class InlineBus:
         """Send setpoints. They replace earlier ones that are not sent yet."""
         self._recover_from_pause()
         following = self._guard.drives_to_command(command.following, may_enable=command.may_enable)
-        self.drives.command(
-            following,
-            command.modes,
-            command.targets,
-            command.limits_nm,
-            may_enable=command.may_enable,
-            emergency=command.emergency,
-        )
+        self.drives.send_setpoints(command._replace(following=following))
 
     def reset_faults(self, joints: frozenset[int]) -> None:
         """Clear the errors of these drives before the next setpoints are sent."""

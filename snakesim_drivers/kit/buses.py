@@ -9,22 +9,21 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from snakesim_drivers.kit.bus import BusCommand, BusSpec, InlineBus
+from snakesim_drivers.kit.bus import BusSpec, InlineBus
 from snakesim_drivers.kit.drive_settings import answer_limit_s
+from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.kit.threaded_bus import WAIT_SLICES, ThreadedBus
-from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Mode
 
 MAX_WAIT_ANSWER_LIMITS = 1.2  # the host's wait for a bus, in answer limits of its drives: the bus itself takes time too
 CLOSE_LIMIT_S = 2.0  # for all buses together, before those that hang are left
 
 
-class Buses:
+class Buses(Drives):
     """All buses of a robot, as one `Drives`. Joints are numbered as in the robot."""
 
     def __init__(
@@ -64,7 +63,7 @@ class Buses:
         if errors:
             lines = [line for error in errors for line in error.lines]
             distinct_lines = dict.fromkeys(lines)
-            raise BackendError(*distinct_lines)
+            raise BackendError(*distinct_lines, code=errors[0].code)
         for bus in self.buses:
             self._readings.copy_from(bus.readings, bus.spec.joints)
 
@@ -81,27 +80,23 @@ class Buses:
         for bus in self.buses:
             bus.copy_readings_to(self._readings)
 
-    def command(
-        self,
-        following: frozenset[int],
-        modes: list[Mode],
-        targets: Floats,
-        limits_nm: Floats,
-        *,
-        may_enable: bool,
-        emergency: bool,
-    ) -> None:
+    def send_setpoints(self, command: BusCommand) -> None:
         """Send setpoints on all buses that are due, and at once where drives begin to follow or stop."""
         for bus in self.buses:
             joints = list(bus.spec.joints)
-            following_here = _local_indices(bus, following)
-            selection = (following_here, may_enable, emergency)
+            following_here = _local_indices(bus, command.following)
+            selection = (following_here, command.may_enable, command.emergency)
             if self._is_due(bus) or bus.last_selection != selection:
                 bus.last_selection = selection
-                modes_here = [modes[j] for j in joints]
-                bus.send(
-                    BusCommand(following_here, modes_here, targets[joints], limits_nm[joints], may_enable, emergency)
+                command_here = BusCommand(
+                    following=following_here,
+                    modes=[command.modes[j] for j in joints],
+                    targets=command.targets[joints],
+                    limits_nm=command.limits_nm[joints],
+                    may_enable=command.may_enable,
+                    emergency=command.emergency,
                 )
+                bus.send(command_here)
         self._cycles += 1
 
     def reset_faults(self, joints: frozenset[int]) -> None:
@@ -158,7 +153,10 @@ class Buses:
     def _inject_into_bus(self, injection: Injection, *, begins: bool) -> bool:
         number = injection.number
         if not 0 <= number < len(self.buses):
-            raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}")
+            raise ConfigError(
+                f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}",
+                code="injection/unknown-target",
+            )
         bus = self.buses[number]
         if injection.kind == "slow":
             delay_s = injection.amount or 0.0

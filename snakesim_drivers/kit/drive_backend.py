@@ -6,17 +6,19 @@ between here and the drives are those at the drives' shafts, in SI units.
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import msgspec
 import numpy as np
 
 from snakesim_drivers.kit.braking import Braking
 from snakesim_drivers.kit.drive_guard import NO_DRIVES, RESET_GRACE_CYCLES
-from snakesim_drivers.kit.drives import Drives
+from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding, ReportedFindings
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
-from snakesim_hal.backend import SafeSetpoints, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.robot import with_serials
@@ -41,33 +43,26 @@ class DriverClock:
         return self.robot_ns if self._lockstep else time.monotonic_ns()
 
 
-class DriveBackend:
-    """A `snakesim_hal.backend.Backend` on drives. The hooks at the end are for driver types that need more."""
+@dataclass(frozen=True, kw_only=True)
+class DriveBackendParts:
+    """What a subclass of `DriveBackend` passes to its constructor."""
 
-    reset_grace_cycles = RESET_GRACE_CYCLES
+    name: str  # of the backend
+    hardware: str  # what the backend drives, such as can0+can1; empty if the drives are emulated
+    clock: DriverClock
+    mocap: MocapReceiver | None  # receives the base pose; None without motion capture. The backend closes it.
+    open_drives: Callable[[DriveReadings], Drives]  # opens the buses; raises ConfigError and BackendError
+    watchdogs_s: Sequence[float]  # time of each joint's watchdog, from tail to head
+    decimation: int = 1  # control cycles from one reading of the slowest bus to the next
 
-    def __init__(
-        self,
-        config: RunConfig,
-        name: str,
-        hardware: str,
-        clock: DriverClock,
-        mocap: MocapReceiver | None,
-        make_drives: Callable[[DriveReadings], Drives],
-        watchdogs_s: Sequence[float],
-        decimation: int = 1,
-    ) -> None:
+
+class DriveBackend(Backend):
+    """A backend on drives. The hooks at the end are for driver types that need more."""
+
+    reset_grace_cycles: ClassVar[int] = RESET_GRACE_CYCLES  # after a reset, in which drives may report older errors
+
+    def __init__(self, config: RunConfig, parts: DriveBackendParts) -> None:
         """Open the buses and bring up every drive; no drive is enabled.
-
-        Args:
-            config: The run.
-            name: Name of the backend.
-            hardware: What the backend drives, such as can0+can1; empty if the drives are emulated.
-            clock: The driver's time.
-            mocap: Receives the base pose; None without motion capture. This object closes it.
-            make_drives: Opens the buses.
-            watchdogs_s: Time of each joint's watchdog, from tail to head.
-            decimation: Control cycles from one reading of the slowest bus to the next.
 
         Raises:
             ConfigError: the configuration does not suit the drives.
@@ -79,11 +74,11 @@ class DriveBackend:
         self._max_isolated = config.robot.safety.max_isolated_joints
         self._period_ns = config.period_ns
         self._lease_ns = config.lease_ns
-        self._decimation = decimation
+        self._decimation = parts.decimation
         # Measurements.
-        self._clock = clock
-        self._mocap = mocap
-        self._readings = DriveReadings(joints, clock.now_ns)
+        self._clock = parts.clock
+        self._mocap = parts.mocap
+        self._readings = DriveReadings(joints, parts.clock.now_ns)
         self._mounting = self._readings.mounting
         # Lifecycle.
         self._open = True
@@ -91,7 +86,7 @@ class DriveBackend:
         self._lifecycle: LifecycleState = "disarmed"
         self._following = NO_DRIVES
         self._braking = Braking(
-            [round(watchdog_s * 1e9) for watchdog_s in watchdogs_s], holds=config.robot.safety.action == "hold"
+            [round(watchdog_s * 1e9) for watchdog_s in parts.watchdogs_s], holds=config.robot.safety.action == "hold"
         )
         # Faults.
         self._reported = ReportedFindings()
@@ -99,17 +94,17 @@ class DriveBackend:
         self._pending = NO_DRIVES  # just reported as failed: the HAL is expected to isolate them
         self._grace_cycles = 0  # left, in which drives may report errors from before a reset
         try:
-            self._drives = make_drives(self._readings)
+            self._drives = parts.open_drives(self._readings)
         except BaseException:
-            if mocap is not None:
-                mocap.close()
+            if parts.mocap is not None:
+                parts.mocap.close()
             raise
         try:
             self._drives.bring_up()
         except BaseException:
             self.close()
             raise
-        description = self._make_description(config, name, hardware)
+        description = self._make_description(config, parts.name, parts.hardware)
         self._description = with_serials(description, self._readings.serials, self._readings.firmware)
 
     def describe(self) -> Description:
@@ -138,14 +133,15 @@ class DriveBackend:
         self._reset_faults(lifecycle, connected, returned)
         self._following = self._joints_to_drive(lifecycle, connected, setpoints.mode)
         self._lifecycle = lifecycle
-        self._drives.command(
-            self._following,
-            setpoints.mode,
-            self._mounting.drive_targets(setpoints.mode, setpoints.target),
-            self._mounting.drive_torque_limit_nm(np.array(setpoints.torque_limit_nm)),
+        command = BusCommand(
+            following=self._following,
+            modes=setpoints.mode,
+            targets=self._mounting.to_drive_targets(setpoints.mode, setpoints.target),
+            limits_nm=self._mounting.to_drive_torque_limit_nm(np.array(setpoints.torque_limit_nm)),
             may_enable=lifecycle == "armed",
             emergency=lifecycle == "estop",
         )
+        self._drives.send_setpoints(command)
 
     def advance(self) -> None:
         """Receive what has arrived. In lockstep the robot's time passes by one control cycle."""
@@ -201,7 +197,7 @@ class DriveBackend:
             case "armed":
                 return connected
             case "fault":
-                speeds = self._mounting.joint_velocity_rad_s(self._readings.velocity_rad_s)
+                speeds = self._mounting.to_joint_velocity_rad_s(self._readings.velocity_rad_s)
                 followed_before = connected & self._following
                 return self._braking.select_braking_joints(followed_before, modes, speeds, self._clock.now_ns())
             case _:
@@ -245,7 +241,7 @@ class DriveBackend:
 
     def _require_open(self) -> None:
         if not self._open:
-            raise BackendError("the buses are closed; open a new backend")
+            raise BackendError("the buses are closed; open a new backend", code="backend/closed")
 
     def _make_description(self, config: RunConfig, name: str, hardware: str) -> Description:
         description = describe_run_robot(config, name, emulated=self._drives.emulated)

@@ -5,8 +5,9 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody, SharedPhysics, make_physics_model
+from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody
 from snakesim_drivers.emulation.mounted import Mounted, check_mounted
+from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_drivers.motion_capture.mocap import check_pose
 from snakesim_hal.base.errors import ConfigError
@@ -24,18 +25,30 @@ MIN_LEASE_ROUNDS = 1.5  # readings of a bus in a lease: its joint states have to
 class BodySettings(FileStruct, frozen=True, kw_only=True):
     """Settings that concern a robot as a whole, whatever its drives."""
 
-    pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None  # of motion capture: HOST:PORT
-    physics_model: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.physics_models`
+    pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None
+    """UDP address HOST:PORT at which the pose from motion capture arrives; none: there is no motion capture."""
+
+    physics_model: str = "mujoco"
+    """Body that emulated drives move: `mujoco`, `inertia`, or another installed physics model."""
+
     physics_model_settings: dict[str, Any] = {}
-    mounted: Mapping[str, Mounted] = {}  # of emulated drives: joint -> how it is mounted in truth
+    """Settings of the physics model, which checks them."""
+
+    mounted: Mapping[str, Mounted] = {}
+    """For joints of emulated drives, how each is really mounted, to see what a wrong robot file does."""
 
 
 class DriveSettings(BodySettings, frozen=True, kw_only=True):
     """Settings that every driver type has; a driver type adds its ports."""
 
-    watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1  # of the drives
+    watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1
+    """Time without a setpoint after which a drive stops by itself."""
+
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    decimation: Annotated[int, Meta(ge=1, le=100)] = 1  # control cycles from one reading of a bus to the next
+    """Time limit for finding and configuring all drives at the start."""
+
+    decimation: Annotated[int, Meta(ge=1, le=100)] = 1
+    """Control cycles from one reading of a bus to the next."""
 
 
 def make_body(config: RunConfig, settings: BodySettings, backend: str, pose_address: str | None) -> EmulatedBody:
@@ -105,7 +118,8 @@ def check_buses(
         if joint.drive.port and joint.drive.port not in ports:
             raise ConfigError(
                 f"{joint_label(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
-                f"`{section}`: {', '.join(ports) or 'none'}"
+                f"`{section}`: {', '.join(ports) or 'none'}",
+                code="bus/invalid-channel",
             )
     _check_watchdog(config, settings, section)
     _check_decimation(config, settings.decimation, section)
@@ -119,7 +133,8 @@ def _check_watchdog(config: RunConfig, settings: DriveSettings, section: str) ->
     decimation_text = f" and `decimation` = {decimation}" if decimation > 1 else ""
     raise ConfigError(
         f"`{section}.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}{decimation_text}: "
-        f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more"
+        f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more",
+        code="drive/watchdog-too-short",
     )
 
 
@@ -130,7 +145,8 @@ def _check_decimation(config: RunConfig, decimation: int, section: str) -> None:
     age_ms = 1000 * decimation / config.rate_hz
     raise ConfigError(
         f"`{section}.decimation` = {decimation} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
-        f"{age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}"
+        f"{age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}",
+        code="drive/watchdog-too-short",
     )
 
 

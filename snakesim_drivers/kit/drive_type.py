@@ -4,6 +4,7 @@ A driver type is a subclass of `DriverTypeBackend`. If it is the backend of a ru
 the backend `mixed` it drives those whose `driver` is its name.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from typing import Any, ClassVar
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.buses import Buses
-from snakesim_drivers.kit.drive_backend import DriveBackend, DriverClock
+from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, DriverClock
 from snakesim_drivers.kit.drive_settings import (
     DriveSettings,
     assign_ports,
@@ -36,82 +37,43 @@ class DriverTypePart:
     """The joints of a robot that are of one driver type."""
 
     driver_type: "type[DriverTypeBackend]"
-    settings: Any  # of the driver type's own `Settings`
+    settings: Any  # an instance of the driver type's own `Settings`
     section: str  # where they are in the scenario
     joints: Mapping[int, Joint]  # by their indices in the robot
 
     @property
     def ports(self) -> Sequence[str]:
         """The names of its buses; empty: its drives are emulated in this process."""
-        return self.driver_type.ports(self.settings)
+        return self.driver_type.list_ports(self.settings)
 
 
-class DriverTypeBackend(DriveBackend):
-    """A `snakesim_hal.backend.Backend` on drives, real or emulated.
+@dataclass(frozen=True)
+class DriverTypeContext:
+    """What a driver type gets to plan and open its buses in a robot."""
 
-    A driver type sets the two class variables and implements the four class methods that raise NotImplementedError.
-    The host's thread calls them before and while the backend is opened.
+    config: RunConfig
+    settings: Any  # an instance of the driver type's own `Settings`
+    joints: Mapping[int, Joint]  # those that it drives, by their indices in the robot
+    clock: DriverClock
+    body: EmulatedBody | None  # moved by these joints' drives if they are emulated here; None: they are on a bus
+
+
+class BusesBackend(DriveBackend):
+    """A backend on the buses of one driver type or of several: checks before a start, and everything around the buses.
+
+    Not for driver types: they derive from `DriverTypeBackend`.
     """
 
-    Settings: ClassVar[type[Any]]  # a subclass of `BodySettings`; of a driver type, of `DriveSettings`
-    name: ClassVar[str]  # of the backend, and of the driver type in a robot file
+    name: ClassVar[str]  # of the backend
 
     @classmethod
-    def ports(cls, settings: Any) -> Sequence[str]:
-        """Return the names of the buses in the settings; empty: the drives are emulated in this process."""
-        raise NotImplementedError
-
-    @classmethod
-    def bus_faults(cls, settings: Any) -> Collection[str]:
-        """Return the kinds of faults that can be injected into the buses."""
-        raise NotImplementedError
-
-    @classmethod
-    def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
-        """Check that drives of this type suit the joints, and that the buses can carry their messages.
-
-        Raises:
-            ConfigError: a joint, or the load of a bus, does not suit this driver type.
-        """
-        raise NotImplementedError
-
-    @classmethod
-    def buses(
-        cls,
-        config: RunConfig,
-        settings: Any,
-        joints: Mapping[int, Joint],
-        clock: DriverClock,
-        body: EmulatedBody | None,
-    ) -> list[BusSpec]:
-        """Return the buses that have some of the joints; `BusSpec.open` opens them later.
-
-        Args:
-            config: The run.
-            settings: The settings of this driver type.
-            joints: Its joints, by their indices in the robot.
-            clock: The driver's time.
-            body: The body that these joints' drives move if they are emulated here; None: they are on a bus.
-        """
-        raise NotImplementedError
-
-    # --- the same for all driver types ------------------------------------------------------------------------
-
-    @classmethod
+    @abstractmethod
     def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
-        """Return the joints of each driver type; here all are of this one.
+        """Return the joints of each driver type in a robot.
 
         Raises:
-            ConfigError: the robot file names another driver type for a joint.
+            ConfigError: A joint is of no driver type that the backend has.
         """
-        joints = dict(enumerate(config.robot.joint_table))
-        for joint in joints.values():
-            if joint.drive.driver not in ("", cls.name):
-                raise ConfigError(
-                    f"{joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
-                    f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
-                )
-        return [DriverTypePart(cls, settings, config.backend_section, joints)]
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
@@ -126,7 +88,7 @@ class DriverTypeBackend(DriveBackend):
         check_gains(config.robot)
         parts = cls.split_by_driver_type(config, settings)
         emulated_here = _are_emulated_here(parts)
-        possible_faults = [{*part.driver_type.bus_faults(part.settings)} for part in parts]
+        possible_faults = [{*part.driver_type.list_bus_faults(part.settings)} for part in parts]
         common_faults = set[str].intersection(*possible_faults)
         bus_count = sum(max(len(part.ports), 1) for part in parts)
         check_body(config, settings, emulators=emulated_here, buses=bus_count, bus_faults=common_faults)
@@ -159,24 +121,72 @@ class DriverTypeBackend(DriveBackend):
             specs: list[BusSpec] = []
             for part in parts:
                 part_body = body.select(list(part.joints)) if body is not None else None
-                specs += part.driver_type.buses(config, part.settings, part.joints, clock, part_body)
+                context = DriverTypeContext(config, part.settings, part.joints, clock, part_body)
+                specs += part.driver_type.plan_buses(context)
             return Buses(config, readings, specs, clock.now_ns)
 
-        super().__init__(
-            config,
-            self.name,
+        backend_parts = DriveBackendParts(
+            name=self.name,
             hardware="+".join(port for part in parts for port in part.ports),
             clock=clock,
             mocap=mocap,
-            make_drives=open_buses,
+            open_drives=open_buses,
             watchdogs_s=_list_watchdogs_s(parts),
-            decimation=max(self.decimation(part.settings) for part in parts),
+            decimation=max(part.settings.decimation for part in parts),
         )
+        super().__init__(config, backend_parts)
 
-    @staticmethod
-    def decimation(settings: DriveSettings) -> int:
-        """Return the number of control cycles from one reading of a bus to the next."""
-        return settings.decimation
+
+class DriverTypeBackend(BusesBackend):
+    """A driver type, and the backend on its drives, real or emulated. Derive from it; see docs/backends.md.
+
+    A driver type sets `name`, `Settings`, a subclass of `DriveSettings`, and perhaps `supported_modes`, and implements
+    the four abstract class methods. The host's thread calls all of them, before the backend is opened or while it is.
+    `list_ports`, `list_bus_faults` and `check_drives` open nothing, as `Backend.check` does, which calls them.
+    """
+
+    @classmethod
+    @abstractmethod
+    def list_ports(cls, settings: Any) -> Sequence[str]:
+        """Return the names of the buses in the settings; empty: the drives are emulated in this process."""
+
+    @classmethod
+    @abstractmethod
+    def list_bus_faults(cls, settings: Any) -> Collection[str]:
+        """Return the kinds of faults that `Drives.inject` can inject into the buses; empty: none."""
+
+    @classmethod
+    @abstractmethod
+    def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
+        """Check that drives of this type suit the joints, and that the buses can carry their messages.
+
+        Raises:
+            ConfigError: A joint, or the load of a bus, does not suit this driver type.
+        """
+
+    @classmethod
+    @abstractmethod
+    def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
+        """Return the buses that have some of the joints; `BusSpec.open` opens each of them later.
+
+        `group_by_port` makes them for drives on named ports.
+        """
+
+    @classmethod
+    def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
+        """Return all joints as those of this driver type.
+
+        Raises:
+            ConfigError: The robot file names another driver type for a joint.
+        """
+        joints = dict(enumerate(config.robot.joint_table))
+        for joint in joints.values():
+            if joint.drive.driver not in ("", cls.name):
+                raise ConfigError(
+                    f"{joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
+                    f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
+                )
+        return [DriverTypePart(cls, settings, config.backend_section, joints)]
 
 
 def _are_emulated_here(parts: Sequence[DriverTypePart]) -> bool:

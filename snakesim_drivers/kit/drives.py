@@ -1,19 +1,35 @@
 """The interface that a driver type implements: `Drives`, the drives of one bus.
 
-Call order: `bring_up` once; then, in every control cycle, `read`, `command`, `poll` and `findings`; in the end `close`,
-which may also follow a failed `bring_up`. `reset_faults` comes before the `command` of the same cycle, and `inject` at
-any time.
+`Drives` is the base class of every driver type's protocol. This file shows each of its members with its arguments,
+their units, when it is called, by which thread, and how long it may take.
 
-Threads: the host's thread creates the object and calls `bring_up` and `inject`. In real time each bus of `Buses` has
-a thread of its own, which makes all other calls. In lockstep the host's thread makes all calls. No two calls overlap,
-except that `inject` may run while the bus thread is in another method.
+Call order
+    `bring_up` once. Then in every control cycle `read`, `send_setpoints`, `poll` and `findings`. In the end `close`,
+    which may also follow a failed `bring_up`. `reset_faults` comes before the `send_setpoints` of the same cycle, and
+    `inject` at any time.
 
-All joint numbers are indices on this bus, from tail to head. All physical values are those at the shafts of the
-drives, in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure goes into
-the `DriveReadings` that the driver type gets when the bus is opened.
+Threads
+    The host's thread creates the object and calls `bring_up` and `inject`. In real time each bus has a thread of its
+    own, which makes all other calls. In lockstep the host's thread makes all calls. No two calls overlap, except that
+    `inject` may run while the bus thread is in another method.
+
+Time
+    `bring_up` may take `bring_up_limit_s` of the settings, 10 s by default, and `close` 2 s for all buses together. All
+    other calls of a cycle together may take one control period times the `decimation` of the bus; `read` should wait
+    at most `drive_settings.answer_limit_s` for answers, half of that time. A bus that is slower delays neither the host
+    nor other buses: its joint states become older, and after one lease they are invalid.
+
+Errors
+    An exception of any call ends the run safely. The bus first switches its drives off, by `send_setpoints` without
+    followers, and then closes. A drive that is silent or reports an error is no exception but a `Finding`.
+
+All drives are numbered by their place on this bus, from tail to head. All values are those at the shafts of the drives,
+in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure goes into the
+`DriveReadings` that the driver type gets when the bus is opened; a value that is not finite counts as not measured.
 """
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 from snakesim_drivers.kit.findings import Finding
 from snakesim_hal.base.arrays import Floats
@@ -21,80 +37,106 @@ from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
 
 
-class Drives(Protocol):
-    """The drives of one driver type on one bus.
+class BusCommand(NamedTuple):
+    """What all drives of a bus are to do until the next command."""
 
-    Every method except `bring_up` and `close` returns within a control cycle.
-    """
+    following: frozenset[int]  # the drives that get setpoints; all others are switched off
+    modes: list[Mode]  # of every drive
+    targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive; 0 for passive drives
+    limits_nm: Floats  # (n_drives,) torque limits, not negative
+    may_enable: bool  # True: the robot is armed; False: a drive that is off stays off
+    emergency: bool  # True: drives stop by their own emergency stop, where they have one
 
-    emulated: bool  # True: no real motor moves
 
+class Drives(ABC):
+    """The drives of one driver type on one bus. Derive from it, and implement the abstract methods."""
+
+    emulated: bool = False  # True: no real motor moves; set by the constructor
+
+    @abstractmethod
     def bring_up(self) -> None:
-        """Find every drive, check it and write its settings. No drive is enabled. May take seconds.
+        """Find every drive, check it, write its settings and store its serial number. No drive is enabled.
 
         Raises:
-            BackendError: a drive is missing or does not suit its joint.
+            BackendError: A drive is missing or does not suit its joint. Name all such drives in one error, a line each.
         """
-        ...
 
+    @abstractmethod
     def read(self) -> None:
-        """Request the state of every drive, and put the answers into the readings.
+        """Request motion and torque of every drive, and put the answers into the readings.
 
-        The method does not wait for drives that have been silent before.
+        Do not wait for drives that were silent before: `DriveReadings.is_incomplete` tells whether waiting is worth it.
+        Request also the state of the drives in `DriveReadings.drives_to_check`, and call `mark_checked` for each that
+        reports it: these may have stopped by themselves.
+
+        Raises:
+            BackendError: The bus cannot be used any more.
         """
-        ...
 
-    def command(
-        self,
-        following: frozenset[int],
-        modes: list[Mode],
-        targets: Floats,
-        limits_nm: Floats,
-        *,
-        may_enable: bool,
-        emergency: bool,
-    ) -> None:
+    @abstractmethod
+    def send_setpoints(self, command: BusCommand) -> None:
         """Send setpoints to the drives that follow, and switch off all others.
 
         A drive that begins to follow is enabled after it has received its setpoint. A drive that should be off but
-        reports that it is on is switched off again.
+        reports that it is on is switched off again. `drive_states.DriveStates` decides both.
 
         Args:
-            following: The drives that get setpoints.
-            modes: The mode of every drive.
-            targets: (n_drives,) in rad, rad/s or N·m, by the mode of each drive; 0 for passive drives.
-            limits_nm: (n_drives,) torque limits.
-            may_enable: True if the robot is armed. Otherwise a drive that is off stays off.
-            emergency: True if drives stop by their own emergency stop, where they have one.
-        """
-        ...
-
-    def reset_faults(self, joints: frozenset[int]) -> None:
-        """Clear the errors of these drives, and write the settings that a restart may have lost.
-
-        Only the operator's reset of a fault leads to this call.
-        """
-        ...
-
-    def findings(self) -> list[Finding]:
-        """Return what is wrong now with the drives and their bus. Silent drives need not be included."""
-        ...
-
-    def poll(self) -> None:
-        """Receive what has arrived. Drives that are emulated in this process simulate up to the present time."""
-        ...
-
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end an injected fault of the bus or of a drive emulated here.
-
-        Returns:
-            False if the fault concerns neither of them.
+            command: Setpoints and followers. It replaces the one of the cycle before.
 
         Raises:
-            ConfigError: the fault cannot be injected here.
+            BackendError: The bus cannot be used any more.
         """
-        ...
 
+    @abstractmethod
+    def reset_faults(self, joints: frozenset[int]) -> None:
+        """Clear the errors of these drives, and write the settings that a restart may have lost. Enable none.
+
+        Only the operator's reset of a fault leads to this call.
+
+        Args:
+            joints: The drives.
+
+        Raises:
+            BackendError: The bus cannot be used any more.
+        """
+
+    @abstractmethod
     def close(self) -> None:
-        """Switch all drives off and close the bus. Allowed in every state."""
-        ...
+        """Switch all drives off and close the bus. Allowed in every state.
+
+        Raises:
+            BackendError: The bus cannot be closed.
+        """
+
+    def findings(self) -> list[Finding]:
+        """Return what is wrong now with the drives and their bus; the caller reports each finding once.
+
+        Drives that do not answer need not be included: the caller counts the requests that they left unanswered.
+        """
+        return []
+
+    def poll(self) -> None:
+        """Receive what has arrived, without waiting. Drives that are emulated here simulate up to the present time.
+
+        The default is for drives that only answer requests.
+
+        Raises:
+            BackendError: The bus cannot be used any more.
+        """
+        return
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Begin or end an injected fault of the bus, `bus_1`, or of a drive emulated here, `joint_1` for drive 0.
+
+        Args:
+            injection: The fault.
+            begins: True to begin it, False to end it.
+
+        Returns:
+            False if the fault concerns neither of them. This is the default.
+
+        Raises:
+            ConfigError: The fault cannot be injected here.
+        """
+        del injection, begins
+        return False

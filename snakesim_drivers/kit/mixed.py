@@ -5,13 +5,12 @@ scenario. What concerns the whole robot is in `[backends.mixed]`: motion capture
 move together.
 """
 
-from collections.abc import Collection
 from typing import Any
 
 import msgspec
 
 from snakesim_drivers.kit.drive_settings import BodySettings
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
+from snakesim_drivers.kit.drive_type import BusesBackend, DriverTypeBackend, DriverTypePart
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
@@ -23,8 +22,8 @@ class MixedSettings(BodySettings, frozen=True, kw_only=True):
     """The scenario's `[backends.mixed]` section."""
 
 
-class MixedBackend(DriverTypeBackend):
-    """A `snakesim_hal.backend.Backend` on drives of several driver types, real or emulated."""
+class MixedBackend(BusesBackend):
+    """The backend on drives of several driver types, real or emulated."""
 
     Settings = MixedSettings
     name = "mixed"
@@ -41,14 +40,14 @@ class MixedBackend(DriverTypeBackend):
         _check_same_world(parts)
         return parts
 
-    @staticmethod
-    def as_driven(robot: RobotFile) -> RobotFile:
+    @classmethod
+    def limit_modes(cls, robot: RobotFile) -> RobotFile:
         """Return the robot with only those modes that each joint has in its driver type."""
         joints = dict(robot.joints)
         for joint in robot.joint_table:
-            known_modes: Collection[str] | None = getattr(find_driver_type(robot, joint), "MODES", None)
-            if known_modes is not None:
-                modes = [mode for mode in joint.drive.modes if mode in known_modes]
+            supported_modes = find_driver_type(robot, joint).supported_modes
+            if supported_modes is not None:
+                modes = [mode for mode in joint.drive.modes if mode in supported_modes]
                 exceptions = joints.get(joint.name, JointExceptions())
                 joints[joint.name] = msgspec.structs.replace(exceptions, modes=modes)
         return msgspec.structs.replace(robot, joints=joints)
@@ -64,15 +63,18 @@ def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     where = f"robot {robot.name!r}, {joint.name}: `driver`"
     fix = f"say it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
     if not driver:
-        raise ConfigError(f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}")
+        raise ConfigError(
+            f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}",
+            code="drive/unknown-type",
+        )
     try:
         plugin: Any = find_plugin(BACKENDS, driver)
     except ConfigError as error:
-        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}") from None
-    is_driver_type = isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)
-    if not is_driver_type or issubclass(plugin, MixedBackend):
+        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}", code="drive/unknown-type") from None
+    if not (isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)):
         raise ConfigError(
-            f"{where} = {driver!r}, a backend that drives whole robots, and no driver type of drives; {fix}"
+            f"{where} = {driver!r}, which is a backend of whole robots, and not a driver type; {fix}",
+            code="drive/unknown-type",
         )
     return plugin
 
@@ -86,7 +88,8 @@ def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBacke
     if robot_wide:
         raise ConfigError(
             f"`{section}.{robot_wide[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-            f"say `backends.mixed.{robot_wide[0]}`"
+            f"say `backends.mixed.{robot_wide[0]}`",
+            code="config/conflict",
         )
     settings = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
     joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
@@ -100,5 +103,6 @@ def _check_same_world(parts: list[DriverTypePart]) -> None:
     if on_bus and emulated:
         raise ConfigError(
             f"`{emulated[0].section}` names no bus, and `{on_bus[0].section}` does: drives that are emulated here do "
-            f"not move with those on a bus. Name the buses of all driver types, or of none"
+            f"not move with those on a bus. Name the buses of all driver types, or of none",
+            code="bus/not-virtual",
         )

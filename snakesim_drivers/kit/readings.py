@@ -180,9 +180,9 @@ class DriveReadings:
         return JointState(
             tick=tick,
             timestamp_ns=timestamp_ns,
-            angle_rad=self.mounting.joint_angle_rad(self.angle_rad).tolist(),
-            velocity_rad_s=self.mounting.joint_velocity_rad_s(self.velocity_rad_s).tolist(),
-            torque_nm=self.mounting.joint_torque_nm(self.torque_nm).tolist(),
+            angle_rad=self.mounting.to_joint_angle_rad(self.angle_rad).tolist(),
+            velocity_rad_s=self.mounting.to_joint_velocity_rad_s(self.velocity_rad_s).tolist(),
+            torque_nm=self.mounting.to_joint_torque_nm(self.torque_nm).tolist(),
             valid=[age_ns <= lease_ns for age_ns in ages_ns],
             age_ns=ages_ns,
         )

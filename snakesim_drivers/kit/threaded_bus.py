@@ -14,8 +14,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from snakesim_drivers.kit.bus import BusCommand, BusSpec, InlineBus, bus_findings
+from snakesim_drivers.kit.bus import BusSpec, InlineBus, bus_findings
 from snakesim_drivers.kit.drive_guard import NO_DRIVES
+from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint

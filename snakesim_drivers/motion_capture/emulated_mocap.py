@@ -1,4 +1,4 @@
-"""An emulated motion-capture system: it looks at a physics model, and sends what it saw as `mocap` receives it."""
+"""An emulated motion-capture system: it measures the pose of a physics model, and sends it as `mocap` receives it."""
 
 import contextlib
 import socket
@@ -11,22 +11,32 @@ from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.sensors import PoseSensor
 from snakesim_hal.physics.physics_model import PhysicsModel
+from snakesim_hal.wire.quantities import Quaternion
 
 
 class PoseSender:
     """Sends datagrams and ignores errors: motion capture does not know whether it has receivers."""
 
     def __init__(self, address: str) -> None:
-        """address: HOST:PORT. Raises ConfigError."""
+        """Open a socket.
+
+        Args:
+            address: HOST:PORT to send to.
+
+        Raises:
+            ConfigError: The address is malformed.
+        """
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
-            raise ConfigError(f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450")
+            raise ConfigError(
+                f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450", code="network/invalid-address"
+            )
         self._address = (host, int(port))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
     def __call__(self, datagram: bytes) -> None:
-        """Send one."""
+        """Send a datagram."""
         with contextlib.suppress(OSError):
             self._socket.sendto(datagram, self._address)
 
@@ -36,40 +46,66 @@ class PoseSender:
 
 
 class PoseCamera:
-    """Motion capture of the base, at every Sync, with the delay of the robot file."""
+    """Captures the pose of the base once in every control period, with the noise and delay of the robot file.
+
+    The measured orientation is the true one times a small random rotation about axes of the base:
+
+        measured = true * (1, a, b, c) / norm,   a, b, c: normal, with half of the standard deviation of the angle
+    """
 
     def __init__(self, sensor: PoseSensor, physics_model: PhysicsModel, seed: Sequence[int], period_ns: int) -> None:
+        """Begin without any captured pose.
+
+        Args:
+            sensor: The entry of the robot file.
+            physics_model: The model to measure.
+            seed: Seed of the noise.
+            period_ns: Time between two captures.
+        """
         self._physics_model = physics_model
-        self._under_way: deque[MocapSample] = deque(maxlen=1 + round(sensor.delay_s * 1e9 / period_ns))
-        self._noise = np.random.default_rng(seed).standard_normal
-        self._sigma = np.repeat([sensor.position_noise_m, 0.5 * sensor.angle_noise_rad], 3)  # quaternions halve angles
+        delay_periods = round(sensor.delay_s * 1e9 / period_ns)
+        self._delayed: deque[MocapSample] = deque(maxlen=1 + delay_periods)
+        self._draw_normal = np.random.default_rng(seed).standard_normal
+        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
+        self._sigma = np.repeat(sigma, 3)
 
     def capture(self, timestamp_ns: int) -> MocapSample | None:
-        """The sample that arrives at this Sync: the base's pose before the delay; None at first, or without a world.
+        """Capture the pose of the base. Velocities have no noise of their own.
 
-        Velocities carry no noise of their own.
+        Args:
+            timestamp_ns: The present time of the motion-capture system.
+
+        Returns:
+            The pose that arrives now, captured before the delay; None until the first one arrives, or without a world.
         """
         pose = self._physics_model.pose()
         if pose is None:
             return None
-        ex, ey, ez, a, b, c = (self._sigma * self._noise(6)).tolist()
-        px, py, pz = pose.position_w
-        w, x, y, z = pose.orientation_wxyz
-        turned = np.array(
-            (
-                w - a * x - b * y - c * z,
-                x + a * w + b * z - c * y,
-                y + b * w + c * x - a * z,
-                z + c * w + a * y - b * x,
-            )
-        )
-        w, x, y, z = (turned / np.linalg.norm(turned)).tolist()
+        error_x, error_y, error_z, a, b, c = (self._sigma * self._draw_normal(6)).tolist()
+        x, y, z = pose.position_w
         sample = MocapSample(
             timestamp_ns=timestamp_ns,
-            position_w=(px + ex, py + ey, pz + ez),
-            orientation_wxyz=(w, x, y, z),
+            position_w=(x + error_x, y + error_y, z + error_z),
+            orientation_wxyz=_rotate_slightly(pose.orientation_wxyz, a, b, c),
             velocity_w=pose.velocity_w,
             angular_velocity_w=pose.angular_velocity_w,
         )
-        self._under_way.append(sample)
-        return self._under_way[0] if len(self._under_way) == self._under_way.maxlen else None
+        self._delayed.append(sample)
+        if len(self._delayed) < (self._delayed.maxlen or 0):
+            return None
+        return self._delayed[0]
+
+
+def _rotate_slightly(wxyz: Quaternion, a: float, b: float, c: float) -> Quaternion:
+    """Return the unit quaternion along wxyz * (1, a, b, c)."""
+    w, x, y, z = wxyz
+    product = np.array(
+        (
+            w - a * x - b * y - c * z,
+            x + a * w + b * z - c * y,
+            y + b * w + c * x - a * z,
+            z + c * w + a * y - b * x,
+        )
+    )
+    w, x, y, z = (product / np.linalg.norm(product)).tolist()
+    return (w, x, y, z)

@@ -1,8 +1,6 @@
 """Control: from trajectory and world model to setpoints of every joint. Controllers are plug-ins.
 
-The interface:
-
-`controller`      what a controller is: its observation, its command and its telemetry
+Their base class, their observations and commands are in `snakesim_hal.controller`.
 
 Controllers, one per module:
 
@@ -20,6 +18,6 @@ Parts that controllers share:
 The process that runs a controller:
 
 `service`         calls the controller once a tick, and sends its setpoints
-`guarded`, `freshness`, `live_settings`, `update_times`   check its output, its inputs, its settings and its speed
+`guarded`, `freshness`, `live_parameters`, `update_times`   check its output, its inputs, its parameters and its speed
 `state_reports`, `states`, `advance`   the messages of `control/state`, with the four states of the paper's Figure 6
 """

@@ -13,15 +13,15 @@ from typing import Annotated
 
 import numpy as np
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.wire.messages import Description, JointState
-from snakesim_hal.wire.quantities import about, above
+from snakesim_hal.wire.quantities import above
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 MIN_STIFFNESS_NM_PER_RAD = 1e-9  # avoids a division by zero for joints without a position loop
 
-Blend = Annotated[float, above(10, "s"), about("time over which the command changes smoothly to a new reference")]
+Blend = Annotated[float, above(10, "s")]
 
 
 class HandOver:
@@ -107,30 +107,30 @@ class BumplessReference:
         self._hand_over = HandOver(robot)
         self.reference_rad: Floats | None = None  # of the tick before; None: joints have not been in position mode
 
-    def follow(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> RequestedSetpoints:
+    def follow(self, observation: Observation, reference_rad: Floats, *, restarted: bool = False) -> RequestedSetpoints:
         """Return setpoints that follow a reference.
 
         Args:
-            view: inputs of this tick.
+            observation: inputs of this tick.
             reference_rad: (n_joints,) reference angles, tail to head.
             restarted: the reference may have jumped since the last tick, so that the jump has to fade out.
         """
         if self.reference_rad is None:
-            self._hand_over.start(view.joints, reference_rad)
+            self._hand_over.start(observation.joints, reference_rad)
         elif restarted:
             self._hand_over.shift(reference_rad - self.reference_rad)
         self.reference_rad = reference_rad
-        self._hand_over.fade(view.period_s / self._blend_s)
+        self._hand_over.fade(observation.period_s / self._blend_s)
         return positions(self._robot, self._hand_over.positions_rad(reference_rad).tolist())
 
     def forget_reference(self) -> None:
         """Note that the joints leave position mode; on return they start from the torques that they have then."""
         self.reference_rad = None
 
-    def hold(self, view: View, why: str) -> Action:
+    def hold(self, observation: Observation, why: str) -> ControllerCommand:
         """Keep every joint at its last reference, or at its pose if there was none. `why` is reported."""
         reference_rad = self.reference_rad
         if reference_rad is None:
-            reference_rad = np.array(view.joints.angle_rad)
-        setpoints = self.follow(view, reference_rad)
-        return Action(setpoints, Report(why=why, reference_rad=reference_rad.tolist()))
+            reference_rad = np.array(observation.joints.angle_rad)
+        setpoints = self.follow(observation, reference_rad)
+        return ControllerCommand(setpoints, Telemetry(reason=why, reference_rad=reference_rad.tolist()))

@@ -18,11 +18,11 @@ import math
 import numpy as np
 from msgspec.structs import replace
 
-from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave, spacing_ratio
 from snakesim_gnc.control.standstill import Standstill
-from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
+from snakesim_gnc.control.undulation import HeadSteeredUndulation, HeadSteeredUndulationParameters, LateralUndulation
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description
 
 STANDSTILL_M = 0.02  # a body stands that moves less than this, or less than half of what it should
@@ -30,7 +30,7 @@ PROGRESS_M = 0.05  # a wave makes progress if the goal comes so much nearer with
 PROGRESS_S = 3.0
 PUSHED_M = 0.1  # a body that has moved so far since the last search has advanced by pushing
 SLOW_TIME_SCALE = 2.0  # of the first wave of such a body
-FORWARD_WAVE = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
+FORWARD_WAVE = HeadSteeredUndulationParameters(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
 
 
 class ContactSearch:
@@ -66,27 +66,29 @@ class ContactSearch:
         self._nearest_m = math.inf  # distance of the goal then
         self.changed = False  # a wave began or ended in this tick
 
-    def decide(self, view: View, center_w: Floats, *, wanted_m_s: float, near: bool) -> LateralUndulation | None:
+    def decide(
+        self, observation: Observation, center_w: Floats, *, wanted_m_s: float, near: bool
+    ) -> LateralUndulation | None:
         """Return the wave by which to move at this tick; None: follow the path.
 
         Args:
-            view: inputs of this tick.
+            observation: inputs of this tick.
             center_w: (2,) m, center of the body.
             wanted_m_s: wanted speed along the path.
             near: obstacles are within reach of the body.
         """
         last_wave = self._wave
         if last_wave is None:
-            if self._stands_still(view, center_w, abs(wanted_m_s)):
-                self._begin_s = view.time_s
-                self._begin_wave(self._choose_first_wave(center_w, near=near), view)
-        elif view.time_s - self._begin_s >= self._for_s:
+            if self._stands_still(observation, center_w, abs(wanted_m_s)):
+                self._begin_s = observation.time_s
+                self._begin_wave(self._choose_first_wave(center_w, near=near), observation)
+        elif observation.time_s - self._begin_s >= self._for_s:
             self.stop()
-        elif not self._makes_progress(view, center_w):
+        elif not self._makes_progress(observation, center_w):
             if last_wave is self._forward_wave:
-                self._begin_wave(self._feedback_wave, view)
+                self._begin_wave(self._feedback_wave, observation)
             else:
-                self._begin_wave(self._forward_wave, view)
+                self._begin_wave(self._forward_wave, observation)
         self.changed = self._wave is not last_wave
         return self._wave
 
@@ -104,26 +106,26 @@ class ContactSearch:
             return self._slow_feedback_wave
         return self._feedback_wave
 
-    def _begin_wave(self, wave: LateralUndulation, view: View) -> None:
+    def _begin_wave(self, wave: LateralUndulation, observation: Observation) -> None:
         self._wave = wave
-        self._progress_s = view.time_s
+        self._progress_s = observation.time_s
         self._nearest_m = math.inf
-        wave.start_from(np.array(view.joints.angle_rad))
+        wave.start_from(np.array(observation.joints.angle_rad))
 
-    def _makes_progress(self, view: View, center_w: Floats) -> bool:
+    def _makes_progress(self, observation: Observation, center_w: Floats) -> bool:
         """Whether the wave has brought the goal nearer within the last PROGRESS_S."""
-        trajectory = view.trajectory
+        trajectory = observation.trajectory
         if trajectory is None:
             return True
         goal_w = trajectory.goal_w or trajectory.path_w[-1]
         distance_m = math.dist(center_w, goal_w)
         if distance_m < self._nearest_m - PROGRESS_M:
-            self._progress_s = view.time_s
+            self._progress_s = observation.time_s
             self._nearest_m = distance_m
-        return view.time_s - self._progress_s < PROGRESS_S
+        return observation.time_s - self._progress_s < PROGRESS_S
 
-    def _stands_still(self, view: View, center_w: Floats, wanted_m_s: float) -> bool:
+    def _stands_still(self, observation: Observation, center_w: Floats, wanted_m_s: float) -> bool:
         if self._origin_w is None:
             self._origin_w = center_w
         max_distance_m = min(STANDSTILL_M, 0.5 * wanted_m_s * self._after_s)
-        return self._standstill.update(view.time_s, view.period_s, center_w, max_distance_m)
+        return self._standstill.update(observation.time_s, observation.period_s, center_w, max_distance_m)

@@ -10,9 +10,9 @@ For joint i, with phase phi, and with n = 0, 1, 2, ... counted from the head ove
 F_c are the contact forces on the links behind and ahead of the joint. feedback_i changes by at most
 MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal.
 
-Source: the shipped policy `lab` (`snakesim train`, `docs/environments.md`), with its numbers, and with measured or
-estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied in every tick as fast
-as the drives are, the body would need a quarter more energy; the limit of its rate avoids this.
+Source: the shipped policy `lab` (`snakesim policy train`, `docs/environments.md`), with its numbers, and with measured
+or estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied in every tick as
+fast as the drives are, the body would need a quarter more energy; the limit of its rate avoids this.
 
 The policy was trained on one robot. For another robot, angles and lags scale with the distance between its joints, so
 that it has the same curve, and torques scale with the torque limits of its joints.
@@ -23,9 +23,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.undulation import LateralUndulation, aside_rad
+from snakesim_gnc.control.undulation import LateralUndulation, LateralUndulationParameters, aside_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description
 
 # The trained wave.
@@ -68,7 +68,7 @@ class ForceFeedbackWave(LateralUndulation):
             time_scale: factor on all times; 2 moves at half the speed.
         """
         scale = spacing_ratio(robot)
-        super().__init__(robot, LateralUndulation.Settings(period_s=time_scale * PERIOD_S, lag_rad=scale * LAG_RAD))
+        super().__init__(robot, LateralUndulationParameters(period_s=time_scale * PERIOD_S, lag_rad=scale * LAG_RAD))
         count = len(self._body.bends)
         x = np.arange(count)[::-1] / max(count - 1, 1)  # 0 at the head, 1 at the tail
         self._base_amplitude_rad = scale * (AMPLITUDE_RAD + GROWTH_RAD * x)
@@ -85,10 +85,10 @@ class ForceFeedbackWave(LateralUndulation):
         super().start_from(angles_rad)
         self._feedback_rad = None
 
-    def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
+    def reference_rad(self, observation: Observation, passed_s: float) -> NDArray[np.float64]:
         """Return the angles of all joints, (n_joints,), `passed_s` later than in the last call."""
-        reference = super().reference_rad(view, passed_s)
-        feedback_rad = self._measure_feedback(view)
+        reference = super().reference_rad(observation, passed_s)
+        feedback_rad = self._measure_feedback(observation)
         if self._feedback_rad is not None:
             max_change_rad = self._max_feedback_rad_s * passed_s
             change_rad = np.clip(feedback_rad - self._feedback_rad, -max_change_rad, max_change_rad)
@@ -97,10 +97,10 @@ class ForceFeedbackWave(LateralUndulation):
         reference[self._body.bends] += feedback_rad
         return reference
 
-    def _measure_feedback(self, view: View) -> NDArray[np.float64]:
+    def _measure_feedback(self, observation: Observation) -> NDArray[np.float64]:
         """Return MAX_FEEDBACK_RAD tanh(sum of gains x measurements), (n_bends,)."""
         bends = self._body.bends
-        joints = view.joints
+        joints = observation.joints
         scaled_torque_nm = np.array(joints.torque_nm) / self._torque_scale
         total = np.zeros(len(bends))
         for values, gains in zip((joints.angle_rad, joints.velocity_rad_s, scaled_torque_nm), self._gains, strict=True):
@@ -108,19 +108,21 @@ class ForceFeedbackWave(LateralUndulation):
             total += gains[0] * padded[:-2] + gains[1] * padded[1:-1] + gains[2] * padded[2:]
         return self._max_feedback_rad * np.tanh(total)
 
-    def _bend_rad(self, view: View) -> float | NDArray[np.float64]:
+    def _bend_rad(self, observation: Observation) -> float | NDArray[np.float64]:
         """Return the bend towards the goal. It ignores the path, which a body pushed by obstacles does not follow."""
-        if view.world is None or view.trajectory is None:
+        if observation.world is None or observation.trajectory is None:
             return 0.0
-        nodes_w = self._body.nodes_w(view.world, view.joints.angle_rad).T
-        goal_w = view.trajectory.goal_w or view.trajectory.path_w[-1]
+        nodes_w = self._body.nodes_w(observation.world, observation.joints.angle_rad).T
+        goal_w = observation.trajectory.goal_w or observation.trajectory.path_w[-1]
         return self._steering_rad * math.sin(aside_rad(nodes_w, goal_w - nodes_w[-1]))
 
-    def _amplitude_rad(self, view: View, _waves: NDArray[np.float64], _passed_s: float) -> NDArray[np.float64]:
+    def _amplitude_rad(
+        self, observation: Observation, _waves: NDArray[np.float64], _passed_s: float
+    ) -> NDArray[np.float64]:
         """Return A_i + sum of gains x contact forces, (n_bends,)."""
-        forces_n = np.zeros(len(self._robot.links))
-        if view.world is not None:
-            for contact in view.world.contacts:
+        forces_n = np.zeros(len(self.robot.links))
+        if observation.world is not None:
+            for contact in observation.world.contacts:
                 forces_n[contact.link] += math.hypot(*contact.force_w)
         behind_n = forces_n[:-1][self._body.bends]
         ahead_n = forces_n[1:][self._body.bends]

@@ -16,7 +16,7 @@ A timestamp that is further ahead of the clock than its limit is rejected as wel
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from snakesim_hal.model.scenario import SENSOR, RunConfig, Service
+from snakesim_hal.model.scenario import SENSOR, RunConfig, ServiceSchedule
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.freshness import max_state_age_ns
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
@@ -43,8 +43,8 @@ class AgeLimits:
         """Return the limits of a run: those in its scenario, or else the defaults."""
         max_age = config.max_age
         period_s = robot.period_ns * 1e-9
-        guidance = config.services.get("guidance", Service())
-        navigation = config.services.get("navigation", Service())
+        guidance = config.services.get("guidance", ServiceSchedule())
+        navigation = config.services.get("navigation", ServiceSchedule())
         guidance_cycle_s = guidance.decimation * period_s
         guidance_latency_s = guidance.latency_ticks * period_s
         navigation_cycle_s = navigation.decimation * period_s

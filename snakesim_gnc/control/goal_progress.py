@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from snakesim_gnc.control.controller import Task
+from snakesim_hal.controller import Task
 from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose

@@ -9,8 +9,8 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.base.errors import ControllerError, describe_exception
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
 from snakesim_hal.wire.messages import Description, JointDescription, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
 from snakesim_hal.wire.setpoints import RequestedSetpoints
@@ -23,30 +23,30 @@ MAX_SHOWN = 60  # characters of a value in an error message
 class GuardedController:
     """A checked controller, constructed for one arm session. Every call may raise ControllerError."""
 
-    def __init__(self, name: str, plugin: type[Controller], robot: Description, settings: Any) -> None:
+    def __init__(self, name: str, controller_class: type[Controller[Any]], robot: Description, parameters: Any) -> None:
         """Construct the controller.
 
         Args:
             name: the controller as configured: an entry point, or `./file.py:Class`.
-            plugin: its class.
+            controller_class: its class.
             robot: description of the robot.
-            settings: the controller's settings.
+            parameters: the controller's parameters.
         """
-        self._label = f"controller {name} (class {getattr(plugin, '__name__', plugin)})"
-        self._module = plugin.__module__
+        self._label = f"controller {name} (class {controller_class.__name__})"
+        self._module = controller_class.__module__
         self._joints = robot.joints
         with self._name_errors("__init__"):
-            self._controller = plugin(robot, settings)
+            self._controller = controller_class(robot, parameters)
 
-    def update(self, view: View) -> Action:
-        """Return the controller's action after a check."""
+    def update(self, observation: Observation) -> ControllerCommand:
+        """Return the controller's command after a check."""
         with self._name_errors("update"):
-            action = self._controller.update(view)
+            command = self._controller.update(observation)
         try:
-            check(action, self._joints)
+            check(command, self._joints)
         except ValueError as error:
             raise self.make_error(str(error)) from None
-        return action
+        return command
 
     def make_error(self, what: str) -> ControllerError:
         """Return an error that names the controller. `what` names the field, its value, and what is allowed."""
@@ -65,29 +65,29 @@ class GuardedController:
             raise self.make_error(f"{method}() {describe_exception(error, self._module)}") from error
 
 
-def check(action: Action, described: Sequence[JointDescription]) -> None:
-    """Check an action.
+def check(command: ControllerCommand, described: Sequence[JointDescription]) -> None:
+    """Check a command.
 
     Args:
-        action: what a controller returned; it may be of any type.
+        command: what a controller returned; it may be of any type.
         described: the joints, tail to head.
 
     Raises:
-        ValueError: the action cannot be sent; the error names the field, its value and what is allowed.
+        ValueError: the command cannot be sent; the error names the field, its value and what is allowed.
     """
-    if not isinstance(action, Action):
-        raise ValueError(f"update() returned {_format_value(action)}, must return an Action")
-    setpoints = action.setpoints
-    report = action.report
+    if not isinstance(command, ControllerCommand):
+        raise ValueError(f"update() returned {_format_value(command)}, must return a ControllerCommand")
+    setpoints = command.setpoints
+    telemetry = command.telemetry
     if not isinstance(setpoints, RequestedSetpoints):
-        raise ValueError(f"Action.setpoints is {_format_value(setpoints)}, must be RequestedSetpoints")
-    if not isinstance(report, Report):
-        raise ValueError(f"Action.report is {_format_value(report)}, must be a Report")
+        raise ValueError(f"ControllerCommand.setpoints is {_format_value(setpoints)}, must be RequestedSetpoints")
+    if not isinstance(telemetry, Telemetry):
+        raise ValueError(f"ControllerCommand.telemetry is {_format_value(telemetry)}, must be Telemetry")
     joints = [joint.name for joint in described]
     _check_modes(setpoints.mode, described, joints)
     _check_numbers("target", setpoints.target, joints, minimum=-MAX_TARGET)
     _check_numbers("torque_limit_nm", setpoints.torque_limit_nm, joints, minimum=0.0)
-    _check_report(report, joints)
+    _check_telemetry(telemetry, joints)
 
 
 def _check_modes(modes: Any, described: Sequence[JointDescription], joints: Sequence[str]) -> None:
@@ -127,16 +127,16 @@ def _check_numbers(field: str, values: Any, joints: Sequence[str], *, minimum: f
         raise ValueError(f"{found}, must be a finite number of {unit} from {minimum:g} to {MAX_TARGET:g}")
 
 
-def _check_report(report: Report, joints: Sequence[str]) -> None:
+def _check_telemetry(telemetry: Telemetry, joints: Sequence[str]) -> None:
     """Check the fields that decide about the state; all others are checked when the state is published."""
-    if not isinstance(report.why, str):
-        raise ValueError(f"Report.why is {_format_value(report.why)}, must be a str")
-    _check_index("usable_push_points", report.usable_push_points)
-    _check_index("propulsion_joint", report.propulsion_joint, len(joints) - 1)
+    if not isinstance(telemetry.reason, str):
+        raise ValueError(f"Telemetry.reason is {_format_value(telemetry.reason)}, must be a str")
+    _check_index("usable_push_points", telemetry.usable_push_points)
+    _check_index("propulsion_joint", telemetry.propulsion_joint, len(joints) - 1)
 
 
 def _check_index(field: str, value: Any, maximum: int | None = None) -> None:
-    """Check that a field of a report is None, or an int from 0 to `maximum` (None: without an upper bound)."""
+    """Check that a field of the telemetry is None, or an int from 0 to `maximum` (None: without an upper bound)."""
     if value is None:
         return
     if type(value) is int and value >= 0 and (maximum is None or value <= maximum):
@@ -144,7 +144,7 @@ def _check_index(field: str, value: Any, maximum: int | None = None) -> None:
     allowed = "None or an int from 0"
     if maximum is not None:
         allowed += f" to {maximum}"
-    raise ValueError(f"Report.{field} is {_format_value(value)}, must be {allowed}")
+    raise ValueError(f"Telemetry.{field} is {_format_value(value)}, must be {allowed}")
 
 
 def _format_value(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 The robot hangs by its tail, head down: on the ground, friction under the body would count as friction of the joints.
 Each joint moves slowly back and forth, which shows dry friction, and on top of that shakes at frequencies that no other
-joint has. Neighbors start in opposite directions, so that the body stays near the vertical. `snakesim identify`
+joint has. Neighbors start in opposite directions, so that the body stays near the vertical. `snakesim robot identify`
 evaluates the recording.
 """
 
@@ -11,10 +11,10 @@ import random
 from dataclasses import dataclass
 from typing import Annotated
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, bounded
+from snakesim_hal.wire.quantities import bounded
 
 MARGIN_RAD = 0.02  # between a target and the joint's limit
 SPEED_RATIO = 0.8  # of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself
@@ -32,7 +32,29 @@ class Tone:
     phase_rad: float
 
 
-class Identify:
+class IdentifyParameters(FileStruct, frozen=True):
+    """How far and how fast."""
+
+    swing_rad: Annotated[float, bounded(0.01, 0.5, "rad")] = 0.25
+    """Amplitude of the slow motion."""
+
+    swing_s: Annotated[float, bounded(0.5, 60.0, "s")] = 2.0
+    """Period of the fastest slow motion, there and back."""
+
+    shake_rad: Annotated[float, bounded(0.0, 0.3, "rad")] = 0.05
+    """Maximum of the sum of all tones."""
+
+    shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz")] = 6.0
+    """Frequency of the highest tone; that of the lowest is a tenth of it."""
+
+    shake_after_s: Annotated[float, bounded(0.0, 600.0, "s")] = 6.0
+    """Time with the slow motion alone, before the shaking."""
+
+    fade_s: Annotated[float, bounded(0.1, 10.0, "s")] = 0.5
+    """Time until each motion reaches its full size."""
+
+
+class Identify(Controller[IdentifyParameters]):
     """Sends position targets: for each joint a slow triangle wave and four tones, which fade in.
 
     With the triangle wave w of period T_i, and with the tones' frequencies f_ik, amplitudes a_ik and phases p_ik, the
@@ -43,56 +65,42 @@ class Identify:
     Targets stay within the joint's limits of angle and speed.
     """
 
-    NEEDS = "joints"
-    MEASURES = ("torque",)
+    Parameters = IdentifyParameters
+    needs_world = False
+    required_measurements = ("torque",)
 
-    class Settings(FileStruct, frozen=True):
-        """How far and how fast."""
-
-        swing_rad: Annotated[float, bounded(0.01, 0.5, "rad"), about("slow motion to either side")] = 0.25
-        swing_s: Annotated[
-            float, bounded(0.5, 60.0, "s"), about("period of the fastest slow motion, there and back")
-        ] = 2.0
-        shake_rad: Annotated[float, bounded(0.0, 0.3, "rad"), about("maximum of the sum of all tones")] = 0.05
-        shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz"), about("highest tone; the lowest is a tenth")] = 6.0
-        shake_after_s: Annotated[
-            float, bounded(0.0, 600.0, "s"), about("time with the slow motion alone, before the shaking")
-        ] = 6.0
-        fade_s: Annotated[float, bounded(0.1, 10.0, "s"), about("time until each motion reaches its full size")] = 0.5
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot = robot
-        self._settings = settings
-        self._tones = make_tones(len(robot.joints), settings.shake_to_hz)
-        self._start_rad: list[float] = []  # empty: there has been no view yet
+    def __init__(self, robot: Description, parameters: IdentifyParameters) -> None:
+        super().__init__(robot, parameters)
+        self._tones = make_tones(len(robot.joints), parameters.shake_to_hz)
+        self._start_rad: list[float] = []  # empty: there has been no observation yet
         self._last_rad: list[float] = []  # targets of the tick before
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Return the next targets, within the limits of every joint."""
         if not self._start_rad:
-            self._start_rad = list(view.joints.angle_rad)
-        swing_rad = self._settings.swing_rad * self._fade_in(view.time_s)
-        shaking_s = view.time_s - self._settings.shake_after_s
-        shake_rad = self._settings.shake_rad * self._fade_in(shaking_s)
+            self._start_rad = list(observation.joints.angle_rad)
+        swing_rad = self.parameters.swing_rad * self._fade_in(observation.time_s)
+        shaking_s = observation.time_s - self.parameters.shake_after_s
+        shake_rad = self.parameters.shake_rad * self._fade_in(shaking_s)
         targets_rad: list[float] = []
-        for i, joint in enumerate(self._robot.joints):
-            offset_rad = self._swing(i, view.time_s, swing_rad) + self._shake(i, shaking_s, shake_rad)
+        for i, joint in enumerate(self.robot.joints):
+            offset_rad = self._swing(i, observation.time_s, swing_rad) + self._shake(i, shaking_s, shake_rad)
             min_rad = joint.angle_min_rad + MARGIN_RAD
             max_rad = joint.angle_max_rad - MARGIN_RAD
             targets_rad.append(min(max(self._start_rad[i] + offset_rad, min_rad), max_rad))
         if self._last_rad:
-            targets_rad = self._limit_speed(targets_rad, view.period_s)
+            targets_rad = self._limit_speed(targets_rad, observation.period_s)
         self._last_rad = targets_rad
         why = "shaking every joint" if shake_rad else "slowly back and forth, every joint"
-        return Action(positions(self._robot, targets_rad), Report(why=why, reference_rad=targets_rad))
+        return ControllerCommand(positions(self.robot, targets_rad), Telemetry(reason=why, reference_rad=targets_rad))
 
     def _fade_in(self, time_s: float) -> float:
         """Return the fraction of the full size at a time after the beginning of a motion, 0 to 1."""
-        return min(max(time_s / self._settings.fade_s, 0.0), 1.0)
+        return min(max(time_s / self.parameters.fade_s, 0.0), 1.0)
 
     def _swing(self, i: int, time_s: float, swing_rad: float) -> float:
         """Return the slow motion of a joint. The period grows towards the head, to one and a half times the first."""
-        period_s = self._settings.swing_s * (1 + i / (2 * len(self._robot.joints)))
+        period_s = self.parameters.swing_s * (1 + i / (2 * len(self.robot.joints)))
         sign = (-1) ** (i // 2 + i)
         return sign * swing_rad * triangle_wave(time_s / period_s)
 
@@ -107,7 +115,7 @@ class Identify:
     def _limit_speed(self, targets_rad: list[float], period_s: float) -> list[float]:
         """Return targets that no joint has to move too fast for."""
         limited_rad: list[float] = []
-        for joint, target_rad, last_rad in zip(self._robot.joints, targets_rad, self._last_rad, strict=True):
+        for joint, target_rad, last_rad in zip(self.robot.joints, targets_rad, self._last_rad, strict=True):
             max_step_rad = SPEED_RATIO * joint.speed_limit_rad_s * period_s
             limited_rad.append(min(max(target_rad, last_rad - max_step_rad), last_rad + max_step_rad))
         return limited_rad

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.goal_progress import GoalProgress
 from snakesim_hal.base.errors import ConfigError, suggest_word
+from snakesim_hal.controller import Observation
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Message, Pose
 
@@ -28,7 +28,7 @@ MAX_TIME_S = 1e5
 SPEED_MARGIN = 3.0  # loads turn joints faster than motors do
 TORQUE_MARGIN = 1.5  # torque sensors have noise
 
-Read = Callable[[View, GoalProgress], Sequence[float]]
+Read = Callable[[Observation, GoalProgress], Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,14 @@ def _joint_parts(robot: Description) -> dict[str, ObservationPart]:
     speeds_rad_s = [SPEED_MARGIN * joint.speed_limit_rad_s for joint in joints]
     torques_nm = [TORQUE_MARGIN * joint.torque_limit_nm for joint in joints]
     return {
-        "time_s": ObservationPart(["since_arming"], "s", [0.0], [MAX_TIME_S], lambda view, _: [view.time_s]),
-        "angle_rad": _symmetric(names, "rad", angles_rad, lambda view, _: view.joints.angle_rad),
-        "velocity_rad_s": _symmetric(names, "rad/s", speeds_rad_s, lambda view, _: view.joints.velocity_rad_s),
-        "torque_nm": _symmetric(names, "N·m", torques_nm, lambda view, _: view.joints.torque_nm),
+        "time_s": ObservationPart(
+            ["since_arming"], "s", [0.0], [MAX_TIME_S], lambda observation, _: [observation.time_s]
+        ),
+        "angle_rad": _symmetric(names, "rad", angles_rad, lambda observation, _: observation.joints.angle_rad),
+        "velocity_rad_s": _symmetric(
+            names, "rad/s", speeds_rad_s, lambda observation, _: observation.joints.velocity_rad_s
+        ),
+        "torque_nm": _symmetric(names, "N·m", torques_nm, lambda observation, _: observation.joints.torque_nm),
     }
 
 
@@ -89,7 +93,9 @@ def _contact_parts(robot: Description) -> dict[str, ObservationPart]:
     low = [0.0] * count
     high = [MAX_FORCE_N] * count
     return {
-        "contact_n": ObservationPart(names, "N", low, high, lambda view, _: _read_forces(view, count), keys.CONTACTS)
+        "contact_n": ObservationPart(
+            names, "N", low, high, lambda observation, _: _read_forces(observation, count), keys.CONTACTS
+        )
     }
 
 
@@ -123,13 +129,21 @@ def select_parts(robot: Description, observe: Sequence[str] | None) -> dict[str,
     if observe is None:
         return {name: observable[name] for name in DEFAULT if name in observable}
     if isinstance(observe, str) or not observe:
-        raise ConfigError(f"observe={observe!r:.60}: give a sequence of names, such as ('angle_rad', 'contact_n')")
+        raise ConfigError(
+            f"observe={observe!r:.60}: give a sequence of names, such as ('angle_rad', 'contact_n')",
+            code="policy/invalid",
+        )
     for name in observe:
         if name not in parts:
             hint = suggest_word(str(name), parts)
-            raise ConfigError(f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}")
+            raise ConfigError(
+                f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}", code="policy/invalid"
+            )
         if name not in observable:
-            raise ConfigError(f"observe: {name!r} needs {parts[name].sensor}, which robot {robot.robot!r} has not")
+            raise ConfigError(
+                f"observe: {name!r} needs {parts[name].sensor}, which robot {robot.robot!r} has not",
+                code="policy/invalid",
+            )
     return {name: parts[name] for name in observe}
 
 
@@ -145,7 +159,7 @@ class Observer:
         """
         self._robot = robot
         self._parts = parts
-        self._progress: GoalProgress | None = None  # None: there has been no view yet
+        self._progress: GoalProgress | None = None  # None: there has been no observation yet
 
         # Sensors that the parts need, by key, and the bounds of the observation.
         self.sensors = {part.sensor for part in parts.values() if part.sensor is not None}
@@ -154,35 +168,35 @@ class Observer:
         self.low: NDArray[np.float32] = np.array(low, np.float32)
         self.high: NDArray[np.float32] = np.array(high, np.float32)
 
-    def update(self, view: View) -> NDArray[np.float32]:
-        """Return the numbers of all parts, clipped to their bounds. The advance counts from the first view on."""
-        assert view.senses is not None, "a controller of observations has SENSES = True"
+    def update(self, observation: Observation) -> NDArray[np.float32]:
+        """Return the numbers of all parts, clipped to their bounds. The advance counts from the first call on."""
+        assert observation.sensor_samples is not None, "a controller with an Observer declares uses_sensors = True"
         progress = self._progress
         if progress is None:
-            progress = GoalProgress(self._robot, view.senses.task)
+            progress = GoalProgress(self._robot, observation.sensor_samples.task)
             self._progress = progress
-        progress.update(view.joints, _newest_pose(view))
+        progress.update(observation.joints, _newest_pose(observation))
         values: list[float] = []
         for part in self._parts.values():
-            values.extend(part.read(view, progress))
-        observation = np.array(values, dtype=np.float32)
-        return np.minimum(np.maximum(observation, self.low), self.high)
+            values.extend(part.read(observation, progress))
+        numbers = np.array(values, dtype=np.float32)
+        return np.minimum(np.maximum(numbers, self.low), self.high)
 
     @property
     def progress(self) -> GoalProgress:
-        """The advance towards the goal as of the newest view."""
-        assert self._progress is not None, "there has been no view yet"
+        """The advance towards the goal as of the newest observation."""
+        assert self._progress is not None, "there has been no observation yet"
         return self._progress
 
 
-def _read_bearing(_view: View, progress: GoalProgress) -> Sequence[float]:
+def _read_bearing(_observation: Observation, progress: GoalProgress) -> Sequence[float]:
     return math.cos(progress.bearing_rad), math.sin(progress.bearing_rad)
 
 
-def _read_forces(view: View, link_count: int) -> Sequence[float]:
+def _read_forces(observation: Observation, link_count: int) -> Sequence[float]:
     """Return the sum of the sizes of all contact forces on every link, (link_count,) in N."""
     forces_n = [0.0] * link_count
-    sample = _newest_sample(view, keys.CONTACTS)
+    sample = _newest_sample(observation, keys.CONTACTS)
     if not isinstance(sample, Contacts):
         return forces_n
     for contact in sample.contacts:
@@ -191,28 +205,28 @@ def _read_forces(view: View, link_count: int) -> Sequence[float]:
     return forces_n
 
 
-def _read_velocity(view: View, _progress: GoalProgress) -> Sequence[float]:
-    pose = _newest_pose(view)
+def _read_velocity(observation: Observation, _progress: GoalProgress) -> Sequence[float]:
+    pose = _newest_pose(observation)
     if pose is None:
         return 0.0, 0.0, 0.0
     return pose.velocity_w
 
 
-def _read_angular_velocity(view: View, _progress: GoalProgress) -> Sequence[float]:
-    pose = _newest_pose(view)
+def _read_angular_velocity(observation: Observation, _progress: GoalProgress) -> Sequence[float]:
+    pose = _newest_pose(observation)
     if pose is None:
         return 0.0, 0.0, 0.0
     return pose.angular_velocity_w
 
 
-def _newest_pose(view: View) -> Pose | None:
-    sample = _newest_sample(view, keys.POSE)
+def _newest_pose(observation: Observation) -> Pose | None:
+    sample = _newest_sample(observation, keys.POSE)
     if isinstance(sample, Pose):
         return sample
     return None
 
 
-def _newest_sample(view: View, key: str) -> Message | None:
-    if view.senses is None:
+def _newest_sample(observation: Observation, key: str) -> Message | None:
+    if observation.sensor_samples is None:
         return None
-    return view.senses.newest.get(key)
+    return observation.sensor_samples.newest.get(key)

@@ -32,17 +32,17 @@ from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.contact_search import ContactSearch
-from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.progress import Located, PathProgress, SpeedFilter
 from snakesim_gnc.control.push import PushFilter, Touches, UnitPush, find_touches, push_forward
 from snakesim_gnc.control.push_report import explain_push_standstill, push_points
 from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, Mode, World, WorldContact
-from snakesim_hal.wire.quantities import about, above, from_zero
+from snakesim_hal.wire.quantities import above, from_zero
 
 OTHER_SHAPE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
 SLOPE_STEP_M = 0.02  # step of the finite difference for theta'
@@ -74,97 +74,94 @@ class PushSnapshot:
     push: UnitPush
 
 
-class ObstacleAided:
+class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
+    """Parameters; the bound of the look-ahead limits how hard the shape pushes."""
+
+    speed_kp_s: Annotated[float, from_zero(5, "s")] = 0.2
+    """Look-ahead of the shape for each m/s that the speed is too low."""
+
+    integral_per_s: Annotated[float, from_zero(50, "1/s")] = 0.4
+    """Rate at which the look-ahead grows while the speed stays too low."""
+
+    max_look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.05
+    """Maximum look-ahead of the shape along its path; it limits how hard the shape pushes."""
+
+    fresh_look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.01
+    """Look-ahead at the start of a new path."""
+
+    push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0
+    """Factor of both pushing terms, for control experiments; negative: backward."""
+
+    push_sign_s: Annotated[float, from_zero(100, "s")] = 0.0
+    """Time after which the sign of the push is drawn at random again, for control experiments; 0: never."""
+
+    speed_kp_n_s_per_m: Annotated[float, from_zero(1000, "N*s/m")] = 25.0
+    """Push on obstacles for each m/s that the speed is too low."""
+
+    lag_kp_n_per_m: Annotated[float, from_zero(1000, "N/m")] = 60.0
+    """Push on obstacles for each meter that the body has fallen behind."""
+
+    max_push_n: Annotated[float, from_zero(1000, "N")] = 60.0
+    """Maximum push along the path."""
+
+    max_torque_nm: Annotated[float, from_zero(1000, "N*m")] = 5.0
+    """Maximum torque of a joint for pushing."""
+
+    max_contact_n: Annotated[float, above(1000, "N")] = 60.0
+    """Maximum desired force on one contact."""
+
+    reach_m: Annotated[float, above(1, "m")] = 0.03
+    """Maximum gap between the body and an obstacle that is pushed."""
+
+    contact_gap_scale_m: Annotated[float, above(1, "m")] = 0.005
+    """Gap to an obstacle at which a contact counts half."""
+
+    push_filter_s: Annotated[float, above(5, "s")] = 0.05
+    """Time constant of the filter of how the push is shared among contacts."""
+
+    torque_filter_s: Annotated[float, above(5, "s")] = 0.03
+    """Time constant of the filter of the pushing torques."""
+
+    search_after_s: Annotated[float, from_zero(1000, "s")] = 1.2
+    """Time with less than 2 cm of advance after which the body searches for contacts by a wave; 0: never."""
+
+    search_s: Annotated[float, above(1000, "s")] = 30.0
+    """Duration of a search, after which the body tries its path again."""
+
+    blend_s: Blend = 0.3
+    speed_filter_s: SpeedFilter = 0.05
+    no_contact_cost: Annotated[float, from_zero(1000, "1")] = 10.0
+    """Additional cost of a force on an obstacle without measured contact; 0: it costs as much as on others."""
+
+    shape_nm_per_rad: Annotated[float, from_zero(1000, "N*m/rad")] = 1.5
+    """Stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are."""
+
+    shape_nm_s_per_rad: Annotated[float, from_zero(1000, "N*m*s/rad")] = 0.1
+    """Damping of the shape in torque mode."""
+
+
+class ObstacleAided(Controller[ObstacleAidedParameters]):
     """Controls the speed along the path with all joints."""
 
-    class Settings(FileStruct, frozen=True, kw_only=True):
-        """Parameters; the bound of the look-ahead limits how hard the shape pushes."""
+    Parameters = ObstacleAidedParameters
 
-        speed_kp_s: Annotated[
-            float, from_zero(5, "s"), about("look-ahead of the shape for each m/s that the speed is too low")
-        ] = 0.2
-        integral_per_s: Annotated[
-            float, from_zero(50, "1/s"), about("how fast the look-ahead grows while the speed stays too low")
-        ] = 0.4
-        max_look_ahead_m: Annotated[
-            float, from_zero(1, "m"), about("bound of the look-ahead: how far ahead on its path the shape is at most")
-        ] = 0.05
-        fresh_look_ahead_m: Annotated[
-            float, from_zero(1, "m"), about("look-ahead with which it begins on a new path")
-        ] = 0.01
-        push_scale: Annotated[
-            float, Meta(ge=-1, le=1), about("factor of both pushing terms, for control experiments; below 0: backward")
-        ] = 1.0
-        push_sign_s: Annotated[
-            float,
-            from_zero(100, "s"),
-            about("for control experiments: after each such time the sign of the push is drawn at random; 0: never"),
-        ] = 0.0
-        speed_kp_n_s_per_m: Annotated[
-            float, from_zero(1000, "N*s/m"), about("push on obstacles for each m/s that the speed is too low")
-        ] = 25.0
-        lag_kp_n_per_m: Annotated[
-            float, from_zero(1000, "N/m"), about("push on obstacles for each metre that the body has fallen behind")
-        ] = 60.0
-        max_push_n: Annotated[float, from_zero(1000, "N"), about("bound of the push along the path")] = 60.0
-        max_torque_nm: Annotated[
-            float,
-            from_zero(1000, "N*m"),
-            about("bound of a joint's torque for pushing"),
-        ] = 5.0
-        max_contact_n: Annotated[float, above(1000, "N"), about("bound of the desired force on one contact")] = 60.0
-        reach_m: Annotated[float, above(1, "m"), about("an obstacle so near to the body is pushed")] = 0.03
-        contact_gap_scale_m: Annotated[
-            float, above(1, "m"), about("gap to an obstacle at which a contact counts half")
-        ] = 0.005
-        push_filter_s: Annotated[
-            float, above(5, "s"), about("time constant of the filter of how the push is shared among contacts")
-        ] = 0.05
-        torque_filter_s: Annotated[
-            float, above(5, "s"), about("time constant of the filter of the pushing torques")
-        ] = 0.03
-        search_after_s: Annotated[
-            float,
-            from_zero(1000, "s"),
-            about("after so long with less than 2 cm of advance the body searches for contacts by a wave; 0: never"),
-        ] = 1.2
-        search_s: Annotated[
-            float, above(1000, "s"), about("duration of a search, after which the body tries its path again")
-        ] = 30.0
-        blend_s: Blend = 0.3
-        speed_filter_s: SpeedFilter = 0.05
-        no_contact_cost: Annotated[
-            float,
-            from_zero(1000, "1"),
-            about("added cost of a force on an obstacle without measured contact; 0: it costs as much as on others"),
-        ] = 10.0
-        shape_nm_per_rad: Annotated[
-            float,
-            from_zero(1000, "N*m/rad"),
-            about("stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are"),
-        ] = 1.5
-        shape_nm_s_per_rad: Annotated[
-            float, from_zero(1000, "N*m*s/rad"), about("damping of the shape in torque mode")
-        ] = 0.1
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot = robot
-        self._set = settings
+    def __init__(self, robot: Description, parameters: ObstacleAidedParameters) -> None:
+        super().__init__(robot, parameters)
         # Models and estimators.
         self._body = PlanarBody(robot)
         self._climb = Climb(robot)
-        self._progress = PathProgress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._progress = PathProgress(self._body, speed_filter_s=parameters.speed_filter_s)
         self._contacts = MeasuredContacts()
         # Joints.
         self._bends = self._body.bends  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         self._has_torque_mode = all(robot.joints[i].supports_mode(Mode.TORQUE) for i in self._bends)
-        self._bumpless = BumplessReference(robot, settings.blend_s)
+        self._bumpless = BumplessReference(robot, parameters.blend_s)
         self._holding = False  # the joints hold a pose; the next reference may jump
         # Look-ahead.
         self._look_ahead_integral_m = 0.0
         # Push along the path.
-        self._push_filter = PushFilter(settings.push_filter_s)
+        self._push_filter = PushFilter(parameters.push_filter_s)
         self._snapshot: PushSnapshot | None = None
         self._unit_torques_nm = np.zeros(len(robot.joints))  # joint torques for 1 N along the path
         self._torques_nm = np.zeros(len(robot.joints))  # filtered joint torques of the commanded push
@@ -174,38 +171,38 @@ class ObstacleAided:
         self._unbalanced_at_s = 0.0  # when the contacts could last not balance a push
         # Supervision.
         self._moved_at_s = 0.0  # when the body was last faster than STANDSTILL_SPEED_M_S
-        self._search = ContactSearch(robot, after_s=settings.search_after_s, for_s=settings.search_s)
+        self._search = ContactSearch(robot, after_s=parameters.search_after_s, for_s=parameters.search_s)
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Return torques, or angles of the body further along the path, as far as the wanted speed needs it."""
-        located = self._progress.update(view)
+        located = self._progress.update(observation)
         if isinstance(located, str):
             self._holding = True
-            return self._bumpless.hold(view, located)
+            return self._bumpless.hold(observation, located)
         self._contacts.add_world(located.world)
         wanted_m_s = located.trajectory.speed_m_s
         if wanted_m_s == 0.0:  # whatever path is planned meanwhile
-            return self._rest(view)
+            return self._rest(observation)
         lift_rad = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
         center_w = located.nodes_w.mean(axis=1)
-        wave = self._search.decide(view, center_w, wanted_m_s=wanted_m_s, near=self._has_near_obstacles())
+        wave = self._search.decide(observation, center_w, wanted_m_s=wanted_m_s, near=self._has_near_obstacles())
         if wave is not None:
-            return self._undulate(view, wave, lift_rad)
+            return self._undulate(observation, wave, lift_rad)
 
-        scale = self._set.push_scale * self._push_sign(view.time_s)
-        look_ahead_m = self._update_look_ahead(located, view.period_s)
+        scale = self.parameters.push_scale * self._push_sign(observation.time_s)
+        look_ahead_m = self._update_look_ahead(located, observation.period_s)
         if scale < 0:
             look_ahead_m = abs(look_ahead_m)  # a negative scale always pushes backward
         look_ahead_m = scale * look_ahead_m
         theta = self._angles_on_path(located, located.tail_s_m)
         theta_prime = (self._angles_on_path(located, located.tail_s_m + SLOPE_STEP_M) - theta) / SLOPE_STEP_M
-        push_torques_nm = scale * self._update_push_torques(view, located, theta_prime)
-        if self._can_be_soft(view.time_s) and not lift_rad.any():
-            return self._command_torques(view, located, theta, theta_prime, push_torques_nm)
+        push_torques_nm = scale * self._update_push_torques(observation, located, theta_prime)
+        if self._can_be_soft(observation.time_s) and not lift_rad.any():
+            return self._command_torques(observation, located, theta, theta_prime, push_torques_nm)
         reference = self._angles_on_path(located, located.tail_s_m + look_ahead_m)
         reference = reference + push_torques_nm / self._stiffness + lift_rad
         look_ahead_n = look_ahead_m * float(self._stiffness @ theta_prime**2)
-        return self._command_positions(view, located, reference, look_ahead_n)
+        return self._command_positions(observation, located, reference, look_ahead_n)
 
     def _angles_on_path(self, located: Located, tail_s_m: float) -> Floats:
         """Return theta(s): the angles of all joints, (n_joints,), with the tail at an arc length of the path."""
@@ -216,7 +213,7 @@ class ObstacleAided:
 
     def _push_sign(self, time_s: float) -> float:
         """Return the sign of the push at a time; random signs are the same in every run."""
-        interval_s = self._set.push_sign_s
+        interval_s = self.parameters.push_sign_s
         if interval_s == 0.0:
             return 1.0
         return float(RANDOM_SIGNS[int(time_s / interval_s) % len(RANDOM_SIGNS)])
@@ -225,29 +222,29 @@ class ObstacleAided:
 
     def _can_be_soft(self, time_s: float) -> bool:
         """Whether the joints can be in torque mode: obstacles have been able to balance a push for a while."""
-        if not self._has_torque_mode or self._set.shape_nm_per_rad <= 0.0:
+        if not self._has_torque_mode or self.parameters.shape_nm_per_rad <= 0.0:
             return False
         if self._snapshot is None or self._snapshot.push.rest > MAX_UNBALANCED_SOFT:
             self._unbalanced_at_s = time_s
         return time_s - self._unbalanced_at_s > SOFT_AFTER_S
 
     def _command_torques(
-        self, view: View, located: Located, theta: Floats, theta_prime: Floats, push_torques_nm: Floats
-    ) -> Action:
+        self, observation: Observation, located: Located, theta: Floats, theta_prime: Floats, push_torques_nm: Floats
+    ) -> ControllerCommand:
         """Command tau_push + tau_shape in torque mode.
 
         tau_shape = k (theta - q) + d (theta' v - q'), less its component along theta'. All arrays are (n_joints,).
         """
-        k = self._set.shape_nm_per_rad
-        d = self._set.shape_nm_s_per_rad
-        angle_error_rad = theta - np.array(view.joints.angle_rad)
-        velocity_error_rad_s = theta_prime * located.speed_m_s - np.array(view.joints.velocity_rad_s)
+        k = self.parameters.shape_nm_per_rad
+        d = self.parameters.shape_nm_s_per_rad
+        angle_error_rad = theta - np.array(observation.joints.angle_rad)
+        velocity_error_rad_s = theta_prime * located.speed_m_s - np.array(observation.joints.velocity_rad_s)
         shape_nm = k * angle_error_rad + d * velocity_error_rad_s
         slope = theta_prime[self._bends]
         along_n = float(slope @ shape_nm[self._bends])  # force of tau_shape along the path, by virtual work
         shape_nm = shape_nm - theta_prime * along_n / (slope @ slope + MIN_SLOPE_SQUARED_PER_M2)
 
-        setpoints = self._bumpless.follow(view, theta)
+        setpoints = self._bumpless.follow(observation, theta)
         self._bumpless.forget_reference()
         self._limit_look_ahead_integral()
         self._holding = False
@@ -255,40 +252,42 @@ class ObstacleAided:
             limit_nm = setpoints.torque_limit_nm[i]
             setpoints.mode[i] = Mode.TORQUE
             setpoints.target[i] = min(max(float(shape_nm[i] + push_torques_nm[i]), -limit_nm), limit_nm)
-        return Action(setpoints, self._make_report(view, located, 0.0, theta))
+        return ControllerCommand(setpoints, self._make_telemetry(observation, located, 0.0, theta))
 
-    def _command_positions(self, view: View, located: Located, reference: Floats, look_ahead_n: float) -> Action:
+    def _command_positions(
+        self, observation: Observation, located: Located, reference: Floats, look_ahead_n: float
+    ) -> ControllerCommand:
         """Command a reference in position mode; look_ahead_n: the force of its look-ahead."""
         restarted = located.restarted or self._holding or self._search.changed
         last_reference = self._bumpless.reference_rad
         if restarted and last_reference is not None and np.abs(reference - last_reference).max() > OTHER_SHAPE_RAD:
             self._limit_look_ahead_integral()
-        setpoints = self._bumpless.follow(view, reference, restarted=restarted)
+        setpoints = self._bumpless.follow(observation, reference, restarted=restarted)
         self._holding = False
-        return Action(setpoints, self._make_report(view, located, look_ahead_n, reference))
+        return ControllerCommand(setpoints, self._make_telemetry(observation, located, look_ahead_n, reference))
 
-    def _undulate(self, view: View, wave: LateralUndulation, lift_rad: Floats) -> Action:
+    def _undulate(self, observation: Observation, wave: LateralUndulation, lift_rad: Floats) -> ControllerCommand:
         """Move by a wave, in search of obstacles to push off."""
         self._stop_pushing()
-        reference = wave.reference_rad(view, view.period_s) + lift_rad
-        setpoints = self._bumpless.follow(view, reference, restarted=self._search.changed)
+        reference = wave.reference_rad(observation, observation.period_s) + lift_rad
+        setpoints = self._bumpless.follow(observation, reference, restarted=self._search.changed)
         why = "it does not come on: it moves by a wave, in search of contacts"
-        return Action(setpoints, Report(why=why, reference_rad=reference.tolist()))
+        return ControllerCommand(setpoints, Telemetry(reason=why, reference_rad=reference.tolist()))
 
-    def _rest(self, view: View) -> Action:
+    def _rest(self, observation: Observation) -> ControllerCommand:
         """Keep every joint where it is, without a push: the wanted speed is 0."""
         self._stop_pushing()
         self._look_ahead_integral_m = 0.0
-        self._moved_at_s = view.time_s
+        self._moved_at_s = observation.time_s
         self._search.stop()
         if self._holding or self._bumpless.reference_rad is None:
-            action = self._bumpless.hold(view, "")
+            command = self._bumpless.hold(observation, "")
         else:
-            reference = np.array(view.joints.angle_rad)
-            setpoints = self._bumpless.follow(view, reference, restarted=True)
-            action = Action(setpoints, Report(reference_rad=reference.tolist()))
+            reference = np.array(observation.joints.angle_rad)
+            setpoints = self._bumpless.follow(observation, reference, restarted=True)
+            command = ControllerCommand(setpoints, Telemetry(reference_rad=reference.tolist()))
         self._holding = True
-        return action
+        return command
 
     def _stop_pushing(self) -> None:
         self._torques_nm[:] = 0.0
@@ -299,51 +298,51 @@ class ObstacleAided:
 
     def _update_look_ahead(self, located: Located, period_s: float) -> float:
         """Return the look-ahead l = speed_kp e + integral_per_s integral e dt in m; both are bounded."""
-        max_m = self._set.max_look_ahead_m
+        max_m = self.parameters.max_look_ahead_m
         error_m_s = located.trajectory.speed_m_s - located.speed_m_s
-        self._look_ahead_integral_m += self._set.integral_per_s * error_m_s * period_s
+        self._look_ahead_integral_m += self.parameters.integral_per_s * error_m_s * period_s
         self._look_ahead_integral_m = min(max(self._look_ahead_integral_m, -max_m), max_m)
-        return min(max(self._look_ahead_integral_m + self._set.speed_kp_s * error_m_s, -max_m), max_m)
+        return min(max(self._look_ahead_integral_m + self.parameters.speed_kp_s * error_m_s, -max_m), max_m)
 
     def _limit_look_ahead_integral(self) -> None:
-        self._look_ahead_integral_m = min(self._look_ahead_integral_m, self._set.fresh_look_ahead_m)
+        self._look_ahead_integral_m = min(self._look_ahead_integral_m, self.parameters.fresh_look_ahead_m)
 
-    def _update_push_torques(self, view: View, located: Located, theta_prime: Floats) -> Floats:
+    def _update_push_torques(self, observation: Observation, located: Located, theta_prime: Floats) -> Floats:
         """Return tau_push: the joint torques, (n_joints,), of the force F = lag_kp integral e dt + speed_kp e."""
-        config = self._set
+        parameters = self.parameters
         wanted_m_s = located.trajectory.speed_m_s
-        if wanted_m_s <= 0.0 or config.max_push_n == 0.0:
+        if wanted_m_s <= 0.0 or parameters.max_push_n == 0.0:
             self._push_integral_n = 0.0
             self._force_n = 0.0
             self._snapshot = None
-            return np.zeros(len(self._robot.joints))
+            return np.zeros(len(self.robot.joints))
         error_m_s = wanted_m_s - located.speed_m_s
         gain = 1.0
         if abs(located.speed_m_s) < CREEP_SPEED_M_S:
             gain = CREEP_GAIN
-        self._push_integral_n += gain * config.lag_kp_n_per_m * error_m_s * view.period_s
-        self._push_integral_n = min(max(self._push_integral_n, 0.0), config.max_push_n)
-        force_n = self._push_integral_n + config.speed_kp_n_s_per_m * error_m_s
-        force_n = min(max(force_n, 0.0), config.max_push_n)
+        self._push_integral_n += gain * parameters.lag_kp_n_per_m * error_m_s * observation.period_s
+        self._push_integral_n = min(max(self._push_integral_n, 0.0), parameters.max_push_n)
+        force_n = self._push_integral_n + parameters.speed_kp_n_s_per_m * error_m_s
+        force_n = min(max(force_n, 0.0), parameters.max_push_n)
         if located.fresh:
-            self._update_contacts(view.time_s, located, theta_prime)
+            self._update_contacts(observation.time_s, located, theta_prime)
         # Anti-windup: a body that cannot push does not store force for later.
         self._push_integral_n = min(self._push_integral_n, self._max_force_n)
         self._force_n = min(force_n, self._max_force_n)
-        keep = np.exp(-view.period_s / config.torque_filter_s)
+        keep = np.exp(-observation.period_s / parameters.torque_filter_s)
         self._torques_nm = keep * self._torques_nm + (1 - keep) * self._force_n * self._unit_torques_nm
-        return np.clip(self._torques_nm, -config.max_torque_nm, config.max_torque_nm)
+        return np.clip(self._torques_nm, -parameters.max_torque_nm, parameters.max_torque_nm)
 
     def _update_contacts(self, time_s: float, located: Located, theta_prime: Floats) -> None:
         """Find the contacts of a new world model, the push that they allow, and its largest force."""
-        config = self._set
+        parameters = self.parameters
         obstacles = located.world.obstacles
         nodes_w = self._predict_nodes(located)
         touches = find_touches(
             nodes_w,
             self._body.radius_m,
             Outlines.from_obstacles(obstacles),
-            reach_m=config.reach_m,
+            reach_m=parameters.reach_m,
             friction=located.trajectory.peg_friction,
         )
         names = [obstacles[k].name for k in touches.obstacle.tolist()]
@@ -351,19 +350,19 @@ class ObstacleAided:
             nodes_w,
             touches,
             theta_prime[self._bends],
-            contact_gap_scale_m=config.contact_gap_scale_m,
+            contact_gap_scale_m=parameters.contact_gap_scale_m,
             extra_cost=self._no_contact_costs(names),
         )
         push = self._push_filter.update(time_s, push, names)
         self._snapshot = PushSnapshot(located.world, touches, push)
-        self._unit_torques_nm = np.zeros(len(self._robot.joints))
+        self._unit_torques_nm = np.zeros(len(self.robot.joints))
         self._max_force_n = 0.0
         max_lambda = float(push.lambdas.max(initial=0.0))
         # Without any lambda there is no push: a body bent into a U has hardly any drag, and needs none.
         if push.rest < MAX_UNBALANCED and max_lambda > 0.0:
             self._unit_torques_nm[self._bends] = push.torques_nm
             max_unit_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-            self._max_force_n = min(config.max_torque_nm / max_unit_nm, config.max_contact_n / max_lambda)
+            self._max_force_n = min(parameters.max_torque_nm / max_unit_nm, parameters.max_contact_n / max_lambda)
 
     def _predict_nodes(self, located: Located) -> Floats:
         """Return the nodes of the body, (2, n_nodes), when the motors will act: moved on along the path."""
@@ -380,27 +379,29 @@ class ObstacleAided:
         if not forces_w:
             return 0.0
         forces_n = np.hypot(*np.array(forces_w).reshape(-1, 2).T)
-        return self._set.no_contact_cost * np.exp(-forces_n / CONTACT_FORCE_SCALE_N)
+        return self.parameters.no_contact_cost * np.exp(-forces_n / CONTACT_FORCE_SCALE_N)
 
     # --- reports -------------------------------------------------------------------------------------------------
 
-    def _make_report(self, view: View, located: Located, look_ahead_n: float, reference: Floats) -> Report:
+    def _make_telemetry(
+        self, observation: Observation, located: Located, look_ahead_n: float, reference: Floats
+    ) -> Telemetry:
         """Report the push, and why the body stands still, if it does; look_ahead_n: force of the look-ahead."""
         if abs(located.speed_m_s) > STANDSTILL_SPEED_M_S:
-            self._moved_at_s = view.time_s
-        stands_still = view.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
+            self._moved_at_s = observation.time_s
+        stands_still = observation.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
         points = self._report_push_points()
         jammed, reason = self._explain_standstill(located, points)
-        return Report(
-            why=reason if stands_still else "",
-            why_if_still=reason if view.time_s > STANDSTILL_S else "",
+        return Telemetry(
+            reason=reason if stands_still else "",
+            reason_if_stationary=reason if observation.time_s > STANDSTILL_S else "",
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + self._force_n,
             push_points=points,
             desired_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
             bending_torque_nm=self._torques_nm.tolist(),
             reference_rad=reference.tolist(),
-            torque_headroom_nm=self._set.max_torque_nm - float(np.abs(self._torques_nm).max()),
+            torque_headroom_nm=self.parameters.max_torque_nm - float(np.abs(self._torques_nm).max()),
             saturated=0.0 < self._max_force_n <= self._force_n,
             jammed=stands_still and jammed,
         )

@@ -13,49 +13,50 @@ from typing import Annotated
 
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.climb import Climb
-from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.progress import PathProgress, SpeedFilter
 from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, from_zero
+from snakesim_hal.wire.quantities import from_zero
 
 
-class PathFollowing:
+class PathFollowingParameters(FileStruct, frozen=True, kw_only=True):
+    """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
+
+    look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.03
+    """Maximum look-ahead of the shape along its path."""
+
+    blend_s: Blend = 0.3
+    speed_filter_s: SpeedFilter = 0.03
+
+
+class PathFollowing(Controller[PathFollowingParameters]):
     """Controls the shape of the body along a path. It does not use the positions of obstacles."""
 
-    class Settings(FileStruct, frozen=True, kw_only=True):
-        """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
+    Parameters = PathFollowingParameters
 
-        look_ahead_m: Annotated[
-            float,
-            from_zero(1, "m"),
-            about("how far ahead on its path the shape is at most"),
-        ] = 0.03
-        blend_s: Blend = 0.3
-        speed_filter_s: SpeedFilter = 0.03
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
-        self._set = settings
+    def __init__(self, robot: Description, parameters: PathFollowingParameters) -> None:
+        super().__init__(robot, parameters)
         self._body = PlanarBody(robot)
         self._climb = Climb(robot)
-        self._progress = PathProgress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._bumpless = BumplessReference(robot, settings.blend_s)
+        self._progress = PathProgress(self._body, speed_filter_s=parameters.speed_filter_s)
+        self._bumpless = BumplessReference(robot, parameters.blend_s)
         self._reference_s_m = 0.0  # s_ref
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Return the joint angles of the body slightly further along the path; hold if its position is unknown."""
-        located = self._progress.update(view)
+        located = self._progress.update(observation)
         if isinstance(located, str):
-            return self._bumpless.hold(view, located)
+            return self._bumpless.hold(observation, located)
         tail_s_m = located.tail_s_m
         if located.restarted:
             self._reference_s_m = tail_s_m
-        advanced_s_m = self._reference_s_m + located.trajectory.speed_m_s * view.period_s
-        self._reference_s_m = min(max(advanced_s_m, tail_s_m), tail_s_m + self._set.look_ahead_m)
+        advanced_s_m = self._reference_s_m + located.trajectory.speed_m_s * observation.period_s
+        self._reference_s_m = min(max(advanced_s_m, tail_s_m), tail_s_m + self.parameters.look_ahead_m)
 
         yaw_rad = self._body.all_angles(located.on_path.pose_at(self._reference_s_m))
         pitch_rad = self._climb.angles_rad(located.trajectory.rises, self._reference_s_m)
         reference_rad = yaw_rad + pitch_rad
-        setpoints = self._bumpless.follow(view, reference_rad, restarted=located.restarted)
-        return Action(setpoints, Report(path_s_m=tail_s_m, reference_rad=reference_rad.tolist()))
+        setpoints = self._bumpless.follow(observation, reference_rad, restarted=located.restarted)
+        return ControllerCommand(setpoints, Telemetry(path_s_m=tail_s_m, reference_rad=reference_rad.tolist()))

@@ -13,14 +13,13 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.observations import ObservationPart, Observer, make_parts, select_parts
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.model.files import SHIPPED, FileStruct, expand_home
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_hal.wire.quantities import about
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 RUNTIME: Any = None
@@ -98,23 +97,27 @@ def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts:
             raise metadata.make_error(OBSERVATIONS, ",".join(parts), allowed)
 
 
-class Policy:
+class PolicyParameters(FileStruct, frozen=True, kw_only=True):
+    """The model."""
+
+    model: Annotated[str, Meta(min_length=1, max_length=1024)]
+    """Name of a shipped model, or path of an ONNX file."""
+
+
+class Policy(Controller[PolicyParameters]):
     """Runs the model every `snakesim.frame_skip` ticks, and repeats its targets in between."""
 
-    NEEDS, SENSES = "joints", True
+    Parameters = PolicyParameters
+    needs_world = False
+    uses_sensors = True
 
-    class Settings(FileStruct, frozen=True, kw_only=True):
-        """The model."""
-
-        model: Annotated[str, Meta(min_length=1, max_length=1024), about("shipped name, or path of an ONNX file")]
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
+    def __init__(self, robot: Description, parameters: PolicyParameters) -> None:
         """Load the model. Raises ConfigError if it does not fit the robot."""
-        self._robot = robot
+        super().__init__(robot, parameters)
         self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
 
         # The model.
-        self._model = Model(robot, settings.model)
+        self._model = Model(robot, parameters.model)
         self._observer = Observer(robot, self._model.parts)
         self._mode = MODES[self._model.action]
 
@@ -125,43 +128,43 @@ class Policy:
         # Setpoints that hold the pose while a sensor is late; None while all sensors are fresh.
         self._hold_setpoints: RequestedSetpoints | None = None
 
-    @staticmethod
-    def check(robot: Description, settings: Settings) -> None:
+    @classmethod
+    def check(cls, robot: Description, parameters: PolicyParameters) -> None:
         """Check before a run that the model fits the robot. Raises ConfigError."""
-        Model(robot, settings.model)
+        Model(robot, parameters.model)
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Return the model's targets, or setpoints that hold the pose while a sensor that the model needs is late.
 
         The command limiter limits the targets.
         """
-        why_late = self._describe_late_sensors(view)
+        why_late = self._describe_late_sensors(observation)
         if why_late:
-            return self._hold(view, why_late)
+            return self._hold(observation, why_late)
         self._hold_setpoints = None
-        if self._target is None or view.tick - self._target_tick >= self._model.frame_skip:
-            self._target = self._model(self._observer.update(view))
-            self._target_tick = view.tick
+        if self._target is None or observation.tick - self._target_tick >= self._model.frame_skip:
+            self._target = self._model(self._observer.update(observation))
+            self._target_tick = observation.tick
         modes = [self._mode] * len(self._target)
         setpoints = RequestedSetpoints(modes, list(self._target), list(self._torque_limit_nm))
         reference: Sequence[float] = ()
         if self._mode is Mode.POSITION:
             reference = self._target
-        return Action(setpoints, Report(why="a policy moves the joints", reference_rad=reference))
+        return ControllerCommand(setpoints, Telemetry(reason="a policy moves the joints", reference_rad=reference))
 
-    def _describe_late_sensors(self, view: View) -> str:
+    def _describe_late_sensors(self, observation: Observation) -> str:
         """Return why samples that the model needs must not be used; empty when all are fresh."""
-        if view.senses is None:
+        if observation.sensor_samples is None:
             return ""
-        late = view.senses.late
+        late = observation.sensor_samples.late
         return "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys()))
 
-    def _hold(self, view: View, why: str) -> Action:
+    def _hold(self, observation: Observation, why: str) -> ControllerCommand:
         """Hold the pose that the robot had when the sensor became late."""
         if self._hold_setpoints is None:
-            self._hold_setpoints = positions(self._robot, view.joints.angle_rad)
+            self._hold_setpoints = positions(self.robot, observation.joints.angle_rad)
         self._target = None
-        return Action(self._hold_setpoints, Report(why=why))
+        return ControllerCommand(self._hold_setpoints, Telemetry(reason=why))
 
 
 class _Metadata:
@@ -184,7 +187,9 @@ class _Metadata:
         try:
             return select_parts(robot, names)
         except ConfigError as error:
-            raise ConfigError(f"{self._file}: metadata `{OBSERVATIONS}` is {shorten(text)!r}: {error}") from None
+            raise ConfigError(
+                f"{self._file}: metadata `{OBSERVATIONS}` is {shorten(text)!r}: {error}", code="policy/invalid"
+            ) from None
 
     def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
         """Return a text that is one of the choices."""
@@ -213,13 +218,16 @@ class _Metadata:
 
     def make_error(self, field: str, value: object, allowed: str) -> ConfigError:
         """Return an error that names the file, the field, its value and what is allowed."""
-        return ConfigError(f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}")
+        return ConfigError(
+            f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}", code="policy/invalid"
+        )
 
     def _read_text(self, field: str, allowed: str) -> str:
         if field not in self._properties:
             available = ", ".join(sorted(self._properties)) or "no metadata"
             raise ConfigError(
-                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {shorten(available, 200)}"
+                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {shorten(available, 200)}",
+                code="policy/invalid",
             )
         return self._properties[field]
 
@@ -236,7 +244,8 @@ def _find_model_file(name: str) -> Path:
     if name not in shipped:
         raise ConfigError(
             f"no policy called {shorten(name)!r}; {suggest_word(name, shipped)}shipped are {', '.join(shipped)}. For a "
-            f"file of your own give its path, such as ./{shorten(name)}{SUFFIX}"
+            f"file of your own give its path, such as ./{shorten(name)}{SUFFIX}",
+            code="config/unknown-name",
         )
     return POLICIES / f"{name}{SUFFIX}"
 
@@ -255,7 +264,7 @@ def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     """
     data = read_bytes(_find_model_file(file))
     if RUNTIME is None:
-        raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}")
+        raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}", code="extra/not-installed")
     options = RUNTIME.SessionOptions()
     # One thread adds in the same order on every computer, so that results are equal to the bit.
     options.intra_op_num_threads = 1
@@ -264,7 +273,9 @@ def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     try:
         session = RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many classes that share no base class
-        raise ConfigError(f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}") from error
+        raise ConfigError(
+            f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}", code="policy/invalid"
+        ) from error
     return session, session.get_modelmeta().custom_metadata_map
 
 
@@ -287,7 +298,8 @@ def _check_tensor(kind: str, tensors: Sequence[Any], width: int, meaning: str, f
     available = shorten("; ".join(descriptions) or "none", 200)
     raise ConfigError(
         f"{shorten(file)}: {kind} is {available}, must be one tensor(float), that is float32, of shape (1, {width}): "
-        f"{meaning}"
+        f"{meaning}",
+        code="policy/invalid",
     )
 
 

@@ -9,17 +9,15 @@ from typing import Annotated
 
 import numpy as np
 
-from snakesim_gnc.control.controller import View
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import Observation
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Trajectory, World
-from snakesim_hal.wire.quantities import about, from_zero
+from snakesim_hal.wire.quantities import from_zero
 
-SpeedFilter = Annotated[
-    float, from_zero(1, "s"), about("time constant of the filter of the speed along the path; 0: none")
-]
+SpeedFilter = Annotated[float, from_zero(1, "s")]
 RELOCALIZE_STEPS = 8  # iterations for a body that may have slid while its position was unknown
 
 
@@ -74,11 +72,11 @@ class PathProgress:
         self._s_m = 0.0
         self._speed_m_s = 0.0
 
-    def update(self, view: View) -> Located | str:
+    def update(self, observation: Observation) -> Located | str:
         """Return the position of the body at this tick, or why it is unknown. Call it in every tick."""
-        self._angles.add(view.joints.timestamp_ns, view.joints.angle_rad)
-        world = view.world
-        trajectory = view.trajectory
+        self._angles.add(observation.joints.timestamp_ns, observation.joints.angle_rad)
+        world = observation.world
+        trajectory = observation.trajectory
         if world is None:
             self._measured_ns = None
             return "no world model"
@@ -94,8 +92,8 @@ class PathProgress:
             self._path_id = trajectory.path_id
 
         last_measured_ns = self._measured_ns
-        measured_ns = self._measure(body, world, view, is_new_path=is_new_path)
-        elapsed_s = _seconds(view.joints.timestamp_ns - measured_ns, view)
+        measured_ns = self._measure(body, world, observation, is_new_path=is_new_path)
+        elapsed_s = _seconds(observation.joints.timestamp_ns - measured_ns, observation)
         is_new_world = world.tick != self._world_tick
         self._world_tick = world.tick
         return Located(
@@ -110,7 +108,7 @@ class PathProgress:
             trajectory=trajectory,
         )
 
-    def _measure(self, body: BodyOnPath, world: World, view: View, *, is_new_path: bool) -> int:
+    def _measure(self, body: BodyOnPath, world: World, observation: Observation, *, is_new_path: bool) -> int:
         """Localize the body if the path or the pose is new. Return the instant of the newest pose in ns."""
         last_ns = self._measured_ns
         pose_ns = pose_instant_ns(world)
@@ -128,7 +126,7 @@ class PathProgress:
             self._s_m = body.refine_tail_s_m(self._nodes, self._s_m, steps=RELOCALIZE_STEPS)
             self._speed_m_s = 0.0
         elif pose_ns > last_ns:
-            self._filter(body, max(_seconds(pose_ns - last_ns, view), view.period_s))
+            self._filter(body, max(_seconds(pose_ns - last_ns, observation), observation.period_s))
         return measured_ns
 
     def _filter(self, body: BodyOnPath, dt_s: float) -> None:
@@ -150,6 +148,6 @@ class PathProgress:
         self._speed_m_s += (1 - k) ** 2 * residual_m / dt_s
 
 
-def _seconds(elapsed_ns: int, view: View) -> float:
+def _seconds(elapsed_ns: int, observation: Observation) -> float:
     """Convert a time to seconds as a multiple of the period, which gives the same bits on every machine."""
-    return elapsed_ns / round(view.period_s * 1e9) * view.period_s
+    return elapsed_ns / round(observation.period_s * 1e9) * observation.period_s

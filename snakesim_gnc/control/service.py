@@ -8,14 +8,14 @@ this process at once.
 import time
 from collections.abc import Sequence
 
-from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.freshness import AgeLimits
 from snakesim_gnc.control.guarded import GuardedController
-from snakesim_gnc.control.live_settings import LiveSettings
+from snakesim_gnc.control.live_parameters import LiveParameters
 from snakesim_gnc.control.state_reports import StateReports
 from snakesim_gnc.control.update_times import UpdateTimes
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.base.terminal import print_stderr
+from snakesim_hal.controller import Observation, SensorSamples, Task
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.programs.preflight import describe_missing_capability
@@ -47,10 +47,10 @@ class Control(Service):
     urgent = True
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Find the controller, check its settings, and subscribe to its inputs."""
+        """Find the controller, check its parameters, and subscribe to its inputs."""
         self._client = client
         self._config = config
-        self._settings = LiveSettings(client, config)
+        self._parameters = LiveParameters(client, config)
 
         # Inputs of every controller.
         self._joints = client.subscribe(keys.JOINTS, JointState)
@@ -63,8 +63,8 @@ class Control(Service):
         self._task: Task | None = None  # None: the controller does not ask for samples
         self._sensor_feeds: dict[str, Feed[Message]] = {}
         self._sensor_samples: dict[str, Message] = {}  # the newest of each key
-        if self._settings.asks_for_senses:
-            self._task = Task.of(config)
+        if self._parameters.uses_sensors:
+            self._task = Task.from_config(config)
             self._subscribe_to_sensors()
 
         # The arm session of the present controller.
@@ -84,10 +84,10 @@ class Control(Service):
 
     def configure(self, robot: Description) -> None:
         """Prepare to command this robot. Raises ControllerError if the robot lacks what the controller needs."""
-        missing = describe_missing_capability(robot.joints, self._settings.plugin, self._config.controller)
+        missing = describe_missing_capability(robot.joints, self._parameters.controller_class, self._config.controller)
         if missing is not None:
             raise ControllerError(f"robot {robot.robot!r}: {missing}")
-        self._settings.configure(robot)
+        self._parameters.configure(robot)
         self._commander = Commander(self._client, robot)
         self._age_limits = AgeLimits.from_config(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
@@ -103,7 +103,7 @@ class Control(Service):
         """
         self._last_clock = clock
         self._statuses.drain()  # `silence` considers only a status that is newer than the last clock
-        self._apply_new_settings(clock)
+        self._apply_new_parameters(clock)
         joints = self._client.read(self._joints)
         if joints is None:
             return None
@@ -125,8 +125,8 @@ class Control(Service):
         return self._run_controller(clock, joints)
 
     def pause(self, clock: Clock) -> None:
-        """Answer requests for other settings while time is paused; they take effect in the next tick."""
-        self._apply_new_settings(clock)
+        """Answer requests for other parameters while time is paused; they take effect in the next tick."""
+        self._apply_new_parameters(clock)
 
     def silence(self) -> Outputs:
         """Report why no clock arrives: time is paused, or the HAL is silent altogether, which is PowerOff.
@@ -145,9 +145,9 @@ class Control(Service):
         is_armed = status.lifecycle == "armed"
         return _state_messages(self._reports.make_state(clock, armed=is_armed, paused=f"time stands: {why_paused}"))
 
-    def _apply_new_settings(self, clock: Clock) -> None:
-        """Answer requests for other settings. If the settings have changed, the controller is constructed again."""
-        if self._settings.answer_requests(clock):
+    def _apply_new_parameters(self, clock: Clock) -> None:
+        """Answer requests for other parameters. If the parameters have changed, the controller is constructed again."""
+        if self._parameters.answer_requests(clock):
             self._controller = None
 
     def _run_controller(self, clock: Clock, joints: JointState) -> Outputs:
@@ -157,26 +157,26 @@ class Control(Service):
             ControllerError: the controller has failed; its last state has been published.
         """
         world, trajectory, missing = self._read_fresh_plan(clock)
-        senses = self._read_senses(clock)
+        sensor_samples = self._read_sensor_samples(clock)
         try:
             controller = self._prepare_controller(clock)
-            view = View(
+            observation = Observation(
                 tick=clock.tick,
                 time_s=(clock.timestamp_ns - self._armed_at_ns) * 1e-9,
                 period_s=clock.period_ns * 1e-9,
                 joints=joints,
                 world=world,
                 trajectory=trajectory,
-                senses=senses,
+                sensor_samples=sensor_samples,
             )
             started_s = time.perf_counter()
-            action = controller.update(view)
+            command = controller.update(observation)
             duration_s = time.perf_counter() - started_s
             self._count_update(clock, duration_s)
-            self._commander.send(clock, joints, action.setpoints)
+            self._commander.send(clock, joints, command.setpoints)
             rests = _explain_rest(trajectory)
             try:
-                state = self._reports.make_state(clock, action.report, armed=True, missing=missing, rests=rests)
+                state = self._reports.make_state(clock, command.telemetry, armed=True, missing=missing, rests=rests)
             except ValueError as error:
                 raise controller.make_error(str(error)) from None
         except ControllerError as error:
@@ -204,7 +204,7 @@ class Control(Service):
             self._reports.add_world(world)
         return world, trajectory, "; ".join(late)
 
-    def _read_senses(self, clock: Clock) -> Senses | None:
+    def _read_sensor_samples(self, clock: Clock) -> SensorSamples | None:
         """Return the newest sensor samples, and which are too old; None for a controller that does not ask for them."""
         if self._task is None:
             return None
@@ -214,13 +214,13 @@ class Control(Service):
                 self._sensor_samples[key] = sample
         timestamps_ns = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensor_samples.items()}
         late = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
-        return Senses(dict(self._sensor_samples), late, self._task)
+        return SensorSamples(dict(self._sensor_samples), late, self._task)
 
     def _prepare_controller(self, clock: Clock) -> GuardedController:
-        """Return the controller of this arm session, which is new after an arming and after a change of settings."""
+        """Return the controller of this arm session, which is new after an arming and after a change of parameters."""
         is_new_session = clock.arm_session != self._arm_session
         if self._controller is None or is_new_session:
-            self._controller = self._settings.construct_controller()
+            self._controller = self._parameters.construct_controller()
             if is_new_session:
                 self._arm_session = clock.arm_session
                 self._armed_at_ns = clock.timestamp_ns

@@ -4,8 +4,8 @@ import msgspec
 
 from snakesim_gnc.control.advance import RecentAdvance
 from snakesim_gnc.control.contact_forces import MeasuredContacts
-from snakesim_gnc.control.controller import Report
 from snakesim_gnc.control.states import locomotion_state
+from snakesim_hal.controller import Telemetry
 from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
 from snakesim_hal.wire.outgoing import find_wrong_value
 
@@ -49,7 +49,7 @@ class StateReports:
     def make_state(
         self,
         clock: Clock,
-        report: Report | None = None,
+        telemetry: Telemetry | None = None,
         *,
         silent: str = "",
         paused: str = "",
@@ -61,7 +61,7 @@ class StateReports:
 
         Args:
             clock: the last clock.
-            report: the controller's report; None if the controller was not called.
+            telemetry: the controller's telemetry; None if the controller was not called.
             silent: why neither clock nor status arrives; see `locomotion_state`.
             paused: why no clock arrives. If `silent` or `paused` is given, the message is always due, because robot
                 time does not advance.
@@ -73,18 +73,18 @@ class StateReports:
             None if nothing has changed and the last message is recent.
 
         Raises:
-            ValueError: the report contains an invalid value.
+            ValueError: the telemetry contains an invalid value.
         """
-        if report is None:
-            report = Report()
+        if telemetry is None:
+            telemetry = Telemetry()
         state, reason = locomotion_state(
             silent=silent,
             armed=armed,
             missing=missing or paused,
             rests=rests,
-            usable_push_points=report.usable_push_points,
-            obstacle=report.why,
-            still=report.why_if_still,
+            usable_push_points=telemetry.usable_push_points,
+            obstacle=telemetry.reason,
+            still=telemetry.reason_if_stationary,
             advanced_m=self._advance.distance_m,
         )
         # A change of any of these is published at once.
@@ -92,8 +92,8 @@ class StateReports:
             state,
             bool(missing),
             rests,
-            report.propulsion_joint,
-            report.jammed,
+            telemetry.propulsion_joint,
+            telemetry.jammed,
             clock.lifecycle,
             clock.arm_session,
             bool(self.too_slow),
@@ -103,42 +103,42 @@ class StateReports:
             return None
         self._last_summary = summary
         self._next_ns = clock.timestamp_ns + round(TELEMETRY_S * 1e9)
-        return self._make_message(clock, state, reason, report)
+        return self._make_message(clock, state, reason, telemetry)
 
     def make_failure(self, clock: Clock, why: str) -> ControlState:
         """Return the last message of a controller that has failed."""
-        message = self._make_message(clock, "NotLocomoting", why, Report())
+        message = self._make_message(clock, "NotLocomoting", why, Telemetry())
         return msgspec.structs.replace(message, failed=True)
 
-    def _make_message(self, clock: Clock, state: LocomotionState, reason: str, report: Report) -> ControlState:
-        """Return a message that a receiver accepts. Raises ValueError for an invalid value in the report."""
+    def _make_message(self, clock: Clock, state: LocomotionState, reason: str, telemetry: Telemetry) -> ControlState:
+        """Return a message that a receiver accepts. Raises ValueError for an invalid value in the telemetry."""
         joint_name = None
-        if report.propulsion_joint is not None:
-            joint_name = self._joints[report.propulsion_joint]
-        obstacles = [point.obstacle for point in report.push_points]
+        if telemetry.propulsion_joint is not None:
+            joint_name = self._joints[telemetry.propulsion_joint]
+        obstacles = [point.obstacle for point in telemetry.push_points]
         message = ControlState(
             tick=clock.tick,
             timestamp_ns=clock.timestamp_ns,
             controller=self._controller,
             state=state,
             reason=reason[:MAX_REASON],
-            path_s_m=report.path_s_m,
+            path_s_m=telemetry.path_s_m,
             propulsion_joint=joint_name,
-            propulsion_n=report.propulsion_n,
-            push_points=report.push_points,  # pyright: ignore[reportArgumentType] - any sequence can be sent
-            desired_force_n=report.desired_force_n,  # pyright: ignore[reportArgumentType]
+            propulsion_n=telemetry.propulsion_n,
+            push_points=telemetry.push_points,  # pyright: ignore[reportArgumentType] - any sequence can be sent
+            desired_force_n=telemetry.desired_force_n,  # pyright: ignore[reportArgumentType]
             measured_force_n=self._measured_contacts.mean_sizes_n(obstacles),
-            propulsion_torque_nm=report.propulsion_torque_nm,
-            bending_torque_nm=report.bending_torque_nm,  # pyright: ignore[reportArgumentType]
-            reference_rad=report.reference_rad,  # pyright: ignore[reportArgumentType]
-            condition=report.condition,
-            torque_headroom_nm=report.torque_headroom_nm,
-            saturated=report.saturated,
-            jammed=report.jammed,
+            propulsion_torque_nm=telemetry.propulsion_torque_nm,
+            bending_torque_nm=telemetry.bending_torque_nm,  # pyright: ignore[reportArgumentType]
+            reference_rad=telemetry.reference_rad,  # pyright: ignore[reportArgumentType]
+            condition=telemetry.condition,
+            torque_headroom_nm=telemetry.torque_headroom_nm,
+            saturated=telemetry.saturated,
+            jammed=telemetry.jammed,
             too_slow=self.too_slow,
         )
         try:
             # Encoded and decoded, because a Struct checks its fields only when it is decoded.
             return self._decoder.decode(msgspec.msgpack.encode(message))
         except (TypeError, msgspec.ValidationError) as error:
-            raise ValueError(find_wrong_value(message, "Report") or str(error)) from None
+            raise ValueError(find_wrong_value(message, "Telemetry") or str(error)) from None

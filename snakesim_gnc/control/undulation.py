@@ -13,21 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
-from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_gnc.control.standstill import Standstill
 from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, motion_wanted
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import about, above, bounded, from_zero
+from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 AIM_DISTANCE_M = 1.0  # how far ahead on the path the head steers for
 JAMMED_M = 0.02  # a body that moves less than this within `jam_after_s` is jammed
 
-Steering = Annotated[
-    float,
-    from_zero(2, "1"),
-    about("bend of all joints for each radian that the path leads aside; 0: no steering"),
-]
+Steering = Annotated[float, from_zero(2, "1")]
 
 
 def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float:
@@ -44,72 +40,80 @@ def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float
     return math.atan2(aim_w[1], aim_w[0]) - math.atan2(along_w[1], along_w[0])
 
 
-class LateralUndulation:
+class LateralUndulationParameters(FileStruct, frozen=True, kw_only=True):
+    """Parameters of the wave, and how much it bends towards the path."""
+
+    amplitude_rad: Annotated[float, from_zero(2, "rad")] = 0.5
+    """Amplitude of every joint."""
+
+    period_s: Annotated[float, above(100, "s")] = 2.0
+    """Period of the wave."""
+
+    lag_rad: Annotated[float, bounded(-3.2, 3.2, "rad")] = 0.9
+    """Phase of a joint behind the one ahead of it; negative: the wave travels to the head."""
+
+    steering: Steering = 0.0
+    blend_s: Blend = 1.0
+
+
+class LateralUndulation(Controller[LateralUndulationParameters]):
     """A wave of the yaw joints: theta_n = A sin(phi - n lag) + bend, with n = 0 at the head.
 
     The phase phi grows by 2 pi in each period.
     """
 
-    class Settings(FileStruct, frozen=True, kw_only=True):
-        """Parameters of the wave, and how much it bends towards the path."""
+    Parameters = LateralUndulationParameters
 
-        amplitude_rad: Annotated[float, from_zero(2, "rad"), about("swing of every joint to each side")] = 0.5
-        period_s: Annotated[float, above(100, "s"), about("period of the wave")] = 2.0
-        lag_rad: Annotated[
-            float,
-            bounded(-3.2, 3.2, "rad"),
-            about("phase of a joint behind the one ahead of it; below 0 the wave travels to the head"),
-        ] = 0.9
-        steering: Steering = 0.0
-        blend_s: Blend = 1.0
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot = robot
-        self._set = settings
+    def __init__(self, robot: Description, parameters: LateralUndulationParameters) -> None:
+        super().__init__(robot, parameters)
         self._body = PlanarBody(robot)
-        self._bumpless = BumplessReference(robot, settings.blend_s)
+        self._bumpless = BumplessReference(robot, parameters.blend_s)
         self._phase_rad = 0.0
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Advance the wave while there is a path to move along, and keep its phase otherwise."""
         passed_s = 0.0
-        if motion_wanted(view):
-            passed_s = view.period_s
-        reference = self.reference_rad(view, passed_s)
-        setpoints = self._bumpless.follow(view, reference)
-        return Action(setpoints, Report(reference_rad=reference.tolist()))
+        if motion_wanted(observation):
+            passed_s = observation.period_s
+        reference = self.reference_rad(observation, passed_s)
+        setpoints = self._bumpless.follow(observation, reference)
+        return ControllerCommand(setpoints, Telemetry(reference_rad=reference.tolist()))
 
     def start_from(self, angles_rad: NDArray[np.float64]) -> None:
         """Choose the phase at which the wave is most similar to a shape, (n_joints,) rad."""
-        lags_rad = self._set.lag_rad * np.arange(len(self._body.bends))[::-1]
+        lags_rad = self.parameters.lag_rad * np.arange(len(self._body.bends))[::-1]
         correlation = angles_rad[self._body.bends] @ np.exp(1j * lags_rad)
         self._phase_rad = float(np.angle(1j * correlation))
 
-    def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
+    def reference_rad(self, observation: Observation, passed_s: float) -> NDArray[np.float64]:
         """Return the angles of all joints, (n_joints,), `passed_s` later than in the last call."""
-        self._phase_rad += math.tau * passed_s / self._set.period_s
+        self._phase_rad += math.tau * passed_s / self.parameters.period_s
         n = np.arange(len(self._body.bends))[::-1]  # 0 at the head
-        waves = np.sin(self._phase_rad - self._set.lag_rad * n)
-        reference = np.zeros(len(self._robot.joints))
-        reference[self._body.bends] = self._amplitude_rad(view, waves, passed_s) * waves + self._bend_rad(view)
+        waves = np.sin(self._phase_rad - self.parameters.lag_rad * n)
+        reference = np.zeros(len(self.robot.joints))
+        reference[self._body.bends] = self._amplitude_rad(observation, waves, passed_s) * waves + self._bend_rad(
+            observation
+        )
         return reference
 
-    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> float | NDArray[np.float64]:
+    def _amplitude_rad(
+        self, _observation: Observation, _waves: NDArray[np.float64], _passed_s: float
+    ) -> float | NDArray[np.float64]:
         """Return the amplitude of all joints, or of each joint that bends, (n_bends,)."""
-        return self._set.amplitude_rad
+        return self.parameters.amplitude_rad
 
-    def _bend_rad(self, view: View) -> float | NDArray[np.float64]:
+    def _bend_rad(self, observation: Observation) -> float | NDArray[np.float64]:
         """Return the bend of every joint that turns the body towards the path ahead.
 
         A body that moves by a wave towards the head turns against its bend, so the bend has the sign of the lag.
         """
-        if self._set.steering == 0.0 or view.world is None or view.trajectory is None:
+        if self.parameters.steering == 0.0 or observation.world is None or observation.trajectory is None:
             return 0.0
-        nodes_w = self._body.nodes_w(view.world, view.joints.angle_rad).T
+        nodes_w = self._body.nodes_w(observation.world, observation.joints.angle_rad).T
         head_w = nodes_w[-1]
-        aim_w = _find_aim(np.array(view.trajectory.path_w), head_w)
+        aim_w = _find_aim(np.array(observation.trajectory.path_w), head_w)
         angle_rad = math.remainder(aside_rad(nodes_w, aim_w - head_w), math.tau)
-        return math.copysign(self._set.steering, self._set.lag_rad) * angle_rad / len(self._body.bends)
+        return math.copysign(self.parameters.steering, self.parameters.lag_rad) * angle_rad / len(self._body.bends)
 
 
 def _find_aim(path_w: NDArray[np.float64], head_w: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,13 +125,32 @@ def _find_aim(path_w: NDArray[np.float64], head_w: NDArray[np.float64]) -> NDArr
     return ahead_w[min(aim, len(ahead_w) - 1)]
 
 
+class HeadSteeredUndulationParameters(LateralUndulationParameters, frozen=True, kw_only=True):
+    """Parameters of lateral undulation, with steering."""
+
+    steering: Steering = 0.8
+
+
 class HeadSteeredUndulation(LateralUndulation):
     """A wave that bends the body towards the path ahead."""
 
-    class Settings(LateralUndulation.Settings, frozen=True, kw_only=True):
-        """Parameters of lateral undulation, with steering."""
+    Parameters = HeadSteeredUndulationParameters
 
-        steering: Steering = 0.8
+
+class CompliantUndulationParameters(HeadSteeredUndulationParameters, frozen=True, kw_only=True):
+    """Parameters of head-steered undulation, with a softness."""
+
+    softness_rad_per_nm: Annotated[float, from_zero(10, "rad/(N*m)")] = 0.05
+    """Change of the amplitude for the torque that obstacles put on the wave."""
+
+    yield_s: Annotated[float, above(10, "s")] = 0.2
+    """Time constant with which the amplitude yields."""
+
+    jam_after_s: Annotated[float, from_zero(1000, "s")] = 0.0
+    """Time with less than 2 cm of advance after which the wave travels the other way; 0: never."""
+
+    back_s: Annotated[float, above(1000, "s")] = 1.0
+    """Time for which the wave then travels the other way."""
 
 
 class CompliantUndulation(HeadSteeredUndulation):
@@ -139,60 +162,45 @@ class CompliantUndulation(HeadSteeredUndulation):
     Source: body-shape compliance, Travers et al. 2018.
     """
 
-    MEASURES = ("torque",)
+    Parameters = CompliantUndulationParameters
+    required_measurements = ("torque",)
 
-    class Settings(HeadSteeredUndulation.Settings, frozen=True, kw_only=True):
-        """Parameters of head-steered undulation, with a softness."""
-
-        softness_rad_per_nm: Annotated[
-            float,
-            from_zero(10, "rad/(N*m)"),
-            about("how far the amplitude yields to the torque that obstacles put on the wave"),
-        ] = 0.05
-        yield_s: Annotated[float, above(10, "s"), about("time constant with which the amplitude yields")] = 0.2
-        jam_after_s: Annotated[
-            float,
-            from_zero(1000, "s"),
-            about("after so long with less than 2 cm of advance the wave travels the other way; 0: never"),
-        ] = 0.0
-        back_s: Annotated[float, above(1000, "s"), about("how long the wave then travels the other way")] = 1.0
-
-    def __init__(self, robot: Description, settings: Settings) -> None:
-        super().__init__(robot, settings)
-        self._yielded_amplitude_rad = settings.amplitude_rad
+    def __init__(self, robot: Description, parameters: CompliantUndulationParameters) -> None:
+        super().__init__(robot, parameters)
+        self._yielded_amplitude_rad = parameters.amplitude_rad
         # Resolving jams; None: never.
         self._standstill: Standstill | None = None
-        if settings.jam_after_s > 0.0:
-            self._standstill = Standstill(settings.jam_after_s)
-        self._reverse_s = settings.back_s
+        if parameters.jam_after_s > 0.0:
+            self._standstill = Standstill(parameters.jam_after_s)
+        self._reverse_s = parameters.back_s
         self._reverse_until_s = -math.inf
 
-    def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
+    def reference_rad(self, observation: Observation, passed_s: float) -> NDArray[np.float64]:
         """Return the angles of all joints, (n_joints,), later than in the last call, or earlier during a jam."""
-        if passed_s > 0.0 and self._is_reversing(view, passed_s):
+        if passed_s > 0.0 and self._is_reversing(observation, passed_s):
             passed_s = -passed_s
-        return super().reference_rad(view, passed_s)
+        return super().reference_rad(observation, passed_s)
 
-    def _is_reversing(self, view: View, passed_s: float) -> bool:
+    def _is_reversing(self, observation: Observation, passed_s: float) -> bool:
         """Whether the wave travels the other way at this tick; a jam that is detected starts it at the next tick."""
-        if self._standstill is None or view.world is None:
+        if self._standstill is None or observation.world is None:
             return False
-        if view.time_s < self._reverse_until_s:
+        if observation.time_s < self._reverse_until_s:
             return True
-        center_w = self._body.nodes_w(view.world, view.joints.angle_rad).mean(axis=1)
-        if self._standstill.update(view.time_s, passed_s, center_w, JAMMED_M):
-            self._reverse_until_s = view.time_s + self._reverse_s
+        center_w = self._body.nodes_w(observation.world, observation.joints.angle_rad).mean(axis=1)
+        if self._standstill.update(observation.time_s, passed_s, center_w, JAMMED_M):
+            self._reverse_until_s = observation.time_s + self._reverse_s
             self._standstill.reset()
         return False
 
-    def _amplitude_rad(self, view: View, waves: NDArray[np.float64], passed_s: float) -> float:
+    def _amplitude_rad(self, observation: Observation, waves: NDArray[np.float64], passed_s: float) -> float:
         """Return the amplitude A: a first-order lag of A0 + softness sum_i w_i tau_i, bounded to 0 to 2 A0."""
-        config = self._set
-        assert isinstance(config, CompliantUndulation.Settings)
+        parameters = self.parameters
+        assert isinstance(parameters, CompliantUndulationParameters)
         # Drives measure their own torque; the torque from outside is opposite to it.
-        generalized_force_nm = -float(waves @ np.array(view.joints.torque_nm)[self._body.bends])
-        wanted_rad = config.amplitude_rad + config.softness_rad_per_nm * generalized_force_nm
-        bounded_rad = min(max(wanted_rad, 0.0), 2.0 * config.amplitude_rad)
-        gain = 1.0 - math.exp(-abs(passed_s) / config.yield_s)
+        generalized_force_nm = -float(waves @ np.array(observation.joints.torque_nm)[self._body.bends])
+        wanted_rad = parameters.amplitude_rad + parameters.softness_rad_per_nm * generalized_force_nm
+        bounded_rad = min(max(wanted_rad, 0.0), 2.0 * parameters.amplitude_rad)
+        gain = 1.0 - math.exp(-abs(passed_s) / parameters.yield_s)
         self._yielded_amplitude_rad += gain * (bounded_rad - self._yielded_amplitude_rad)
         return self._yielded_amplitude_rad

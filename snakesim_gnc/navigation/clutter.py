@@ -178,7 +178,7 @@ class ClutterPlanner:
             return 0.0, "the goal is reached"
         if self._reason in (START, BACKED_OUT):
             return 0.0, f"{self._reason}: a path is being searched"
-        reason = desired.why[:MAX_REASON_LENGTH]
+        reason = desired.reason[:MAX_REASON_LENGTH]
         if self._back_out_from_m is not None:
             return desired.speed_m_s * -BACK_OUT_SPEED_RATIO, reason
         return desired.speed_m_s, reason

@@ -18,7 +18,7 @@ class DesiredMotion:
     """The desired speed and direction of travel."""
 
     speed_m_s: float
-    why: str = ""  # the reason if the speed is not that of the mission
+    reason: str = ""  # the reason if the speed is not that of the mission
     heading_w_rad: float | None = None  # direction of travel; None: the mission's
 
 
@@ -40,7 +40,7 @@ class Intents:
         """Forget all timestamps, because robot time restarts, and stop an intent that is followed."""
         self._newest_ns.clear()
         if self._followed is not None:
-            self._stop(f"the intent of {self._followed.who} was for another start of the robot")
+            self._stop(f"the intent of {self._followed.requester} was for another start of the robot")
 
     def desired(self, newest: Intent | None, now_ns: int) -> DesiredMotion:
         """Return the desired motion at a robot time. newest: the newest intent that arrived."""
@@ -60,9 +60,9 @@ class Intents:
 
     def _motion_from(self, intent: Intent) -> DesiredMotion:
         if not intent.go:
-            return DesiredMotion(0.0, f"{intent.who} wants it to stop", self._heading_w_rad)
+            return DesiredMotion(0.0, f"{intent.requester} wants it to stop", self._heading_w_rad)
         speed_m_s = self._mission_m_s if intent.speed_m_s is None else intent.speed_m_s
-        return DesiredMotion(speed_m_s, f"as {intent.who} wants it", self._heading_w_rad)
+        return DesiredMotion(speed_m_s, f"as {intent.requester} wants it", self._heading_w_rad)
 
     def _follow(self, intent: Intent) -> None:
         self._followed = intent
@@ -70,8 +70,8 @@ class Intents:
         if intent.go:
             self._heading_w_rad = intent.heading_w_rad
         # Insert it at the end: senders that were not followed for the longest time are dropped first.
-        self._newest_ns.pop(intent.who, None)
-        self._newest_ns[intent.who] = intent.timestamp_ns
+        self._newest_ns.pop(intent.requester, None)
+        self._newest_ns[intent.requester] = intent.timestamp_ns
         while len(self._newest_ns) > MAX_SENDERS:
             oldest_sender = next(iter(self._newest_ns))
             del self._newest_ns[oldest_sender]
@@ -82,9 +82,9 @@ class Intents:
         The network may delay an intent. A sender that has asked for a stop must not be set in motion by an intent that
         it sent earlier.
         """
-        newest_ns = self._newest_ns.get(intent.who, intent.timestamp_ns)
+        newest_ns = self._newest_ns.get(intent.requester, intent.timestamp_ns)
         if intent.go and intent.timestamp_ns < newest_ns:
-            return f"the intent of {intent.who} is older than another one that came before it"
+            return f"the intent of {intent.requester} is older than another one that came before it"
         return ""
 
     def _stop(self, reason: str) -> None:
@@ -97,10 +97,10 @@ def _find_refusal(intent: Intent, now_ns: int) -> str:
     age_ns = now_ns - intent.timestamp_ns
     valid_ns = min(intent.valid_for_ns, LONGEST_NS)
     if age_ns < -MAX_AHEAD_NS:
-        return f"the intent of {intent.who} is stamped {-age_ns * 1e-9:.3g} s ahead of the robot's clock"
+        return f"the intent of {intent.requester} is stamped {-age_ns * 1e-9:.3g} s ahead of the robot's clock"
     if age_ns > valid_ns:
         age = f"it is {age_ns * 1e-9:.3g} s old, valid for {valid_ns * 1e-9:.3g} s"
-        return f"the intent of {intent.who} has expired: {age}"
+        return f"the intent of {intent.requester} has expired: {age}"
     if intent.speed_m_s is not None and abs(intent.speed_m_s) > MAX_SPEED_M_S:
-        return f"the intent of {intent.who} asks for {intent.speed_m_s:g} m/s, at most {MAX_SPEED_M_S:g} m/s"
+        return f"the intent of {intent.requester} asks for {intent.speed_m_s:g} m/s, at most {MAX_SPEED_M_S:g} m/s"
     return ""

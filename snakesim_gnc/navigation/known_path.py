@@ -39,7 +39,7 @@ class KnownPath:
             speed_m_s=0.0 if finished else desired.speed_m_s,
             push_points=self._list_push_points_ahead(),
             finished=finished,
-            reason="the path is finished" if finished else desired.why[:MAX_REASON_LENGTH],
+            reason="the path is finished" if finished else desired.reason[:MAX_REASON_LENGTH],
             peg_friction=self._peg_friction,
         )
 

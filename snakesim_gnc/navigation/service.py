@@ -12,8 +12,7 @@ from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_gnc.navigation.platform_rises import PlatformRises
 from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, find_start_pose, survey_obstacles
-from snakesim_hal.model.scenario import Service as Schedule
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, ServiceSchedule, find_start_pose, survey_obstacles
 from snakesim_hal.model.scene import make_route
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
@@ -50,7 +49,7 @@ class Navigation(Service):
         self._recent_angles = RecentAngles()
         self._rises = PlatformRises(_find_platforms(config, robot))
         self._known_path = _make_known_path(config, known) if config.mission.goal is None else None
-        schedule = config.services.get(self.name, Schedule())
+        schedule = config.services.get(self.name, ServiceSchedule())
         self._planner = ClutterPlanner(
             config.mission.goal or HeadingGoal(),
             known if config.mission.map == "known" else None,

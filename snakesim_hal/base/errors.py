@@ -1,4 +1,8 @@
-"""The one error tree. Each class is also the matching builtin, so plain `except ValueError` works too."""
+"""The one error tree. Each class is also the matching builtin, so plain `except ValueError` works too.
+
+Each error has a code, such as `config/unknown-key`: a stable word that users search for, and that tests assert. The
+text of a message may change at any time. `snakesim_hal.base.error_codes` explains every code.
+"""
 
 from collections.abc import Iterable
 
@@ -6,14 +10,25 @@ from collections.abc import Iterable
 class SnakesimError(Exception):
     """Base of all errors of SnakeSIM; the message explains what is wrong, and what to do next."""
 
-    def __init__(self, *lines: str) -> None:
-        """Make an error with one line or more. Each is printed as one line, whatever it quotes from file or network."""
+    code = "run/failed"  # stable; a class has its default, and a raise site may give a more specific one
+
+    def __init__(self, *lines: str, code: str | None = None) -> None:
+        """Make an error.
+
+        Args:
+            lines: The message. Each is printed as one line, whatever it quotes from file or network.
+            code: One of `error_codes.ERROR_CODES`; None for the default of the class.
+        """
         super().__init__("\n".join(lines))
         self.lines = lines
+        if code is not None:
+            self.code = code
 
 
 class ConfigError(SnakesimError, ValueError):
     """A file, flag or setting is wrong: names the file, the field, the value and what is allowed."""
+
+    code = "config/invalid-value"
 
 
 class WireError(SnakesimError, ValueError):
@@ -22,6 +37,8 @@ class WireError(SnakesimError, ValueError):
     `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`; or, if the sample does not
     fit the robot, `wrong_length`, `no_rotation`, `no_path`. `detail` has the values.
     """
+
+    code = "message/rejected"
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
@@ -32,25 +49,37 @@ class WireError(SnakesimError, ValueError):
 class NotConnectedError(SnakesimError, ConnectionError):
     """No robot answers at the requested endpoint and namespace."""
 
+    code = "network/no-answer"
+
 
 class StalledError(SnakesimError, TimeoutError):
     """Something expected did not arrive in time."""
+
+    code = "network/no-ticks"
 
 
 class ControllerError(SnakesimError, RuntimeError):
     """A controller raised, or returned an invalid action: names the controller, field, value, and what is allowed."""
 
+    code = "controller/failed"
+
 
 class ServiceError(SnakesimError, RuntimeError):
     """A service raised, or published what no reader accepts: names service, key, tick, field, value and range."""
+
+    code = "service/failed"
 
 
 class BackendError(SnakesimError, RuntimeError):
     """A backend cannot go on: a diverged simulation, a dead bus. The host reports it and stops the robot."""
 
+    code = "backend/failed"
+
 
 class RefusedError(SnakesimError, PermissionError):
     """The HAL refused a request, with its reason: a lease held by another, an arming condition not met."""
+
+    code = "robot/request-refused"
 
 
 OUR_PACKAGES = frozenset(

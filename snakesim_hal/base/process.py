@@ -241,7 +241,8 @@ def step_wall_clock(by_s: float) -> None:
         time.clock_settime(time.CLOCK_REALTIME, time.time() + by_s)
     except PermissionError as error:
         raise RefusedError(
-            "the wall clock cannot be stepped: that needs CAP_SYS_TIME; run as root, or omit step:clock"
+            "the wall clock cannot be stepped: that needs CAP_SYS_TIME; run as root, or omit step:clock",
+            code="machine/not-permitted",
         ) from error
 
 

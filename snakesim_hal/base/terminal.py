@@ -38,6 +38,10 @@ def print_line(line: str) -> None:
     print(escape_invisible(line), flush=True)
 
 
+def discard_line(_line: str) -> None:
+    """Print nothing, where a function wants a `PrintLine`."""
+
+
 @contextmanager
 def tolerate_failed_output() -> Iterator[None]:
     """Make failed writes harmless within, because a robot moves: a closed pipe or terminal, a full disk."""
@@ -92,27 +96,27 @@ def print_stderr(line: str) -> None:
     print(escape_invisible(line), file=sys.stderr, flush=True)
 
 
-def run_tool(tool: str, act: Callable[[], int]) -> int:
+def run_tool(tool: str, act: Callable[[], int], *, as_json: bool = False) -> int:
     """Run a program and return its exit code. An error is printed: 2 means wrong input, 1 any other error.
 
     Args:
         tool: name of the program, which its errors begin with.
         act: the program.
+        as_json: Print an error also as one line of JSON, on stdout.
     """
     try:
         return act()
-    except ConfigError as error:
-        report_error(error, tool)
-        return 2
     except SnakesimError as error:
         report_error(error, tool)
-        return 1
+        if as_json:
+            print_json({"error": {"code": error.code, "message": str(error)}})
+        return 2 if isinstance(error, ConfigError) else 1
 
 
 def report_error(error: SnakesimError, tool: str) -> None:
-    """Print an error to stderr: the tool's name, and the error's own lines."""
+    """Print an error to stderr: the tool's name, the error's first line and its code; then its further lines."""
     first, *more = error.lines
-    for line in (f"{tool}: {first}", *more):
+    for line in (f"{tool}: {first} [{error.code}]", *more):
         print_stderr(line)
 
 

@@ -67,7 +67,9 @@ class NoFaults:
             ConfigError: the run plans a fault of this part.
         """
         if any(injection.part == part for injection in parse_planned(config)):
-            raise ConfigError(f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out")
+            raise ConfigError(
+                f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out", code="injection/not-allowed"
+            )
         self._lifecycle: LifecycleState = "disarmed"
         session.on_query(keys.fault_key(part), self._refuse)
 

@@ -9,16 +9,16 @@ from dataclasses import replace
 
 import msgspec
 
-from snakesim_hal.backend import Backend, Injectable, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
 
 NO_NUMBER = float("nan")
 
 
-class FaultyBackend:
-    """A `snakesim_hal.backend.Backend` around another. The host's thread makes every call."""
+class FaultyBackend(Backend):
+    """A backend around another."""
 
     def __init__(self, inner: Backend) -> None:
         """Wrap a backend; its description is read once."""
@@ -27,25 +27,28 @@ class FaultyBackend:
         self._active: dict[int, dict[str, Injection]] = {}  # joint index -> kind -> fault applied here
         self._last: JointState | None = None  # as returned, with the faults
         self._speed_ratio: float | None = None  # of real time, for a slowed simulator; None: not slowed
-        # These calls need no fault: they go straight to the backend.
-        self.enact = inner.enact
-        self.faults = inner.faults
-        self.close = inner.close
 
-    def inject(self, injection: Injection, begins: bool) -> None:
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Begin or end a fault.
 
+        Returns:
+            True.
+
         Raises:
-            ConfigError: neither the backend nor this wrapper can carry it out.
+            ConfigError: Neither the backend nor this wrapper can carry it out.
         """
         if "host" in injection.about.by:
             self._slow_down(injection, begins)
-        elif isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins):
-            return
-        elif "samples" in injection.about.by:
+            return True
+        if self._inner.inject(injection, begins=begins):
+            return True
+        if "samples" in injection.about.by:
             self._change_samples(injection, begins)
-        else:
-            raise ConfigError(f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}")
+            return True
+        raise ConfigError(
+            f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}",
+            code="injection/not-supported",
+        )
 
     def describe(self) -> Description:
         """Return the backend's description."""
@@ -59,6 +62,9 @@ class FaultyBackend:
         self._last = samples.joints
         return samples
 
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
+        self._inner.enact(setpoints, lifecycle)
+
     def advance(self) -> None:
         """Advance the backend by a tick. A slowed simulator then waits for the rest of the longer tick."""
         began_s = time.monotonic()
@@ -67,11 +73,20 @@ class FaultyBackend:
             duration_s = self._description.period_ns * 1e-9 / self._speed_ratio
             time.sleep(max(began_s + duration_s - time.monotonic(), 0.0))
 
+    def faults(self) -> list[Fault]:
+        return self._inner.faults()
+
+    def close(self) -> None:
+        self._inner.close()
+
     # --- faults applied here ---------------------------------------------------------------------------------
 
     def _slow_down(self, injection: Injection, begins: bool) -> None:
         if not self._description.emulated:
-            raise ConfigError(f"backend {self._description.backend!r} has no simulation that could be slow")
+            raise ConfigError(
+                f"backend {self._description.backend!r} has no simulation that could be slow",
+                code="injection/not-supported",
+            )
         self._speed_ratio = injection.amount if begins else None
 
     def _change_samples(self, injection: Injection, begins: bool) -> None:
@@ -79,7 +94,10 @@ class FaultyBackend:
         joint = injection.number
         count = len(self._description.joints)
         if joint >= count:
-            raise ConfigError(f"there is no {injection.target}; this robot has joint_1 to joint_{count}")
+            raise ConfigError(
+                f"there is no {injection.target}; this robot has joint_1 to joint_{count}",
+                code="injection/unknown-target",
+            )
         kinds = self._active.setdefault(joint, {})
         if begins:
             kinds[injection.kind] = injection

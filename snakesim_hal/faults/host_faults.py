@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.faults.injector import Injector
-from snakesim_hal.model.fault_kinds import HAL
+from snakesim_hal.model.fault_kinds import HAL, Injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import LifecycleState
@@ -21,12 +21,15 @@ class HostFaults(Injector):
         self.backend = FaultyBackend(backend)
         self._period_ns = config.period_ns
         self._tick = 0
-        super().__init__(HAL, config, session, carry_out=self.backend.inject)
+        super().__init__(HAL, config, session, carry_out=self._inject)
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """Keep the tick for the record, then do what every part does."""
         self._tick = timestamp_ns // self._period_ns
         return super().update(timestamp_ns, arm_session, lifecycle)
+
+    def _inject(self, injection: Injection, begins: bool) -> None:
+        self.backend.inject(injection, begins=begins)
 
     def _note(self, text: str, now_s: float) -> None:
         if len(self.notes) < MAX_NOTES:

@@ -33,7 +33,9 @@ NEVER_S = inf
 
 def no_action(injection: Injection, _begins: bool) -> None:
     """Refuse a fault, in a part that supports only message faults and `hang`."""
-    raise ConfigError(f"{injection.part} cannot do {injection.kind} to {injection.target}")
+    raise ConfigError(
+        f"{injection.part} cannot do {injection.kind} to {injection.target}", code="injection/not-supported"
+    )
 
 
 def print_note(text: str, now_s: float) -> None:

@@ -25,7 +25,10 @@ CABLES = "cables.json"
 FRESH_S = 3600.0  # maximum age of `cable_unwound` in a robot file, for a host that has no stored angle
 AHEAD_S = 60.0  # by which the clock of the computer that declared it may be ahead
 END_STOP_RAD = 0.1  # minimum part of a revolution that end stops take
-WAY_OUT = "with its cable unwound and the robot straight, `snakesim joints zero`, then restart the host within an hour"
+WAY_OUT = (
+    "with its cable unwound and the robot straight, `snakesim robot calibrate zero`, then restart the host within an "
+    "hour"
+)
 
 NO_STOPS = (
     "its limits of {:.3f} to {:.3f} rad leave no room for end stops: give `cable_turns`, that its cable bears to "

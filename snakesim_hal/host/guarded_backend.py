@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from snakesim_hal.backend import Backend, Injectable, SafeSetpoints, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.base.step_limit import StepTooLongError, describe_interrupted_line
 from snakesim_hal.model.fault_kinds import Injection
@@ -38,7 +38,8 @@ def _guarded(method: MethodT) -> MethodT:
         except StepTooLongError as error:
             where = f"{self.name}.{method.__name__}"
             raise BackendError(
-                f"{where} did not return in time: it was in {describe_interrupted_line(error)}"
+                f"{where} did not return in time: it was in {describe_interrupted_line(error)}",
+                code="backend/step-timeout",
             ) from error
         except (Exception, SystemExit) as error:  # third-party code, which must not end the host
             where = f"{self.name}.{method.__name__}"
@@ -47,8 +48,8 @@ def _guarded(method: MethodT) -> MethodT:
     return call  # pyright: ignore[reportReturnType]
 
 
-class GuardedBackend:
-    """A `snakesim_hal.backend.Backend` around another."""
+class GuardedBackend(Backend):
+    """A backend around another."""
 
     def __init__(self, inner: Backend) -> None:
         """Wrap a backend; nothing of it is called yet."""
@@ -96,8 +97,8 @@ class GuardedBackend:
 
     @_guarded
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault, if the backend injects faults itself. Returns whether it does this one."""
-        return isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins)
+        """Begin or end a fault that the backend injects itself; return False if it does not have it."""
+        return self._inner.inject(injection, begins=begins)
 
     def _find_sensor_keys(self) -> list[str]:
         """Return the keys of the described sensors. The description is read at the first call."""

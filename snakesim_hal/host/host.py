@@ -74,7 +74,7 @@ class HostOptions:
 
     # The end of the run.
     max_ticks: int | None = None  # end so many ticks after the first arming; None: on request only
-    end_after_fault_s: float | None = None  # robot time; None: stay, so that a person can clear the fault
+    end_after_fault_s: float | None = None  # robot time; None: stay, so that a person can reset the fault
     clock_mode_after_fault: ClockMode = "realtime"  # of ticks that wait for no service
     stay: bool = False  # count only armed ticks, and record little in between; else count all from the first arming
 
@@ -182,7 +182,7 @@ class Host:
 
     @property
     def requests(self) -> list[str]:
-        """Requests to arm, disarm, clear, finish or stop: who sent them, and the result."""
+        """Requests to arm, disarm, reset, finish or stop: who sent them, and the result."""
         return self._requests.log
 
     @property
@@ -214,9 +214,9 @@ class Host:
         """End the run as if all its time had passed."""
         self._state.ending.request("complete")
 
-    def request_estop(self, who: str, reply: Callable[[str], None]) -> None:
+    def request_estop(self, requester: str, reply: Callable[[str], None]) -> None:
         """Request an emergency stop, as the stop port does; from any thread."""
-        request = EstopRequest(who=who[:64] or "an unnamed client")
+        request = EstopRequest(requester=requester[:64] or "an unnamed client")
         self.submit_request(request, lambda answer: reply(answer.reason))
 
     def submit_request(self, request: Request, reply: Reply) -> None:
@@ -529,10 +529,10 @@ class Host:
     # --- faults and the end ----------------------------------------------------------------------------------
 
     def _restore_estop(self) -> None:
-        """Begin in `estop` if an earlier host of this robot was stopped and the stop was not cleared."""
+        """Begin in `estop` if an earlier host of this robot was stopped and the stop was not reset."""
         latched = self._latch.left_by_earlier_host
         if latched is not None:
-            request = EstopRequest(who=f"{latched.who[:40]}, before this host")
+            request = EstopRequest(requester=f"{latched.requester[:40]}, before this host")
             self.authority.on_estop(request, max(latched.tick, 0))
 
     def _on_backend_failure(self, error: BackendError) -> None:
@@ -543,7 +543,7 @@ class Host:
         self._state.ending.request("failed", cause)
 
     def _follow_fault(self) -> None:
-        """Stop waiting for services after a fault; wait for them again after it is cleared."""
+        """Stop waiting for services after a fault; wait for them again after it is reset."""
         clock = self._state.clock
         if self.authority.state not in ("fault", "estop"):
             if self._faulted_tick is not None:
@@ -580,7 +580,7 @@ class Host:
         """Make the joints safe, and release what the host has opened."""
         self._state.ending.request("failed", "by an internal error; see host.log")
         self._ended_ns = time.monotonic_ns()
-        finish = LifecycleRequest(action="finish", who="the host")
+        finish = LifecycleRequest(action="finish", requester="the host")
         self.authority.on_lifecycle(finish, self._state.clock.safety_ns())
         with contextlib.suppress(BackendError):
             self._cycle.enact(self.authority.decide())

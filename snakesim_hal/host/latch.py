@@ -30,7 +30,7 @@ ANSWER_LIMIT_S = 1.0  # for a disk that hangs; requesters wait longer
 class Latched(msgspec.Struct, frozen=True, kw_only=True):
     """Who stopped the robot, and at which tick of that host."""
 
-    who: str
+    requester: str
     tick: int
 
 
@@ -54,18 +54,18 @@ class EstopLatch:
         self._writer = start_worker("estop", self._run_requests)
         start_worker("estop late", self._answer_late)
 
-    def engage(self, who: str, tick: int, then: Callable[[str | None], None]) -> None:
+    def engage(self, requester: str, tick: int, then: Callable[[str | None], None]) -> None:
         """Store a stop.
 
         Args:
-            who: requester of the stop.
+            requester: requester of the stop.
             tick: of this host.
             then: is called once, from another thread: with None, or with the reason why the stop is not stored.
         """
         late = f"it is not stored yet, and may not outlive this host: {self._path}: the disk does not answer"
         once = _Once(then, late)
         self._unanswered.put(once)
-        self._requests.put(lambda: self._engage(Latched(who=who, tick=tick), once))
+        self._requests.put(lambda: self._engage(Latched(requester=requester, tick=tick), once))
 
     def release(self, then: Callable[[str | None], None]) -> None:
         """Remove the stored stop. `then` is called as in `engage`."""
@@ -123,7 +123,7 @@ def _read(path: Path) -> Latched | None:
     except FileNotFoundError:
         return None
     except (OSError, *UNDECODABLE):
-        return Latched(who=f"unknown ({ESTOP} cannot be read)", tick=-1)
+        return Latched(requester=f"unknown ({ESTOP} cannot be read)", tick=-1)
 
 
 def find_latched_stops() -> list[Path]:
@@ -142,8 +142,8 @@ def remove_latched_stop(path: Path) -> str:
         path.unlink(missing_ok=True)
         sync_folder(path.parent)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from error
-    return f"emergency stop by {'nobody' if latched is None else latched.who}"
+        raise ConfigError(f"{path}: {error.strerror}; remove it by hand", code="file/not-writable") from error
+    return f"emergency stop by {'nobody' if latched is None else latched.requester}"
 
 
 class _Once:

@@ -6,7 +6,7 @@ Pure. The host's thread makes every call.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from snakesim_hal.model.scenario import Service
+from snakesim_hal.model.scenario import ServiceSchedule
 
 NOT_ANSWERED = -1
 
@@ -15,7 +15,7 @@ NOT_ANSWERED = -1
 class Participant:
     """A service that a lockstep run waits for."""
 
-    service: Service
+    service: ServiceSchedule
     done_tick: int = NOT_ANSWERED  # the newest tick for which it has published all output
     present: bool = False
     given_up: bool = False
@@ -28,7 +28,7 @@ class Participant:
 class Participants(dict[str, Participant]):
     """All services of the scenario, by name."""
 
-    def __init__(self, services: Mapping[str, Service]) -> None:
+    def __init__(self, services: Mapping[str, ServiceSchedule]) -> None:
         """Start with services that are not connected yet."""
         super().__init__({name: Participant(service) for name, service in services.items()})
 

@@ -75,7 +75,7 @@ class RequestHandler:
         answer = self._with_host(answer)
         self._log_request(request, answer)
         self._status.publish()
-        self._latch.engage(request.who, tick, make_reply(reply, answer))
+        self._latch.engage(request.requester, tick, make_reply(reply, answer))
 
     def _handle_lease(self, request: LeaseRequest, reply: Reply) -> None:
         state = self._state
@@ -97,7 +97,9 @@ class RequestHandler:
             case "arm" if answer.ok:
                 self._state.forget_answers_before_arming()
             case "finish":
-                self._state.ending.request("finished", f"on request by {request.who}" if request.who else "on request")
+                self._state.ending.request(
+                    "finished", f"on request by {request.requester}" if request.requester else "on request"
+                )
             case _:
                 pass
         self._finish(request, answer, reply)
@@ -107,7 +109,7 @@ class RequestHandler:
         answer = self._with_host(answer)
         self._log_request(request, answer)
         self._status.publish()
-        if isinstance(request, LifecycleRequest) and request.action == "clear" and answer.ok:
+        if isinstance(request, LifecycleRequest) and request.action == "reset" and answer.ok:
             self._latch.release(make_reply(reply, answer))
         else:
             reply(answer)
@@ -120,9 +122,9 @@ class RequestHandler:
 
         state.clock.restart_deadlines(state.clock.simulated.speed)
         if request.action == "reset":
-            finish = LifecycleRequest(action="finish", who=request.who)
+            finish = LifecycleRequest(action="finish", requester=request.requester)
             state.authority.on_lifecycle(finish, state.clock.safety_ns())
-            state.ending.request("reset", f"by {request.who}")
+            state.ending.request("reset", f"by {request.requester}")
         return state.answer(ok=True, reason=outcome)
 
     # --- refusals and the log --------------------------------------------------------------------------------
@@ -155,6 +157,6 @@ class RequestHandler:
             return
         action = "estop" if isinstance(request, EstopRequest) else request.action
         outcome = "done" if answer.ok else f"refused: {answer.reason}"
-        entry = f"tick {self._state.clock.tick}: {action} by {request.who!r}, {outcome}"
+        entry = f"tick {self._state.clock.tick}: {action} by {request.requester!r}, {outcome}"
         self.log.append(entry)
         self._outbox.log(entry)

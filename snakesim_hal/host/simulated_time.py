@@ -82,21 +82,21 @@ class SimulatedTime:
         self._rebase(tick)
         match request.action:
             case "pause":
-                self.paused_by = request.who
+                self.paused_by = request.requester
                 self._steps = 0
-                return f"paused by {request.who}, before tick {tick}"
+                return f"paused by {request.requester}, before tick {tick}"
             case "resume":
                 self.paused_by = None
-                return f"resumed by {request.who}, at tick {tick}"
+                return f"resumed by {request.requester}, at tick {tick}"
             case "step":
-                self.paused_by = request.who
+                self.paused_by = request.requester
                 self._steps = request.ticks
-                return f"{request.ticks} ticks for {request.who}, then paused before tick {tick + request.ticks}"
+                return f"{request.ticks} ticks for {request.requester}, then paused before tick {tick + request.ticks}"
             case "speed":
                 self.speed = request.speed
-                return f"speed {request.speed:g}, as {request.who} wants"
+                return f"speed {request.speed:g}, as {request.requester} wants"
             case _:
-                return f"reset by {request.who}; arm again"
+                return f"reset by {request.requester}; arm again"
 
     def _find_refusal(self, request: SimulatorRequest) -> Refusal | None:
         """Return the reason to refuse a request; None: it can be carried out."""

@@ -97,14 +97,14 @@ class StatusReporter:
             real_time_factor=simulated.real_time_factor,
             # The lifecycle.
             lifecycle=authority.state,
-            why=why,
+            reason=why,
             ready_to_arm=not refusals and not missing and not differing,
             unchecked=authority.unchecked[:500],
             derated=authority.derated_joints,
             isolated=authority.isolated_joints,
             # Faults.
             faults=authority.faults,
-            faults_left_out=authority.faults_since_clear.left_out,
+            faults_left_out=authority.faults_since_reset.left_out,
             injected=list(state.faults.active),
             # Commands.
             lease_holder=authority.lease.holder,

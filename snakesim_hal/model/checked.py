@@ -24,24 +24,37 @@ JointNames = Annotated[list[Words], Meta(max_length=MAX_JOINTS)]
 
 
 class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
-    """The section [checked], which `snakesim joints check` writes."""
+    """The section [checked], which `snakesim robot check` writes."""
 
-    # Who checked what, and when.
     by: Words
-    on: Words  # date
-    joints: Words  # digest of how the joints are mounted, see `mounting_digest`
+    """Name of the person who checked the robot."""
+
+    on: Words
+    """Date of the check."""
+
+    joints: Words
+    """Digest of how the joints were mounted at the check; if it differs now, the record is not valid."""
+
     backend: Words
+    """Backend that the robot was checked with."""
+
     hardware: Words = ""
-    serials: JointNames = []  # serial numbers of the drives, tail to head; empty: the drive does not report it
+    """Hardware of that backend, as it reports it; empty: it does not report it."""
 
-    # Properties that are confirmed for every joint. A robot can be armed only if all of them are.
+    serials: JointNames = []
+    """Serial numbers of the drives, tail to head; empty: the drives do not report them."""
+
     confirmed: Annotated[list[JointProperty], Meta(max_length=len(PROPERTIES))] = []
+    """Properties that are confirmed for every joint; a robot can be armed only if all of them are."""
 
-    # Property -> joints for which a person confirmed it; for the others the check did.
     by_hand: Annotated[dict[JointProperty, JointNames], Meta(max_length=len(PROPERTIES))] = {}
+    """For each property, the joints for which a person confirmed it; for the others the check did."""
 
-    straight: bool = False  # true: a person laid the robot straight, and the zeros were judged from that pose
-    allowed_backlash_rad: Annotated[float, from_zero(0.5, "rad")] = 0.0  # of every gear
+    straight: bool = False
+    """True: a person laid the robot straight, and the zeros were judged from that pose."""
+
+    allowed_backlash_rad: Annotated[float, from_zero(0.5, "rad")] = 0.0
+    """Backlash of a gear that the check allowed."""
 
 
 def mounting_digest(joints: Sequence[Joint]) -> str:

@@ -15,9 +15,14 @@ from snakesim_hal.model.scenario import Override
 class Draw(FileStruct, frozen=True, kw_only=True):
     """A uniform distribution of one value, which all keys in `set` get; the number of a random scene decides it."""
 
-    set: Annotated[list[str], Meta(min_length=1)]  # dotted keys
+    set: Annotated[list[str], Meta(min_length=1)]
+    """Dotted keys that all get the same random value, such as `scene.ground.friction`."""
+
     low: float
+    """Lower bound of the value, in the unit of the keys."""
+
     high: float
+    """Upper bound of the value, in the unit of the keys."""
 
     def __post_init__(self) -> None:
         """Check the bounds. Raises ValueError, for the file reader."""
@@ -55,7 +60,8 @@ def make_draws(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
             draws.append(Draw(set=key_list, low=low, high=high))
         except (TypeError, ValueError):
             raise ConfigError(
-                f"draw {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite"
+                f"draw {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite",
+                code="command/invalid-option",
             ) from None
     return draws
 
@@ -68,5 +74,8 @@ def parse_draw(text: str) -> tuple[str, list[str]]:
     """
     keys, equals, bounds = (part.strip() for part in text.partition("="))
     if not (keys and equals and bounds):
-        raise ConfigError(f"--draw {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4")
+        raise ConfigError(
+            f"--draw {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4",
+            code="command/invalid-option",
+        )
     return keys, bounds.split(":")

@@ -205,7 +205,10 @@ def find_writer(key: str) -> str:
     row = keys.find_row(key)
     if row is None or not _is_written_by_run(row):
         streams = [row.key for row in keys.SPACE if _is_written_by_run(row)]
-        raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
+        raise ConfigError(
+            f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}",
+            code="injection/unknown-target",
+        )
     if row.key == keys.DONE_ALL:
         return keys.parse_service(key)
     match row.writer:
@@ -229,10 +232,13 @@ def parse_injection(text: str) -> Injection:
         ConfigError: The text is not valid, or the fault is not allowed.
     """
     if len(text) > LONGEST_TEXT:
-        raise ConfigError(f"fault {text[:40]!r}...: {len(text)} characters, at most {LONGEST_TEXT}: give {FORM}")
+        raise ConfigError(
+            f"fault {text[:40]!r}...: {len(text)} characters, at most {LONGEST_TEXT}: give {FORM}",
+            code="injection/unknown-fault",
+        )
     match = _text.fullmatch(text.strip())
     if match is None:
-        raise ConfigError(f"fault {text!r}: give {FORM}. Kinds: {kinds_in_short()}")
+        raise ConfigError(f"fault {text!r}: give {FORM}. Kinds: {kinds_in_short()}", code="injection/unknown-fault")
     amount: float | None = None
     try:
         start_s = float(match["start"])
@@ -240,9 +246,14 @@ def parse_injection(text: str) -> Injection:
         if match["amount"] is not None:
             amount = float(match["amount"])
     except ValueError:
-        raise ConfigError(f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3") from None
+        raise ConfigError(
+            f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3", code="injection/unknown-fault"
+        ) from None
     if end_s <= start_s:
-        raise ConfigError(f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s")
+        raise ConfigError(
+            f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s",
+            code="injection/unknown-fault",
+        )
     return check_injection(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
 
 
@@ -264,13 +275,17 @@ def check_injection(injection: Injection, given_text: str | None = None) -> Inje
         find_writer(injection.target)  # raises for a key without a writer
     if kind.amount is None:
         if injection.amount is not None:
-            raise ConfigError(f"fault {text!r}: {injection.kind} takes no amount; leave out ={injection.amount:g}")
+            raise ConfigError(
+                f"fault {text!r}: {injection.kind} takes no amount; leave out ={injection.amount:g}",
+                code="injection/unknown-fault",
+            )
         return injection
     amount = kind.amount.default if injection.amount is None else injection.amount
     if not isfinite(amount) or not kind.amount.low <= amount <= kind.amount.high:
         raise ConfigError(
             f"fault {text!r}: {kind.amount.about} = {amount:g} must be from {kind.amount.low:g} to "
-            f"{kind.amount.high:g} {kind.amount.unit}"
+            f"{kind.amount.high:g} {kind.amount.unit}",
+            code="injection/unknown-fault",
         )
     return replace(injection, amount=amount)
 
@@ -283,7 +298,8 @@ def _unknown_kind_error(injection: Injection, text: str) -> ConfigError:
     hint = f"; {injection.kind} is for {' and '.join(plurals)}" if plurals else ""
     return ConfigError(
         f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "
-        f"{', '.join(KINDS[sort])}{hint}"
+        f"{', '.join(KINDS[sort])}{hint}",
+        code="injection/unknown-fault",
     )
 
 
@@ -318,18 +334,25 @@ def _check_number(injection: Injection, sort: str, count: int) -> None:
     """Raise ConfigError if the number of a joint or bus is above their count."""
     if injection.number >= count:
         has = f"{sort}_1 to {sort}_{count}" if count else f"no {sort}"
-        raise ConfigError(f"fault {str(injection)!r}: there is no {injection.target}; this run has {has}")
+        raise ConfigError(
+            f"fault {str(injection)!r}: there is no {injection.target}; this run has {has}",
+            code="injection/unknown-target",
+        )
 
 
 def _check_process(injection: Injection, processes: list[str]) -> None:
     """Raise ConfigError if the run has no such process, or the router cannot do it."""
     if injection.target not in processes:
         raise ConfigError(
-            f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has {', '.join(processes)}"
+            f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has {', '.join(processes)}",
+            code="injection/unknown-target",
         )
     if injection.target == ROUTER and injection.part != RUN:
         possible = [name for name, kind in KINDS["process"].items() if "supervisor" in kind.by]
-        raise ConfigError(f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(possible)}")
+        raise ConfigError(
+            f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(possible)}",
+            code="injection/not-supported",
+        )
 
 
 def _check_writer(injection: Injection, processes: list[str]) -> None:
@@ -337,7 +360,8 @@ def _check_writer(injection: Injection, processes: list[str]) -> None:
     writer = injection.part
     if writer not in processes and writer != HAL:
         raise ConfigError(
-            f"fault {str(injection)!r}: {writer} writes {injection.target}, and this run does not start it"
+            f"fault {str(injection)!r}: {writer} writes {injection.target}, and this run does not start it",
+            code="injection/unknown-target",
         )
 
 

@@ -25,7 +25,7 @@ def parse_planned(config: RunConfig, table: Table | None = None) -> list[Injecti
         try:
             injections.append(parse_injection(text))
         except ConfigError as error:
-            raise ConfigError(f"{_place(config, i, table)}: {error}") from None
+            raise ConfigError(f"{_place(config, i, table)}: {error}", code=error.code) from None
     return injections
 
 
@@ -47,7 +47,8 @@ def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, b
         if concerns_backend and not host_can and injection.kind not in does:
             raise ConfigError(
                 f"{_place(config, i, None)}: backend {config.backend!r} cannot do {injection.kind} to "
-                f"{injection.target}: {because}"
+                f"{injection.target}: {because}",
+                code="injection/not-supported",
             )
 
 
@@ -61,7 +62,8 @@ def check_without_run(config: RunConfig, table: Table | None = None) -> None:
         if injection.part == RUN:
             raise ConfigError(
                 f"{_place(config, i, table)} = {str(injection)!r}: only `snakesim run` does that; for a host by itself "
-                "leave it out, such as by --set 'faults=[]'"
+                "leave it out, such as by --set 'faults=[]'",
+                code="injection/not-supported",
             )
 
 
@@ -78,10 +80,11 @@ def check_planned(config: RunConfig, table: Table | None = None, buses: int = MA
             if injection.part == RUN and injection.target in config.beside:
                 raise ConfigError(
                     f"fault {str(injection)!r}: {injection.target} is no process of its own; it is beside the driver "
-                    f'(services.{injection.target}.place = "host")'
+                    f'(services.{injection.target}.place = "host")',
+                    code="injection/not-supported",
                 )
         except ConfigError as error:
-            raise ConfigError(f"{_place(config, i, table)}: {error}") from None
+            raise ConfigError(f"{_place(config, i, table)}: {error}", code=error.code) from None
     return injections
 
 

@@ -132,14 +132,14 @@ def _tag_matches(section: dict[str, Any], struct: type[msgspec.Struct]) -> bool:
     return section.get(config.tag_field) == config.tag
 
 
-def _alternatives(info: inspect.Type | None) -> list[inspect.Type]:
+def alternatives(info: inspect.Type | None) -> list[inspect.Type]:
     """Return the alternatives of a union; for any other type, only that type."""
     if info is None:
         return []
     if isinstance(info, inspect.Metadata):
-        return _alternatives(info.type)
+        return alternatives(info.type)
     if isinstance(info, inspect.UnionType):
-        return [leaf for option in info.types for leaf in _alternatives(option)]
+        return [leaf for option in info.types for leaf in alternatives(option)]
     return [info]
 
 
@@ -161,7 +161,7 @@ def in_words(info: inspect.Type | None) -> str:
     """Return the type of a field in words, such as "a number > 0 in m"."""
     unit = unit_of(info)
     descriptions: list[str] = []
-    for option in _alternatives(info):
+    for option in alternatives(info):
         description = _describe(option, unit)
         if description is not None:
             descriptions.append(description)

@@ -7,7 +7,7 @@ value, the file or flag that it came from.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -25,6 +25,9 @@ MAX_SHOWN_TEXT = 40  # characters of a damaged text in an error
 
 class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """Base of everything that is read from a file: an unknown field is an error, so that typos are not ignored."""
+
+    # Sections for all to which this one contains exceptions: it has their fields, and None means the value for all.
+    exceptions_to: ClassVar[tuple[type[msgspec.Struct], ...]] = ()
 
 
 @dataclass
@@ -48,7 +51,10 @@ class Table:
         """
         *parents, last = dotted.split(".")
         if len(parents) >= MAX_DEPTH:
-            raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MAX_DEPTH} are allowed")
+            raise ConfigError(
+                f"{origin}: the key has {len(parents) + 1} parts, at most {MAX_DEPTH} are allowed",
+                code="config/unknown-key",
+            )
         section = self._section_for(dotted, parents, origin)
         if isinstance(section, list):
             index = _list_index(section, last, dotted, origin)
@@ -72,7 +78,8 @@ class Table:
             if not isinstance(section, dict | list):
                 raise ConfigError(
                     f"{origin}: `{path}` is the value {shorten(repr(section))}, not a section; "
-                    f"`{dotted}` cannot be set inside it"
+                    f"`{dotted}` cannot be set inside it",
+                    code="config/unknown-key",
                 )
         return section
 
@@ -109,8 +116,11 @@ def _list_index(entries: list[Any], name: str, dotted: str, origin: str) -> int:
     if is_number and int(name) < len(entries):
         return int(name)
     if not entries:
-        raise ConfigError(f"{origin}: `{dotted}`: the list is empty")
-    raise ConfigError(f"{origin}: `{dotted}`: the list has entries 0 to {len(entries) - 1}; name one by its number")
+        raise ConfigError(f"{origin}: `{dotted}`: the list is empty", code="config/unknown-key")
+    raise ConfigError(
+        f"{origin}: `{dotted}`: the list has entries 0 to {len(entries) - 1}; name one by its number",
+        code="config/unknown-key",
+    )
 
 
 def leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -141,7 +151,9 @@ def read_table(path: Path) -> Table:
     parse = parse_json if is_json else parse_toml
     values = parse(text, str(path))
     if not isinstance(values, dict):
-        raise ConfigError(f"{path}: holds a {type(values).__name__}, not a table of settings")
+        raise ConfigError(
+            f"{path}: holds a {type(values).__name__}, not a table of settings", code="file/invalid-syntax"
+        )
     return Table(values, str(path), _origins(values, str(path)))
 
 
@@ -162,7 +174,9 @@ def find_file(name: str, kind: str, beside: Path | None = None) -> Path:
             return path
         return beside / path
     if name not in list_shipped(kind):
-        raise ConfigError(f"no {kind[:-1]} called {shorten(name)!r}{_hint_for_unknown(name, kind)}")
+        raise ConfigError(
+            f"no {kind[:-1]} called {shorten(name)!r}{_hint_for_unknown(name, kind)}", code="config/unknown-name"
+        )
     return SHIPPED / kind / f"{name}.toml"
 
 
@@ -196,7 +210,10 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
     """
     path = find_file(name, kind, beside)
     if path.resolve() in extended:
-        raise ConfigError(f"{path}: `extends` leads back to this file, so that none says what the robot or scene is")
+        raise ConfigError(
+            f"{path}: `extends` leads back to this file, so that none says what the robot or scene is",
+            code="config/conflict",
+        )
     table = read_table(path)
     base = table.values.pop("extends", None)
     if base is None:
@@ -223,7 +240,7 @@ def expand_home(name: str) -> Path:
     try:
         return Path(name).expanduser()
     except RuntimeError as error:
-        raise ConfigError(f"{shorten(name)}: {error}") from None
+        raise ConfigError(f"{shorten(name)}: {error}", code="file/not-found") from None
 
 
 def list_shipped(kind: str) -> list[str]:
@@ -247,12 +264,25 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
     except msgspec.ValidationError as error:
         violation = first_violation(table.values, struct)
         assert violation is not None, error
-        raise ConfigError(_explain(violation, table, under)) from None
+        raise ConfigError(_explain(violation, table, under), code=_choose_code(violation)) from None
     except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
         odd = ascii(error.object[error.start : error.end])[:MAX_SHOWN_TEXT]
         raise ConfigError(
             f"{table.source}: a key or a text holds {odd}, which is not a character; write it again"
         ) from None
+
+
+def _choose_code(violation: Violation) -> str:
+    """Return the code of the error about a violation."""
+    match violation.kind:
+        case "unknown":
+            return "config/unknown-key"
+        case "missing":
+            return "config/missing-key"
+        case "wrong":
+            is_number = isinstance(violation.value, int | float) and not isinstance(violation.value, bool)
+            is_outside = is_number and (">" in violation.why or "<" in violation.why)  # as msgspec writes ranges
+            return "config/out-of-range" if is_outside else "config/invalid-value"
 
 
 def _explain(violation: Violation, table: Table, under: str) -> str:

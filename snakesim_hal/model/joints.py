@@ -37,29 +37,46 @@ Backlash = Annotated[float, from_zero(0.5, "rad")]
 class Limits(FileStruct, frozen=True, kw_only=True):
     """Limits of a joint; enforced by the limiter and by the motor."""
 
-    # Angle, to either side; `angle_min_rad` and `angle_max_rad` for a side that differs.
     angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]
+    """Maximum angle of the joint to either side of its zero."""
+
     angle_min_rad: Side | None = None
+    """Lowest angle, if it is not minus `angle_rad`; none: minus `angle_rad`."""
+
     angle_max_rad: Side | None = None
+    """Highest angle, if it is not `angle_rad`; none: `angle_rad`."""
 
-    # Revolutions to either side that the cable of a joint without end stops can take; none: it has end stops.
     cable_turns: Annotated[float, above(100, "turns")] | None = None
+    """Revolutions to either side that the cable of a joint without end stops can take; none: the joint has end stops.
+    """
 
-    # Date at which the cable was unwound with the joint at its zero; `snakesim joints zero` writes it.
     cable_unwound: Text = ""
+    """Date at which the cable was unwound with the joint at its zero; empty: unknown.
+
+    `snakesim robot calibrate zero` writes it.
+    """
 
     # Motion.
     speed_rad_s: Annotated[float, above(100, "rad/s")]
+    """Maximum speed of the joint."""
+
     acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
+    """Maximum acceleration of a commanded motion."""
+
     torque_nm: Torque
+    """Maximum torque of the joint."""
+
     torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
+    """Maximum rate at which a commanded torque changes."""
 
-    # Temperature of the winding: above `derate_from_c` torque is derated; at `stop_at_c` a fifth of it is left, and
-    # the robot stops.
     derate_from_c: Celsius = 80.0
-    stop_at_c: Celsius = 105.0
+    """Temperature of the winding above which the torque limit is reduced, down to a fifth of it at `stop_at_c`."""
 
-    min_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
+    stop_at_c: Celsius = 105.0
+    """Temperature of the winding at which the robot stops with a fault."""
+
+    min_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0
+    """Supply voltage below which the robot stops with a fault."""
 
     def __post_init__(self) -> None:
         """Check the limits against each other. Raises ValueError, for the file reader.
@@ -99,19 +116,36 @@ class Motor(FileStruct, frozen=True, kw_only=True):
 
     # Gains: of position mode, and of velocity mode.
     stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]
+    """Gain of position mode: torque for each radian between the target and the angle."""
+
     damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]
+    """Damping of position mode: torque against each rad/s of joint speed."""
+
     velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]
+    """Gain of velocity mode: torque for each rad/s between the target and the speed."""
 
     # Dynamics.
-    response_time_s: Lag  # first-order lag of the torque
-    armature_kg_m2: RotorInertia  # rotor inertia
-    friction_nm: Friction = 0.0  # Coulomb friction
-    viscous_nm_s_per_rad: Viscosity = 0.0  # viscous friction
+    response_time_s: Lag
+    """Time constant with which the torque follows its command; 0: at once."""
+
+    armature_kg_m2: RotorInertia
+    """Inertia of the rotor, as seen at the joint."""
+
+    friction_nm: Friction = 0.0
+    """Coulomb friction of motor and gear."""
+
+    viscous_nm_s_per_rad: Viscosity = 0.0
+    """Viscous friction of motor and gear."""
 
     # Torque.
-    torque_constant_nm_per_a: TorqueConstant | None = None  # at the drive's shaft, before a `gear`; none: unknown
-    rated_nm: Torque | None = None  # torque for which [heat] gives temperatures and losses; none: `limits.torque_nm`
-    peak_nm: Torque | None = None  # torque that no limit may exceed; none: unknown
+    torque_constant_nm_per_a: TorqueConstant | None = None
+    """Torque for each ampere at the drive's shaft, before a `gear`; none: unknown."""
+
+    rated_nm: Torque | None = None
+    """Torque for which [heat] gives temperatures and losses; none: `limits.torque_nm`."""
+
+    peak_nm: Torque | None = None
+    """Torque that no torque limit may exceed; none: unknown."""
 
 
 DriveMode = Literal["position", "velocity", "torque"]
@@ -123,17 +157,28 @@ class Drive(FileStruct, frozen=True, kw_only=True):
     """How a joint's drive is connected and mounted: drive angle = zero_rad + sign * gear * joint angle."""
 
     # Connection.
-    driver: Text = ""  # driver type, such as dynamixel; empty: the only one of the backend
-    port: Text = ""  # bus or serial port, such as can0; empty: the one in the backend's settings
+    driver: Text = ""
+    """Driver type, such as `dynamixel`; empty: the only driver type of the backend."""
+
+    port: Text = ""
+    """Bus or serial port, such as can0; empty: joints are distributed evenly over those in the backend's settings."""
 
     # Mounting.
-    sign: Sign = 1  # -1: the drive rotates against the joint
-    zero_rad: Zero = 0.0  # angle that the drive measures at the joint's zero
-    gear: Gear = 1.0  # revolutions of the drive's shaft per revolution of the joint
+    sign: Sign = 1
+    """1 if the drive rotates with the joint, -1 if it rotates against it."""
+
+    zero_rad: Zero = 0.0
+    """Angle that the drive measures when the joint is at its zero."""
+
+    gear: Gear = 1.0
+    """Revolutions of the drive's shaft for each revolution of the joint."""
 
     # Abilities: control modes, and what it measures beside the angle.
     modes: Modes = msgspec.field(default_factory=lambda: ["position", "velocity", "torque"])
+    """Control modes that the drive supports; `position` must be one of them."""
+
     measures: Measures = msgspec.field(default_factory=lambda: ["torque", "temperature", "voltage"])
+    """Quantities that the drive measures beside its angle."""
 
     def __post_init__(self) -> None:
         """Check that the drive can hold its position, as it must when a robot is armed. Raises ValueError."""
@@ -145,31 +190,40 @@ class Drive(FileStruct, frozen=True, kw_only=True):
 
 
 class Heat(FileStruct, frozen=True, kw_only=True):
-    """How a motor warms up. The defaults are typical of a small geared servo; none was measured."""
+    """How a motor warms up. The defaults are typical of a small geared servo; none was measured.
 
-    ambient_c: Annotated[float, bounded(-50, 100, "°C")] = 20.0  # of the air or water around the robot
+    Together they give 5 K/W from winding to water, a guess of the right order for a housing of 100 mm.
+    """
 
-    # Final temperature rise of the winding at standstill under the rated torque.
+    ambient_c: Annotated[float, bounded(-50, 100, "°C")] = 20.0
+    """Temperature of the air or water around the robot."""
+
     rise_at_rated_k: Annotated[float, above(1000, "K")] = 240.0
+    """Final temperature rise of the winding at standstill under the rated torque."""
+
     time_constant_s: Annotated[float, above(1e5, "s")] = 60.0
+    """Time constant with which the winding warms up and cools down."""
 
-    # Copper loss at the rated torque. With `rise_at_rated_k` the defaults give 5 K/W from winding to water, a guess of
-    # the right order for a housing of 100 mm.
     loss_at_rated_w: Annotated[float, from_zero(1e5, "W")] = 48.0
+    """Copper loss at the rated torque."""
 
-    # Temperature rise of the electronics as a fraction of the winding's rise; a guess.
     board_fraction: Annotated[float, from_zero(1, "1")] = 0.3
+    """Temperature rise of the electronics as a fraction of the winding's rise; the default is a guess."""
 
 
 class Supply(FileStruct, frozen=True, kw_only=True):
     """Electrical supply of a joint."""
 
     voltage_v: Annotated[float, above(1000, "V")] = 24.0
-    idle_a: Annotated[float, from_zero(1000, "A")] = 0.05  # current that the electronics draw
+    """Nominal supply voltage."""
+
+    idle_a: Annotated[float, from_zero(1000, "A")] = 0.05
+    """Current that the electronics of one joint draw without a motor current."""
 
 
 class _Id(FileStruct, frozen=True, kw_only=True):
-    id: Annotated[int, Meta(ge=0, lt=MAX_ID)] | None = None  # on its bus; none: the joint's number
+    id: Annotated[int, Meta(ge=0, lt=MAX_ID)] | None = None
+    """Id of the drive on its bus; none: the joint's number, from 1 at the tail."""
 
 
 # Every field of the sections for all joints is an optional field of the exceptions of one joint. Only the ambient
@@ -185,6 +239,8 @@ _of_one: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_Id,), froz
 
 class JointExceptions(_of_one):
     """What differs in one joint from the sections for all: their fields, and the drive's id."""
+
+    exceptions_to = (Limits, Motor, Drive, Heat, Supply)
 
 
 SectionT = TypeVar("SectionT", Limits, Motor, Drive, Heat, Supply)

@@ -20,13 +20,18 @@ class Link(FileStruct, frozen=True, kw_only=True):
     """
 
     length_m: Annotated[float, above(2, "m")]
+    """Length of the link along its x axis, without the caps of the capsule."""
+
     mass_kg: Annotated[float, above(100, "kg")]
+    """Mass of the link."""
 
-    # Center of mass in the link's frame; none: the middle of the link.
     center_m: tuple[Offset, Offset, Offset] | None = None
+    """Center of mass in the link's frame, from the joint at its rear; none: the middle of the link."""
 
-    # ixx, iyy, izz, ixy, ixz, iyz about the center of mass; none: the inertia of a solid capsule.
     inertia_kg_m2: Inertia | None = None
+    """Moments of inertia ixx, iyy, izz, ixy, ixz, iyz about the center of mass, along the link's axes; none: those of a
+    solid capsule.
+    """
 
     def __post_init__(self) -> None:
         """Check that a rigid body can have this inertia. Raises ValueError, which the file reader explains."""

@@ -8,6 +8,7 @@ import ast
 import contextlib
 import importlib.util
 import sys
+from abc import ABC
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
@@ -25,6 +26,7 @@ from snakesim_hal.model.textfiles import read_bytes
 BACKENDS = "snakesim.backends"
 COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
+FILES = "snakesim.files"  # Structs of the kinds of files that only a feature reads, such as suites
 FILMS = "snakesim.films"
 PHYSICS_MODELS = "snakesim.physics_models"
 SENSORS = "snakesim.sensors"
@@ -88,9 +90,13 @@ def find_plugin(group: str, name: str) -> Any:
     try:
         return entry.load()
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_install_hint(entry)}") from error
+        raise ConfigError(
+            f"{kind} {name!r} cannot be loaded: {error}.{_install_hint(entry)}", code="extra/not-installed"
+        ) from error
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}") from error
+        raise ConfigError(
+            f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}", code="plugin/not-loadable"
+        ) from error
 
 
 def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
@@ -101,14 +107,16 @@ def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
             f"no {kind} called {shorten(name)!r} is installed; "
             f"{suggest_word(name, list_installed(group))}installed are "
             f"{', '.join(list_installed(group)) or 'none'}. "
-            f"A package adds one by an entry point in the group {group!r}"
+            f"A package adds one by an entry point in the group {group!r}",
+            code="plugin/not-found",
         )
     different_objects = {entry.value for entry in entries}
     if len(different_objects) > 1:
         packages = " and ".join(f"{_package(entry)} ({entry.value})" for entry in entries)
         raise ConfigError(
             f"{kind} {name!r} is in several installed packages: {packages}; uninstall all but one, or name a file "
-            f"and a class in it, ./file.py:Class"
+            f"and a class in it, ./file.py:Class",
+            code="plugin/ambiguous",
         )
     return entries[0]
 
@@ -171,7 +179,7 @@ def _parse_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
         tree = ast.parse(read_bytes(path), str(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}") from None
+        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}", code="plugin/not-loadable") from None
     if not attribute:
         raise _missing_class_error(name, kind, tree)
     return path, attribute, tree
@@ -188,7 +196,10 @@ def _missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
     else:
         example = f"{path}:Class"
         available = "there is no class in it"
-    return ConfigError(f"{kind} {shorten(name)!r}: {problem}, as in {shorten(example)}; {shorten(available, 400)}")
+    return ConfigError(
+        f"{kind} {shorten(name)!r}: {problem}, as in {shorten(example)}; {shorten(available, 400)}",
+        code="plugin/not-found",
+    )
 
 
 def _names(tree: ast.Module) -> Iterator[str]:
@@ -207,17 +218,35 @@ def _from_file(name: str, kind: str) -> Any:
     path, attribute, tree = _parse_file(name, kind)
     spec = importlib.util.spec_from_file_location(f"snakesim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python")
+        raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python", code="plugin/not-loadable")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     find_siblings_of(path)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise ConfigError(
+            f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}", code="plugin/not-loadable"
+        ) from error
     if not hasattr(module, attribute):
         raise _missing_class_error(name, kind, tree)
     return getattr(module, attribute)
+
+
+def require_base_class(plugin: Any, base: type[ABC], label: str) -> None:
+    """Raise ConfigError if a plugin does not derive from a base class, or does not implement its abstract methods.
+
+    Args:
+        plugin: the object that `find_plugin` has returned.
+        base: the class that describes the interface.
+        label: kind and name of the plugin, with which the error begins.
+    """
+    file = base.__module__.replace(".", "/") + ".py"
+    if not (isinstance(plugin, type) and issubclass(plugin, base)):
+        raise ConfigError(f"{label} is not derived from `{base.__name__}` in {file}: derive its class from that one")
+    missing = sorted(plugin.__abstractmethods__)
+    if missing:
+        raise ConfigError(f"{label} has no {', '.join(missing)}: implement what {file} describes")
 
 
 def plugin_settings(
@@ -237,5 +266,8 @@ def plugin_settings(
     """
     settings = getattr(plugin, "Settings", None)
     if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):
-        raise ConfigError(f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty")
+        raise ConfigError(
+            f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty",
+            code="plugin/not-loadable",
+        )
     return decode(Table(section, source, origin or {}), settings, where)

@@ -23,23 +23,38 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
+    """Seed of the positions, sizes and leans; the same seed gives the same obstacles."""
 
-    # Corners of the rectangle that contains the centers of all obstacles.
     min_corner_m: Point
+    """Corner with the smallest coordinates of the rectangle that contains the centers of all obstacles, as [x, y]."""
+
     max_corner_m: Point
+    """Corner with the largest coordinates of that rectangle, as [x, y]."""
+
     density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
+    """Number of obstacles for each square meter of the rectangle."""
 
     # Sizes: minimum and maximum.
-    radius_m: tuple[Size, Size]  # of a peg
-    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0  # mean fraction of blocks; the other obstacles are pegs
-    box_size_m: tuple[Size, Size] = (0.06, 0.18)  # length and width of a block
+    radius_m: tuple[Size, Size]
+    """Minimum and maximum of the radius of a peg."""
 
-    clearance_m: Clearance  # minimum gap between the surfaces of two obstacles
-    route_clearance_m: Clearance | None = None  # minimum gap between the route and a surface; none: no such gap
+    box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    """Mean fraction of blocks among the obstacles; the others are pegs."""
+
+    box_size_m: tuple[Size, Size] = (0.06, 0.18)
+    """Minimum and maximum of the length and of the width of a block."""
+
+    clearance_m: Clearance
+    """Minimum gap between the surfaces of two obstacles."""
+
+    route_clearance_m: Clearance | None = None
+    """Minimum gap between the route and the surface of an obstacle; none: no such gap."""
+
     height_m: Size = 0.2
+    """Height of every obstacle."""
 
-    # Each obstacle leans by a random angle of at most this, in a random direction.
     lean_up_to_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
+    """Maximum angle by which an obstacle leans, in a random direction; 0: all are upright."""
 
     @property
     def wanted(self) -> int:
@@ -106,7 +121,8 @@ def place_random_obstacles(
     if len(placed) < field.wanted:
         raise ConfigError(
             f"{where}: only {len(placed)} of {field.wanted} pegs fit; lower `density_per_m2` = "
-            f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}"
+            f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}",
+            code="scene/invalid",
         )
     return placed
 
@@ -129,18 +145,23 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
     if not np.all(np.array(field.max_corner_m) > np.array(field.min_corner_m)):
         raise ConfigError(
             f"{where}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
-            f"{field.min_corner_m} in x and y"
+            f"{field.min_corner_m} in x and y",
+            code="scene/invalid",
         )
     for name in ("radius_m", "box_size_m"):
         sizes = getattr(field, name)
         if sizes[1] < sizes[0]:
-            raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest")
+            raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid")
     if field.route_clearance_m is not None and route is None:
-        raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
+        raise ConfigError(
+            f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section",
+            code="scene/no-route",
+        )
     if field.wanted > MAX_RANDOM_OBSTACLES:
         raise ConfigError(
             f"{where}: `density_per_m2` = {field.density_per_m2} asks for {field.wanted} pegs on this area; at most "
-            f"{MAX_RANDOM_OBSTACLES}"
+            f"{MAX_RANDOM_OBSTACLES}",
+            code="scene/invalid",
         )
 
 

@@ -17,7 +17,8 @@ from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, make_joints
 from snakesim_hal.model.links import Link
-from snakesim_hal.model.plugins import SENSORS, find_plugin
+from snakesim_hal.model.plugins import SENSORS, find_plugin, require_base_class
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import CustomSensor, LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -38,49 +39,90 @@ class Chain(FileStruct, frozen=True, kw_only=True):
     """Number of modules, and axes of their joints."""
 
     modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
-    axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]  # a pattern, repeated from tail to head
+    """Number of joint modules, and so of joints; the robot has one link more."""
+
+    axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]
+    """Axes of the joints, `yaw` (left and right) or `pitch` (up and down), as a pattern that is repeated from tail to
+    head.
+    """
 
 
 class Module(FileStruct, frozen=True, kw_only=True):
     """Body of one module."""
 
     length_m: Annotated[float, above(2, "m")]
+    """Distance between the joint axes of two neighboring modules."""
+
     radius_m: Annotated[float, above(1, "m")]
+    """Radius of the body, which has a circular cross-section."""
+
     mass_kg: Annotated[float, above(100, "kg")]
+    """Mass of one module with everything in it."""
 
 
 class Safety(FileStruct, frozen=True, kw_only=True):
     """Behaviour of the joints in a fault, and limits of commands."""
 
-    action: StopMode = "damp"  # what the joints do in a fault
-    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # from the measured angle to a position target
-    max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # with more isolated joints the robot stops
+    action: StopMode = "damp"
+    """Stop mode: what the joints do in a fault. `damp` brakes them, `hold` holds their angles, `passive` switches the
+    motors off.
+    """
+
+    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35
+    """Maximum difference between a position target and the measured angle; the command limiter clips targets beyond it.
+    """
+
+    max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0
+    """Number of faulty joints that may be isolated, so that the robot goes on without them; with one more it stops."""
 
 
 class RobotFile(FileStruct, frozen=True, kw_only=True):
     """A whole robot file."""
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
+    """Name of the robot: letters, digits, `_` and `-`. It is also the default namespace of its keys on the network."""
+
     about: str = ""
+    """Description in one line, which lists of robots show."""
 
     # Body.
     chain: Chain
+    """Number of modules, and the axes of their joints."""
+
     module: Module
-    links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []  # tail to head; none: made of the modules
+    """Size and mass of one module."""
+
+    links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []
+    """Every link, tail to head, for a robot whose links differ; empty: the links follow from the modules."""
 
     # All joints.
     limits: Limits
+    """Limits of every joint."""
+
     motor: Motor
+    """Motor of every joint."""
+
     drive: Drive = Drive()
+    """Connection, mounting and abilities of every joint's drive."""
+
     heat: Heat = Heat()
+    """How every motor warms up."""
+
     supply: Supply = Supply()
+    """Electrical supply of every joint."""
 
     # What differs in single joints, by name.
     joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}
+    """Values that differ in single joints, as sections such as `[joints.joint_3]`; joint_1 is at the tail."""
 
     safety: Safety = Safety()
+    """Stop mode, and limits of commands."""
+
     sensors: Sensors = Sensors()
-    checked: StartCheckRecord | None = None  # record of the last start check
+    """Sensors of the robot."""
+
+    checked: StartCheckRecord | None = None
+    """Record of the last start check, which `snakesim robot check` writes; none: the robot was never checked."""
 
     def __post_init__(self) -> None:
         """Check joints, links and sensors against each other. Raises ValueError, which the file reader explains."""
@@ -288,8 +330,9 @@ def with_serials(robot: Description, serials: Sequence[str], firmware: Sequence[
 def _own_schema(sensor: CustomSensor) -> str:
     """Return the schema of a custom sensor's message. Raises ConfigError if its class cannot be loaded or has none."""
     model = find_plugin(SENSORS, sensor.model)
-    message = getattr(model, "message", None)
-    return make_message_schema(message, f"sensor {sensor.name!r}: model {shorten(sensor.model)}")
+    label = f"sensor {sensor.name!r}: model {shorten(sensor.model)}"
+    require_base_class(model, SensorModel, label)
+    return make_message_schema(model.message, label)
 
 
 def layout_hash(joints: list[JointDescription]) -> str:

@@ -55,51 +55,67 @@ class Start(FileStruct, frozen=True, kw_only=True):
     """Start pose of the snake: along the scene's route, or straight at a pose."""
 
     on_route: bool = True
+    """True: the snake lies along the scene's route; false: it lies straight at a pose."""
 
-    # Used on the route: arc length of the tail end.
     tail_s_m: Annotated[float, Meta(ge=-100, le=1000, extra_json_schema={"unit": "m"})] = 0.0
+    """Arc length of the tail end along the route; used if `on_route` is true."""
 
-    # Used off the route.
-    position_m: Point = (0.0, 0.0)  # of the tail end
+    position_m: Point = (0.0, 0.0)
+    """Position of the tail end in the world frame, as [x, y]; used if `on_route` is false."""
+
     yaw_rad: Heading = 0.0
+    """Direction from the tail to the head in the world frame; used if `on_route` is false."""
 
 
 class HeadingGoal(FileStruct, frozen=True, kw_only=True, tag="heading", tag_field="kind"):
     """Advance the whole body in one direction."""
 
     heading_rad: Heading = 0.0
-    distance_m: Size = 3.0  # from the start pose
+    """Direction of the advance in the world frame; 0: along x."""
+
+    distance_m: Size = 3.0
+    """Distance of the goal from the start pose."""
 
 
 class WaypointGoal(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
     """Take the head from point to point."""
 
     points_m: Annotated[list[Point], Meta(min_length=1, max_length=1000)]
-    within_m: Size = 0.2  # a point this near counts as reached
+    """Points that the head visits in order, in the world frame, as [x, y]."""
+
+    within_m: Size = 0.2
+    """Distance at which a point counts as reached."""
 
 
 class Mission(FileStruct, frozen=True, kw_only=True):
     """The goal of navigation: the end of the scene's route, or with `goal` a path that it plans itself."""
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
+    """Speed along the path that navigation asks for."""
+
     goal: HeadingGoal | WaypointGoal | None = None
-    until_goal: bool = False  # true: the run ends when the goal is reached, even before `duration_s`
+    """Goal to which navigation plans a path, `kind` = "heading" or "waypoints"; none: the end of the scene's route."""
 
-    # known: the obstacles of the scene, as from a survey; perceived: only what the sensors measure.
+    until_goal: bool = False
+    """True: the run ends when the goal is reached, even before `duration_s`."""
+
     map: Literal["known", "perceived"] = "known"
+    """`known`: navigation has the obstacles of the scene, as from a survey; `perceived`: only what the sensors measure.
+    """
 
-    # Standard deviation of each obstacle's position in a known map. The errors follow from the run's seed, so that all
-    # services have the same map.
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
+    """Standard deviation of each obstacle's position in a known map; the errors follow from the run's seed."""
 
-    # Friction of obstacles that navigation assumes when it plans, and the controller when it pushes.
     peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
+    """Friction of obstacles that navigation assumes when it plans, and the controller when it pushes."""
 
-    # Highest `step` of a known map that a robot with pitch joints climbs.
     max_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1
+    """Height of the highest `step` of a known map that a robot with pitch joints climbs."""
 
-    # pose_sensor: from the pose sensor if there is one; dead_reckoning: from joints, IMU, contacts and the map alone.
     localization: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
+    """`pose_sensor`: the pose comes from the pose sensor if there is one; `dead_reckoning`: from joints, IMU, contacts
+    and the map alone.
+    """
 
     def __post_init__(self) -> None:
         """Check that survey errors come with a known map, and `until_goal` with a goal. Raises ValueError."""
@@ -109,7 +125,7 @@ class Mission(FileStruct, frozen=True, kw_only=True):
             raise ValueError("`until_goal`: this mission has no goal to reach; give it one in [mission.goal]")
 
 
-class Service(FileStruct, frozen=True, kw_only=True):
+class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
     """A process of the run that acts every `decimation` ticks.
 
     In lockstep, the output that a service computes for tick t is used from tick t + latency_ticks on, no matter when
@@ -118,19 +134,23 @@ class Service(FileStruct, frozen=True, kw_only=True):
     in which control and physics overlap.
     """
 
-    decimation: Annotated[int, Meta(ge=1, le=1000)] = 1  # acts on every n-th tick
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 1
+    """The service acts in every n-th control cycle."""
+
     latency_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
+    """Control cycles from the input of the service to the cycle in which its output is used, in lockstep."""
 
-    # With `snakesim run --stay`, true: the run starts its process again when it ends; false: the run ends with it.
     restart: bool = True
+    """With `snakesim run --stay`, true: the run starts the process again when it ends; false: the run ends with it."""
 
-    external: bool = False  # true: the run waits for its process, but does not start it
+    external: bool = False
+    """True: the run waits for the process of the service, but does not start it."""
 
-    # process: a process of its own; host: a thread in the process of the HAL host, beside the driver.
     place: Literal["process", "host"] = "process"
+    """`process`: the service has a process; `host`: it is a thread in the process of the HAL host."""
 
-    # The name of an installed service, or ./file.py:Class; empty: the installed service of the section's name.
     code: str = ""
+    """Name of an installed service, or ./file.py:Class; empty: the installed service of the section's name."""
 
     def used_output_tick(self, tick: int) -> int:
         """Return the newest tick whose output is used at `tick`; at the start, the output of tick 0 is used early."""
@@ -149,50 +169,92 @@ class MaxAge(FileStruct, frozen=True, kw_only=True):
     """
 
     joints_s: Seconds | None = None
+    """Maximum age of the joint states; none: it follows from rates, delays and schedules."""
+
     pose_s: Seconds | None = None
+    """Maximum age of the pose; none: it follows from rates, delays and schedules."""
+
     contacts_s: Seconds | None = None
-    depth_s: Seconds | None = None  # of the newest image or ranges in a perceived map
+    """Maximum age of the contacts; none: it follows from rates, delays and schedules."""
+
+    depth_s: Seconds | None = None
+    """Maximum age of the newest image or ranges in a perceived map; none: it follows from rates, delays and schedules.
+    """
+
     world_s: Seconds | None = None
+    """Maximum age of the world that guidance publishes; none: it follows from rates, delays and schedules."""
+
     trajectory_s: Seconds | None = None
+    """Maximum age of the trajectory that navigation publishes; none: it follows from rates, delays and schedules."""
 
 
 class RunConfig(FileStruct, frozen=True, kw_only=True):
     """The whole configuration of a run."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
+    """Name of the scenario; a file may leave it out, and has its file name then."""
+
     title: str = ""
+    """Description in one line, which lists of scenarios show."""
 
     # What runs.
     robot: RobotFile
+    """The robot: in a file the name of a shipped robot or the path of a robot file, or a whole section."""
+
     scene: SceneFile
+    """The scene: in a file the name of a shipped scene or the path of a scene file, or a whole section."""
+
     backend: str = "sim"
+    """Backend that drives the robot: the name of an installed backend, or ./file.py:Class."""
+
     controller: str
+    """Controller: the name of an installed controller, `policy:MODEL`, or ./file.py:Class."""
 
     # Time.
     clock_mode: ClockMode = "lockstep"
-    rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0  # of the control cycle
-    duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0  # robot time
+    """How robot time passes. `realtime`: by the wall clock; `lockstep`: the host waits for the services in every cycle;
+    `free`: as fast as possible.
+    """
+
+    rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
+    """Rate of the control cycle."""
+
+    duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
+    """Duration of the run in robot time."""
+
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    """Seed of all random numbers of the run."""
 
-    # Injected faults, at times since the first arming: see snakesim_hal.model.fault_kinds.
     faults: list[str] = []
-    allow_fault_injection: bool = False  # true: also on a robot whose motors really move
+    """Faults to inject, at times since the first arming, such as "kill:control@2"; see docs/injector.md."""
 
-    # In lockstep: the time for which the host waits for the output of a service, before it continues without it.
+    allow_fault_injection: bool = False
+    """True: faults may be injected also on a robot whose motors really move."""
+
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
+    """Wall time for which the host waits in lockstep for the output of a service, before it continues without it."""
 
-    # The time within which all services must be ready to arm.
     start_limit_s: Annotated[float, Meta(gt=0, le=3600, extra_json_schema={"unit": "s"})] = 60.0
+    """Wall time within which all services must be ready to arm."""
 
     # What the parts of the run do.
     start: Start = Start()
-    mission: Mission = Mission()
-    services: dict[str, Service]  # by name
-    max_age: MaxAge = MaxAge()
+    """Start pose of the snake."""
 
-    # Parameters of each controller and settings of each backend, by name. The plugins check them.
+    mission: Mission = Mission()
+    """Speed and goal of the motion, and what navigation knows."""
+
+    services: dict[str, ServiceSchedule]
+    """Processes of the run by name, as sections such as `[services.control]`."""
+
+    max_age: MaxAge = MaxAge()
+    """Maximum ages of the inputs of control."""
+
     controllers: dict[str, dict[str, Any]] = {}
+    """Parameters of each controller by its name, as sections such as `[controllers.obstacle_aided]`."""
+
     backends: dict[str, dict[str, Any]] = {}
+    """Settings of each backend by its name, as sections such as `[backends.sim]`."""
 
     @property
     def control_section(self) -> str:
@@ -200,7 +262,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return f"controllers.{_section_name(self.controller)}"
 
     @property
-    def control_settings(self) -> dict[str, Any]:
+    def controller_parameters(self) -> dict[str, Any]:
         """Return the parameters of the chosen controller."""
         return self.controllers.get(_section_name(self.controller), {})
 
@@ -215,7 +277,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return self.backends.get(_section_name(self.backend), {})
 
     @property
-    def own_services(self) -> dict[str, Service]:
+    def own_services(self) -> dict[str, ServiceSchedule]:
         """Return the services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
 
@@ -235,7 +297,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         if not self.has_own_control:
             return "external"
         if self.controller == POLICY_CONTROLLER:
-            model = self.control_settings.get("model")
+            model = self.controller_parameters.get("model")
             if model:
                 return f"{POLICY}{model}"
         return self.controller
@@ -301,7 +363,10 @@ def parse_set(text: str) -> Override:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or not key:
-        raise ConfigError(f"--set {shorten(text)}: give section.key=value, such as --set control.propulsion_n=35")
+        raise ConfigError(
+            f"--set {shorten(text)}: give section.key=value, such as --set control.propulsion_n=35",
+            code="command/invalid-option",
+        )
     try:
         parsed = parse_toml(f"value = {value}", "--set")["value"]
     except ConfigError:
@@ -419,7 +484,8 @@ def check(config: RunConfig) -> None:
     if config.start.on_route and config.scene.route is None:
         raise ConfigError(
             f"scenario {config.name!r}: `start.on_route` is true but scene {config.scene.name!r} has no route; "
-            f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene"
+            f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene",
+            code="scene/no-route",
         )
     angles_rad = find_start_pose(config).angles_rad.tolist()
     for joint, angle_rad in zip(config.robot.joint_table, angles_rad, strict=True):
@@ -435,12 +501,14 @@ def _start_angle_error(config: RunConfig, joint: Joint, angle_rad: float) -> Con
         return ConfigError(
             f"robot {config.robot.name!r}: {joint.name} may turn from {limits.lower_rad:g} to "
             f"{limits.upper_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
-            f"start it on a route that suits them"
+            f"start it on a route that suits them",
+            code="config/out-of-range",
         )
     return ConfigError(
         f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
         f"{config.robot.name!r} allows {limits.lower_rad:g} to {limits.upper_rad:g} rad. Choose a "
-        f"smoother route"
+        f"smoother route",
+        code="config/out-of-range",
     )
 
 

@@ -26,79 +26,136 @@ from snakesim_hal.wire.quantities import Name, above
 class Heightfield(FileStruct, frozen=True, kw_only=True):
     """Smooth random hills."""
 
-    height_m: Annotated[float, above(1, "m")]  # from the lowest to the highest point
-    wavelength_m: Annotated[float, above(100, "m")]  # typical distance between two hills
-    area_m: Annotated[float, above(200, "m")] = 20.0  # edge length of the square around the origin
+    height_m: Annotated[float, above(1, "m")]
+    """Height from the lowest to the highest point of the ground."""
+
+    wavelength_m: Annotated[float, above(100, "m")]
+    """Typical distance between two hills."""
+
+    area_m: Annotated[float, above(200, "m")] = 20.0
+    """Edge length of the square around the origin that has hills."""
+
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    """Seed of the random hills; the same seed gives the same hills."""
 
 
 class Ground(FileStruct, frozen=True, kw_only=True):
     """The ground, and its friction."""
 
     friction: Friction
+    """Coulomb friction between the ground and the snake."""
+
     heightfield: Heightfield | None = None
+    """Random hills; none: the ground is flat."""
 
 
 class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="kind"):
     """y = amplitude sin(2 pi x / wavelength), from x = 0."""
 
     amplitude_m: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m"})]
+    """Amplitude of the sine along y."""
+
     wavelength_m: Size
-    length_m: Size  # along x
+    """Wavelength of the sine along x."""
+
+    length_m: Size
+    """Length of the route along x."""
 
 
 class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
     """Straight lines between points; use many points for a smooth curve."""
 
     points_m: Annotated[list[Point], Meta(min_length=2, max_length=20000)]
+    """Points of the route in the world frame, as [x, y], from its start to its end."""
 
 
 class Cylinder(Upright, frozen=True, kw_only=True):
     """A peg."""
 
     position_m: Point
+    """Center of the foot in the world frame, as [x, y]."""
+
     radius_m: Size
+    """Radius of the peg."""
+
     height_m: Size = 0.2
+    """Height of the peg."""
+
     name: Name | None = None
+    """Name, which no other obstacle has; none: `cylinder_` with its number in the file."""
 
 
 class Box(Upright, frozen=True, kw_only=True):
     """A block."""
 
     position_m: Point
+    """Center of the foot in the world frame, as [x, y]."""
+
     size_m: tuple[Size, Size, Size]
+    """Length, width and height of the block."""
+
     yaw_rad: Heading = 0.0
+    """Rotation about the vertical; 0: its length is along x."""
+
     name: Name | None = None
+    """Name, which no other obstacle has; none: `box_` with its number in the file."""
 
 
 class Sphere(Solid, frozen=True, kw_only=True):
     """A ball; one that slides does not roll."""
 
     position_m: Point
+    """Center in the world frame, as [x, y]."""
+
     radius_m: Size
+    """Radius of the ball."""
+
     center_height_m: Coordinate = 0.0
+    """Height of the center above the ground."""
+
     name: Name | None = None
+    """Name, which no other obstacle has; none: `sphere_` with its number in the file."""
 
 
 class Wall(Upright, frozen=True, kw_only=True):
     """A straight wall between two points."""
 
     from_m: Point
+    """One end of the wall in the world frame, as [x, y]."""
+
     to_m: Point
+    """The other end of the wall in the world frame, as [x, y]."""
+
     thickness_m: Size = 0.05
+    """Thickness of the wall."""
+
     height_m: Size = 0.3
+    """Height of the wall."""
+
     name: Name | None = None
+    """Name, which no other obstacle has; none: `wall_` with its number in the file."""
 
 
 class Step(FileStruct, frozen=True, kw_only=True):
     """A low platform that the snake may lie on or climb."""
 
     position_m: Point
+    """Center of the foot in the world frame, as [x, y]."""
+
     size_m: tuple[Size, Size]
+    """Length and width of the platform."""
+
     height_m: Annotated[float, above(2, "m")]
+    """Height of the platform."""
+
     yaw_rad: Heading = 0.0
+    """Rotation about the vertical; 0: its length is along x."""
+
     friction: Friction = 0.5
+    """Coulomb friction between the platform and the snake."""
+
     name: Name | None = None
+    """Name, which no other obstacle has; none: `step_` with its number in the file."""
 
 
 class PegsAlongRoute(Upright, frozen=True, kw_only=True):
@@ -109,10 +166,19 @@ class PegsAlongRoute(Upright, frozen=True, kw_only=True):
     """
 
     corridor_m: Size
-    radius_m: Size  # of a peg
-    count: Annotated[int, Meta(ge=1, le=2000)]  # pegs
-    first: Annotated[int, Meta(ge=0, le=2000)] = 0  # inflections to skip at the start
+    """Distance from the route to a peg's surface."""
+
+    radius_m: Size
+    """Radius of every peg."""
+
+    count: Annotated[int, Meta(ge=1, le=2000)]
+    """Number of pegs, one at each inflection of the route."""
+
+    first: Annotated[int, Meta(ge=0, le=2000)] = 0
+    """Number of inflections without a peg at the start of the route."""
+
     height_m: Size = 0.2
+    """Height of every peg."""
 
 
 SAMPLES = 24  # points along a link's axis at which the distance to obstacles is computed
@@ -123,27 +189,54 @@ MAX_OBSTACLES = 4096  # bound of the message World
 class ReferenceRobot(FileStruct, frozen=True, kw_only=True):
     """The body that a scene was laid out for; for another robot the scene is scaled in proportion, see fitting.py."""
 
-    spacing_m: Size  # longest distance between two neighboring yaw joints
+    spacing_m: Size
+    """Longest distance between two neighboring yaw joints."""
+
     radius_m: Size
+    """Radius of the body."""
 
 
 class SceneFile(FileStruct, frozen=True, kw_only=True):
     """A whole scene file."""
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
+    """Name of the scene: letters, digits, `_` and `-`."""
+
     about: str = ""
+    """Description in one line, which lists of scenes show."""
+
     ground: Ground
-    reference_robot: ReferenceRobot | None = None  # none: the scene is the same for every robot
+    """The ground, and its friction."""
+
+    reference_robot: ReferenceRobot | None = None
+    """Body that the scene was laid out for, and in proportion to which it is scaled; none: it is the same for every
+    robot.
+    """
+
     route: SineRoute | WaypointRoute | None = None
+    """Route of the snake, `kind` = "sine" or "waypoints"; none: the scene has no route."""
 
     # Obstacles.
     cylinder: list[Cylinder] = []
+    """Pegs, each an entry `[[cylinder]]`."""
+
     box: list[Box] = []
+    """Blocks, each an entry `[[box]]`."""
+
     sphere: list[Sphere] = []
+    """Balls, each an entry `[[sphere]]`."""
+
     wall: list[Wall] = []
+    """Straight walls, each an entry `[[wall]]`."""
+
     step: list[Step] = []
+    """Low platforms that the snake may lie on or climb, each an entry `[[step]]`."""
+
     pegs_along_route: list[PegsAlongRoute] = []
+    """Rows of pegs beside the route, each an entry `[[pegs_along_route]]`."""
+
     random_field: list[RandomField] = []
+    """Areas with randomly placed obstacles, each an entry `[[random_field]]`."""
 
 
 def make_route(scene: SceneFile) -> Route | None:
@@ -161,7 +254,7 @@ def make_route(scene: SceneFile) -> Route | None:
             try:
                 return Route(np.asarray(points))
             except ValueError as error:
-                raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}") from None
+                raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}", code="scene/invalid") from None
 
 
 class Placed(Upright, frozen=True, kw_only=True):
@@ -205,7 +298,9 @@ def _check_count(scene: SceneFile) -> None:
     count += sum(row.count for row in scene.pegs_along_route)
     count += sum(min(field.wanted, MAX_RANDOM_OBSTACLES) for field in scene.random_field)
     if count > MAX_OBSTACLES:
-        raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
+        raise ConfigError(
+            f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed", code="scene/invalid"
+        )
 
 
 def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
@@ -213,7 +308,10 @@ def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
     counts = Counter(item.obstacle.name for item in placed)
     duplicates = sorted(name for name, count in counts.items() if count > 1)
     if duplicates:
-        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {duplicates[0]!r}; rename one")
+        raise ConfigError(
+            f"scene {scene.name!r}: two obstacles are called {duplicates[0]!r}; rename one",
+            code="config/duplicate-name",
+        )
 
 
 def _with_material(obstacle: Obstacle, solid: Solid) -> Placed:
@@ -252,7 +350,9 @@ def _placed_wall(scene: SceneFile, index: int, wall: Wall) -> Placed:
     run_y = to_y - from_y
     length_m = math.hypot(run_x, run_y)
     if length_m == 0:
-        raise ConfigError(f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point")
+        raise ConfigError(
+            f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point", code="scene/invalid"
+        )
     name = wall.name or f"wall_{index}"
     middle_m = ((from_x + to_x) / 2, (from_y + to_y) / 2)
     size_m = (length_m, wall.thickness_m, wall.height_m)
@@ -275,14 +375,15 @@ def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: 
     """
     where = f"scene {scene.name!r}: `pegs_along_route.{index}`"
     if route is None:
-        raise ConfigError(f"{where}: the scene has no route; add a [route] section")
+        raise ConfigError(f"{where}: the scene has no route; add a [route] section", code="scene/no-route")
     inflections_s_m = route.inflections_s_m()
     used_s_m = inflections_s_m[row.first : row.first + row.count]
     if len(used_s_m) < row.count:
         available = len(inflections_s_m)
         raise ConfigError(
             f"{where}: `count` = {row.count} pegs from inflection {row.first} on, but the route has {available} "
-            f"inflections; make the route longer or `count` at most {max(available - row.first, 0)}"
+            f"inflections; make the route longer or `count` at most {max(available - row.first, 0)}",
+            code="scene/invalid",
         )
     start_w, end_w = route.position_w(np.array([0.0, route.length_m]))
     forward = (end_w - start_w) / np.linalg.norm(end_w - start_w)
@@ -334,7 +435,8 @@ def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) ->
         raise ConfigError(
             f"scene {scene.name!r}: obstacle {obstacles[obstacle_index].name!r} overlaps {snake[link_index].name} of "
             f"the snake at its start by {overlap_mm:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
-            f"change [start] in the scenario"
+            f"change [start] in the scenario",
+            code="scene/overlap",
         )
 
 

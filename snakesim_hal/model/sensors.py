@@ -36,43 +36,67 @@ class JointSensor(FileStruct, frozen=True, kw_only=True):
     """Angle, velocity and torque of every joint. No rate: a sample every tick."""
 
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    """Time from the measurement to its arrival at the host."""
+
     angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
+    """Standard deviation of the noise of every angle."""
+
     velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    """Standard deviation of the noise of every angular velocity."""
+
     torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
+    """Standard deviation of the noise of every torque."""
 
 
 class _Sampled(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    """Number of samples per second; at most the rate of the control cycle."""
+
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    """Time from the measurement to its arrival at the host."""
 
 
 class ContactSensor(_Sampled, frozen=True, kw_only=True):
     """Contacts of the links with obstacles."""
 
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    """Standard deviation of the noise of each coordinate of a contact."""
+
     force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
-    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker contacts are not detected
+    """Standard deviation of the noise of each component of a contact force."""
+
+    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0
+    """Force below which a contact is not detected."""
 
 
 class ImuSensor(_Sampled, frozen=True, kw_only=True):
     """Angular velocity and acceleration (gravity included) of every link."""
 
     angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    """Standard deviation of the noise of each component of the angular velocity."""
+
     acceleration_noise_m_s2: Annotated[float, from_zero(100, "m/s²")] = 0.0
+    """Standard deviation of the noise of each component of the acceleration."""
 
 
 class PoseSensor(_Sampled, frozen=True, kw_only=True):
     """Pose of the base, from motion capture."""
 
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    """Standard deviation of the noise of each coordinate of the base."""
+
     angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
+    """Standard deviation of the noise of the orientation, about each axis."""
 
 
 class PowerSensor(FileStruct, frozen=True, kw_only=True):
     """Supply, temperatures and leaks of every joint module. Modules on a bus report them at their own rate."""
 
     rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
+    """Number of samples per second; modules on a bus report at a rate that their firmware sets."""
+
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    """Time from the measurement to its arrival at the host."""
 
 
 class Mounted(FileStruct, frozen=True, kw_only=True):
@@ -82,45 +106,69 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
+    """Name of the sensor, which ends its key; it differs from those of all sensors of the same kind."""
 
-    # Pose. The viewing direction is the link's x axis, rotated about z by `yaw_rad` (positive to the left) and then
-    # about y by `pitch_rad` (positive downwards).
-    link: LinkName = "head"  # head, tail, or the number of a link from 0 at the tail
-    position_m: tuple[Offset, Offset, Offset] | None = None  # in the link's frame; none: the tip of the head
+    link: LinkName = "head"
+    """Link that carries the sensor: `head`, `tail`, or the number of a link from 0 at the tail."""
+
+    position_m: tuple[Offset, Offset, Offset] | None = None
+    """Position of the sensor in the link's frame; none: the tip of the head."""
+
     yaw_rad: Angle = 0.0
+    """Rotation of the viewing direction, the link's x axis, about z; positive: to the left."""
+
     pitch_rad: Angle = 0.0
+    """Rotation of the viewing direction about y, after the yaw; positive: downwards."""
 
     # Time.
     rate_hz: Annotated[float, above(1000, "Hz")] = 20.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.03
+    """Number of samples per second; at most the rate of the control cycle."""
 
-    settings: dict[str, Any] = {}  # of its model, which checks them
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.03
+    """Time from the measurement to its arrival at the host; at least one control period."""
+
+    settings: dict[str, Any] = {}
+    """Settings of the sensor's model, which checks them."""
 
 
 class DistanceSensor(Mounted, frozen=True, kw_only=True):
     """A sensor that measures distances from its position."""
 
     noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    """Standard deviation of the noise of every distance."""
 
-    # Fraction of the pixels or beams that measure nothing.
     dropout: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "1"})] = 0.0
-    model: Model = "rays"  # by which the simulator makes its samples
+    """Fraction of the pixels or beams that measure nothing."""
+
+    model: Model = "rays"
+    """Model by which the simulator makes samples: `rays`, another installed model, or ./file.py:Class."""
 
 
 class DepthCamera(DistanceSensor, frozen=True, kw_only=True):
     """Distances along the optical axis, in an image of square pixels without distortion."""
 
     # Image.
-    width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160  # pixels
-    height: Annotated[int, Meta(ge=1, le=MAX_IMAGE_HEIGHT)] = 120  # pixels
-    fov_rad: Annotated[float, above(3, "rad")] = 1.5708  # from the left edge to the right edge
+    width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160
+    """Width of the image in pixels."""
+
+    height: Annotated[int, Meta(ge=1, le=MAX_IMAGE_HEIGHT)] = 120
+    """Height of the image in pixels."""
+
+    fov_rad: Annotated[float, above(3, "rad")] = 1.5708
+    """Horizontal field of view, from the left edge of the image to its right edge."""
 
     # Distances.
     range_min_m: Annotated[float, from_zero(60, "m")] = 0.1
-    range_max_m: Annotated[float, above(60, "m")] = 5.0
-    noise_m_per_m2: Annotated[float, from_zero(1, "m/m²")] = 0.0  # additional noise per square of the distance
+    """Shortest distance that is measured."""
 
-    color: bool = False  # true: also a color image, which the simulator renders with OpenGL
+    range_max_m: Annotated[float, above(60, "m")] = 5.0
+    """Longest distance that is measured."""
+
+    noise_m_per_m2: Annotated[float, from_zero(1, "m/m²")] = 0.0
+    """Additional noise for each square meter of squared distance, as a standard deviation."""
+
+    color: bool = False
+    """True: the camera also publishes a color image, which the simulator renders with OpenGL."""
 
     def __post_init__(self) -> None:
         """Check the range. Raises ValueError, which the file reader explains."""
@@ -136,9 +184,16 @@ class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
     """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
-    fov_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0  # from the first beam, on the right, to the last beam
+    """Number of beams, evenly distributed over the field of view."""
+
+    fov_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0
+    """Field of view, from the first beam on the right to the last beam; 0 for a single beam."""
+
     range_min_m: Annotated[float, from_zero(1000, "m")] = 0.02
+    """Shortest distance that is measured."""
+
     range_max_m: Annotated[float, above(1000, "m")] = 5.0
+    """Longest distance that is measured."""
 
     def __post_init__(self) -> None:
         """Check range and beams. Raises ValueError, which the file reader explains."""
@@ -152,7 +207,8 @@ class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
 class CustomSensor(Mounted, frozen=True, kw_only=True):
     """A custom sensor: the class in `model` defines its message, see docs/sensors.md."""
 
-    model: Model  # the name of an installed sensor, or ./file.py:Class
+    model: Model
+    """Class that defines the sensor and its message: the name of an installed sensor, or ./file.py:Class."""
 
 
 def _check_range(min_m: float, max_m: float) -> None:
@@ -162,20 +218,36 @@ def _check_range(min_m: float, max_m: float) -> None:
 
 
 AnyMounted = DepthCamera | RangeSensor | CustomSensor
-AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | AnyMounted
+BodySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor
+AnySensor = BodySensor | AnyMounted
 
 
 class Sensors(FileStruct, frozen=True, kw_only=True):
     """The sensors of the robot; without its section a sensor is absent."""
 
     joints: JointSensor = JointSensor()
+    """Angle, velocity and torque of every joint, in every control cycle."""
+
     contacts: ContactSensor | None = None
+    """Contacts of the links with obstacles; none: they are not measured."""
+
     imu: ImuSensor | None = None
+    """Angular velocity and acceleration of every link; none: they are not measured."""
+
     pose: PoseSensor | None = None
+    """Pose of the base from motion capture; none: it is not measured."""
+
     power: PowerSensor | None = None
+    """Supply, temperatures and leaks of the joint modules; none: they are not measured."""
+
     depth: Annotated[list[DepthCamera], Meta(max_length=MAX_MOUNTED)] = []
+    """Depth cameras, each an entry `[[sensors.depth]]`."""
+
     range: Annotated[list[RangeSensor], Meta(max_length=MAX_MOUNTED)] = []
+    """Range sensors, each an entry `[[sensors.range]]`."""
+
     own: Annotated[list[CustomSensor], Meta(max_length=MAX_OWN_SENSORS)] = []
+    """Custom sensors, each an entry `[[sensors.own]]`."""
 
     def __post_init__(self) -> None:
         """Check that no two sensors of a kind have the same name. Raises ValueError, which the file reader explains."""

@@ -28,7 +28,7 @@ def shared_settings(config: RunConfig) -> dict[str, str]:
         "mission": _hash(config.mission),
         "services": _hash(schedules),
         "max_age": _hash(config.max_age),
-        "controller": f"{config.controller.rpartition(':')[2][:40]} {_hash(config.control_settings)}",
+        "controller": f"{config.controller.rpartition(':')[2][:40]} {_hash(config.controller_parameters)}",
     }
 
 

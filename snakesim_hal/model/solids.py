@@ -17,14 +17,17 @@ MAX_LEAN_RAD = 0.6
 class Solid(FileStruct, frozen=True, kw_only=True):
     """An obstacle that the snake can push against. By default it is rigid, and fixed to the ground."""
 
-    friction: Friction = PEG_FRICTION  # between it and the snake
+    friction: Friction = PEG_FRICTION
+    """Coulomb friction between the obstacle and the snake."""
 
-    # Stiffness of a spring that holds the obstacle at its position, or where it has slid to; null: rigid.
     stiffness_n_per_m: Annotated[float, Meta(ge=10, le=1e6, extra_json_schema={"unit": "N/m"})] | None = None
+    """Stiffness of the spring that holds the obstacle at its position, or where it has slid to; none: it is rigid."""
 
-    # With a mass it slides on the ground when it is pushed; null: fixed to the ground.
     mass_kg: Annotated[float, Meta(ge=0.01, le=1000, extra_json_schema={"unit": "kg"})] | None = None
-    base_friction: Friction = BASE_FRICTION  # between it and the ground
+    """Mass of an obstacle that slides on the ground when it is pushed; none: it is fixed to the ground."""
+
+    base_friction: Friction = BASE_FRICTION
+    """Coulomb friction between the obstacle and the ground on which it slides."""
 
     @property
     def yields(self) -> bool:
@@ -42,8 +45,11 @@ class Solid(FileStruct, frozen=True, kw_only=True):
 class Upright(Solid, frozen=True, kw_only=True):
     """A solid with an axis, which may lean about the middle of its foot."""
 
-    lean_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0  # from upright
-    lean_towards_rad: Heading = 0.0  # direction in which its top leans, seen from above; 0: along x
+    lean_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
+    """Angle by which its axis leans from the vertical, about the middle of its foot."""
+
+    lean_towards_rad: Heading = 0.0
+    """Direction in which its top leans, seen from above; 0: along x."""
 
 
 def material_fields(solid: Solid) -> dict[str, Any]:

@@ -45,12 +45,13 @@ def read_text(path: Path) -> str:
     """Return a whole file as text, without a byte-order mark. Raises ConfigError if it is not UTF-8 text."""
     data = read_bytes(path)
     if data.startswith(_UTF16) or b"\0" in data:
-        raise ConfigError(f"{path}: is UTF-16 text, or not text; save it as UTF-8")
+        raise ConfigError(f"{path}: is UTF-16 text, or not text; save it as UTF-8", code="file/invalid-syntax")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"{path}: is not UTF-8 text: byte 0x{data[error.start]:02x} at {error.start}; save it as UTF-8"
+            f"{path}: is not UTF-8 text: byte 0x{data[error.start]:02x} at {error.start}; save it as UTF-8",
+            code="file/invalid-syntax",
         ) from None
 
 
@@ -64,14 +65,16 @@ def read_bytes(path: Path) -> bytes:
             with os.fdopen(descriptor, "rb") as file:
                 data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{_hint_for_missing(path)}") from None
+        raise ConfigError(f"{path}: no such file{_hint_for_missing(path)}", code="file/not-found") from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}", code="file/not-readable") from None
     except ValueError as error:  # a NUL in the name
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
+        raise ConfigError(f"{path}: cannot be read: {error}", code="file/not-readable") from None
     _check_plain(path, mode)
     if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: is larger than {MAX_BYTES // MB} MB, the limit of a settings file")
+        raise ConfigError(
+            f"{path}: is larger than {MAX_BYTES // MB} MB, the limit of a settings file", code="file/too-large"
+        )
     return data
 
 
@@ -98,7 +101,7 @@ def _check_plain(path: Path, mode: int) -> None:
     """Raise ConfigError if a path is a folder, a pipe, a device or a symbolic link."""
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), "something else")
-        raise ConfigError(f"{path}: is {kind}, not a file; name a file")
+        raise ConfigError(f"{path}: is {kind}, not a file; name a file", code="file/not-readable")
 
 
 def parse_json(text: str, source: str) -> Any:
@@ -109,10 +112,14 @@ def parse_json(text: str, source: str) -> Any:
 def parse_toml(text: str, source: str) -> dict[str, Any]:
     """Return the values of a TOML text. Raises ConfigError, which names the source."""
     if len(text) > MAX_TOML:
-        raise ConfigError(f"{source}: is larger than {MAX_TOML // MB} MB; make it smaller, or write it as JSON")
+        raise ConfigError(
+            f"{source}: is larger than {MAX_TOML // MB} MB; make it smaller, or write it as JSON", code="file/too-large"
+        )
     deep_key = _DEEP_KEY.search(text)
     if deep_key:
-        raise ConfigError(f"{source}: key `{deep_key[0][:40]}...` has more than {MAX_DEPTH} parts")
+        raise ConfigError(
+            f"{source}: key `{deep_key[0][:40]}...` has more than {MAX_DEPTH} parts", code="file/too-large"
+        )
     return _parsed(text, source, tomllib.loads, "TOML")
 
 
@@ -121,9 +128,11 @@ def _parsed(text: str, source: str, parse: Callable[[str], Any], language: str) 
     try:
         value = parse(text)
     except RecursionError:
-        raise ConfigError(f"{source}: not valid {language}: nested deeper than {MAX_DEPTH} levels") from None
+        raise ConfigError(
+            f"{source}: not valid {language}: nested deeper than {MAX_DEPTH} levels", code="file/too-large"
+        ) from None
     except ValueError as error:  # the parser's own; or a number of thousands of digits
-        raise ConfigError(f"{source}: not valid {language}: {error}") from None
+        raise ConfigError(f"{source}: not valid {language}: {error}", code="file/invalid-syntax") from None
     _check_depth(value, source)
     return value
 
@@ -138,7 +147,7 @@ def check_brackets(text: str, source: str) -> None:
     for bracket in re.findall(r"[][{}]", text):
         depth += 1 if bracket in "[{" else -1
         if depth > MAX_DEPTH:
-            raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels")
+            raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels", code="file/too-large")
 
 
 def _check_depth(value: Any, source: str) -> None:
@@ -154,7 +163,7 @@ def _check_depth(value: Any, source: str) -> None:
         containers = [part for part in inner if isinstance(part, dict | list)]
         if not containers:
             return
-    raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels")
+    raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels", code="file/too-large")
 
 
 @contextlib.contextmanager
@@ -173,7 +182,8 @@ def exported(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be written: {_reason(error)}. What was there before is unchanged. Make room, or choose "
-            "another place with --out"
+            "another place with --out",
+            code="file/not-writable",
         ) from None
 
 
@@ -200,4 +210,4 @@ def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
         write_atomically(path, text.encode(encoding))
     except OSError as error:
         why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"{path}: cannot be written: {why}") from None
+        raise ConfigError(f"{path}: cannot be written: {why}", code="file/not-writable") from None

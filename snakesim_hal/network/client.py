@@ -101,7 +101,9 @@ class Client:
         """
         robot = self._filter.robot or self._fetch_description(timeout_s)
         if robot is None:
-            raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
+            raise NotConnectedError(
+                f"no robot description within {timeout_s} s; is the robot's HAL host running?", code="network/no-robot"
+            )
         self._filter.robot = robot
         return robot
 

@@ -42,7 +42,8 @@ class CommandingClient:
         if session.present(keys.alive_key(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
-                "--set services.control.external=true"
+                "--set services.control.external=true",
+                code="robot/has-controller",
             )
         self._client = Client(session, CONTROL, clock_mode=clock_mode)
         self._feeds: dict[str, Feed] = {}
@@ -102,7 +103,10 @@ class CommandingClient:
         if not isinstance(joints, JointState) or self.clock is None:
             return
         if not self._holds_lease:
-            raise RefusedError(f"the right to command is lost: {self._commander.refusal or 'no command came in time'}")
+            raise RefusedError(
+                f"the right to command is lost: {self._commander.refusal or 'no command came in time'}",
+                code="robot/lease-lost",
+            )
         self._commander.send(self.clock, joints, points)
         self._last_setpoints = points
 

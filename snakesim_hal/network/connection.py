@@ -142,14 +142,18 @@ def _describe_failure(link: Link, error: zenoh.ZError) -> NotConnectedError:
     if link.listen:
         return NotConnectedError(
             f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
-            f"choose one with --endpoint tcp/127.0.0.1:PORT"
+            f"choose one with --endpoint tcp/127.0.0.1:PORT",
+            code="network/port-in-use",
         )
     if link.session is not None:
         return NotConnectedError(
             f"nothing on {', '.join(link.session.endpoints)} lets {link.session.path} in: no router runs there, or "
-            f"it does not accept the certificate; RUST_LOG=zenoh=warn says more"
+            f"it does not accept the certificate; RUST_LOG=zenoh=warn says more",
+            code="certificate/rejected",
         )
-    return NotConnectedError(f"nothing listens on {link.endpoint}; start a run or a router there first")
+    return NotConnectedError(
+        f"nothing listens on {link.endpoint}; start a run or a router there first", code="network/nothing-listens"
+    )
 
 
 @contextmanager

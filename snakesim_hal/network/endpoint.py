@@ -30,11 +30,16 @@ def check_endpoint(text: str, origin: str) -> str:
         return text
     parts = _parts.fullmatch(text)
     if parts is None:
-        raise ConfigError(f"{given}: this is not an endpoint; give one {VALID}")
+        raise ConfigError(f"{given}: this is not an endpoint; give one {VALID}", code="network/invalid-address")
     if parts["protocol"] not in PROTOCOLS:
-        raise ConfigError(f"{given}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID}")
+        raise ConfigError(
+            f"{given}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID}",
+            code="network/invalid-address",
+        )
     if not 1 <= int(parts["port"]) <= 65535:
-        raise ConfigError(f"{given}: the port is a number from 1 to 65535; give an endpoint {VALID}")
+        raise ConfigError(
+            f"{given}: the port is a number from 1 to 65535; give an endpoint {VALID}", code="network/invalid-address"
+        )
     return text
 
 
@@ -49,8 +54,9 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
     raise ConfigError(
         f"{origin} {shorten(endpoint)}: anyone who reaches this address could command the robot, because "
         "clients are not "
-        f"authenticated. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
-        f"`snakesim run --router ENDPOINT`), or accept it with --insecure"
+        f"authenticated. Listen on loopback, let the robot join a router with access control (`snakesim start router "
+        f"FILE`, `snakesim run --router ENDPOINT`), or accept it with --insecure",
+        code="network/insecure-endpoint",
     )
 
 
@@ -84,7 +90,8 @@ def check_loopback(endpoint: str) -> None:
             raise RefusedError(
                 f"{endpoint}: the loopback interface of this computer, container or network namespace is down "
                 f"({error.strerror}), and the processes of a robot meet there. Bring it up with `ip link set lo up` as "
-                "root, or run in one process with `snakesim run --in-process`"
+                "root, or run in one process with `snakesim run --in-process`",
+                code="network/loopback-down",
             ) from None
 
 
@@ -98,6 +105,7 @@ def check_namespace(text: str, origin: str) -> str:
         raise ConfigError(
             f"{origin} {shorten(text)!r}: this is not a namespace; give a name such as planar13 or "
             "lab/planar13, without "
-            "spaces and * $ ? # @"
+            "spaces and * $ ? # @",
+            code="network/invalid-address",
         )
     return text

@@ -35,4 +35,4 @@ def warn_of_readable_keys(settings: zenoh.Config) -> None:
 def _warn(key: Path) -> None:
     problem = check_permissions(key)
     if problem:
-        print_stderr(f"snakesim: warning: {problem}, and renew it: snakesim deploy certs --rotate")
+        print_stderr(f"snakesim: warning: {problem}, and renew it: snakesim lab certs --rotate")

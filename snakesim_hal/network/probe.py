@@ -75,6 +75,6 @@ def open_probe(settings: str) -> Iterator[Probe]:
     try:
         session = zenoh.open(zenoh.Config.from_json5(settings))
     except zenoh.ZError as error:
-        raise NotConnectedError(str(error).split(" at /")[0]) from None
+        raise NotConnectedError(str(error).split(" at /")[0], code="network/nothing-listens") from None
     with session:
         yield Probe(session)

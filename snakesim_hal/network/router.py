@@ -1,4 +1,4 @@
-"""Runs a Zenoh router from a JSON5 file: `snakesim router`."""
+"""Runs a Zenoh router from a JSON5 file: `snakesim start router`."""
 
 import json
 import os
@@ -22,7 +22,7 @@ def router_settings(config: Path) -> zenoh.Config:
     """
     _, settings = read_zenoh_file(config)
     if json.loads(settings.get_json("mode")) != "router":
-        raise ConfigError(f'{config}: `mode` must be "router"')
+        raise ConfigError(f'{config}: `mode` must be "router"', code="network/session-file")
     return settings
 
 

@@ -477,7 +477,8 @@ def key_expression(text: str) -> str:
         return str(zenoh.KeyExpr.autocanonize(text))
     except zenoh.ZError as error:
         raise ConfigError(
-            f"{text!r} is not a key: {str(error).split(' at /')[0]}; valid are such as sensor/joints, sensor/* and **"
+            f"{text!r} is not a key: {str(error).split(' at /')[0]}; valid are such as sensor/joints, sensor/* and **",
+            code="network/unknown-key",
         ) from None
 
 

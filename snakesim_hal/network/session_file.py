@@ -43,7 +43,8 @@ class SessionFile:
             raise ConfigError(
                 f"{self.path}: `namespace` is {shorten(self.namespace)!r}, not {wanted!r}; use the session "
                 "file of that "
-                "robot, or another --namespace"
+                "robot, or another --namespace",
+                code="network/session-file",
             )
         return wanted or self.namespace
 
@@ -60,12 +61,19 @@ def read_session(path: Path) -> SessionFile:
         if given != wanted and (given is not None or key == "mode"):
             dotted_key = key.replace("/", ".")
             present = "missing" if given is None else json.dumps(given)
-            raise ConfigError(f"{path}: `{dotted_key}` is {present}, must be {json.dumps(wanted)}")
+            raise ConfigError(
+                f"{path}: `{dotted_key}` is {present}, must be {json.dumps(wanted)}", code="network/session-file"
+            )
     if endpoints_of_mode(settings, "listen/endpoints", "client"):
-        raise ConfigError(f"{path}: `listen.endpoints`: a session only connects; leave it out")
+        raise ConfigError(
+            f"{path}: `listen.endpoints`: a session only connects; leave it out", code="network/session-file"
+        )
     endpoints = endpoints_of_mode(settings, "connect/endpoints", "client")
     if not endpoints:
-        raise ConfigError(f"{path}: `connect.endpoints` is empty: name the router's, such as tls/robot-lab:7447")
+        raise ConfigError(
+            f"{path}: `connect.endpoints` is empty: name the router's, such as tls/robot-lab:7447",
+            code="network/session-file",
+        )
     for endpoint in endpoints:
         check_endpoint(endpoint, f"{path}: `connect.endpoints`:")
     namespace = json.loads(settings.get_json("namespace"))
@@ -96,7 +104,7 @@ def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
 def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:
     """Return an error with Zenoh's own message about a file, shortened because it quotes the file."""
     message = " ".join(str(error).split())
-    return ConfigError(f"{path}: Zenoh refuses it: {shorten(message, 500)}")
+    return ConfigError(f"{path}: Zenoh refuses it: {shorten(message, 500)}", code="network/session-file")
 
 
 def endpoints_of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:

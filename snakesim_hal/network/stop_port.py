@@ -31,7 +31,7 @@ REQUEST = b"SNAKSTOP"
 ANSWER = b"SNAKDONE"
 TEST = b"SNAKTEST"  # does nothing, and is never answered
 NONCE_BYTES = 16
-MAX_WHO_BYTES = 64
+MAX_REQUESTER_BYTES = 64
 MAX_ANSWER_BYTES = 1024
 UDP_HEADER = 8  # bytes
 SO_ATTACH_FILTER = 26  # of Linux; Python has no name for it
@@ -72,13 +72,14 @@ def open_stop_port(host: str, port: int) -> socket.socket:
         opened.close()
         raise NotConnectedError(
             f"cannot listen for emergency stops on udp/{host}:{port}: {error.strerror}. Another run may hold the port; "
-            f"choose one with --endpoint tcp/{host}:PORT"
+            f"choose one with --endpoint tcp/{host}:PORT",
+            code="network/port-in-use",
         ) from error
     return opened
 
 
 def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], None]) -> None:
-    """Call `take(who, reply)` for every request, from the thread `stop port`.
+    """Call `take(requester, reply)` for every request, from the thread `stop port`.
 
     Args:
         opened: the bound socket; closing it ends the thread.
@@ -89,15 +90,15 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
     def serve() -> None:
         while True:
             try:
-                datagram, sender = opened.recvfrom(UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES)
+                datagram, sender = opened.recvfrom(UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_REQUESTER_BYTES)
             except OSError:
                 return
             if not datagram.startswith(REQUEST) or len(datagram) < len(REQUEST) + NONCE_BYTES:
                 continue
             nonce = datagram[len(REQUEST) :][:NONCE_BYTES]
-            who = datagram[len(REQUEST) + NONCE_BYTES :].decode(errors="replace")
+            requester = datagram[len(REQUEST) + NONCE_BYTES :].decode(errors="replace")
             reply = _make_reply(opened, nonce + robot.encode() + b"\n", sender)
-            take(who or "an unnamed client", reply)
+            take(requester or "an unnamed client", reply)
             time.sleep(PAUSE_S)
 
     start_worker("stop port", serve)
@@ -133,12 +134,12 @@ class StopRequester:
         for address in unused:
             self._sockets.pop(address).close()
 
-    def request_stop(self, address: Address, who: str, timeout_s: float) -> StopAnswer | None:
+    def request_stop(self, address: Address, requester: str, timeout_s: float) -> StopAnswer | None:
         """Repeat a stop request until it is answered.
 
         Args:
             address: of the stop port.
-            who: name of the requester, for the record.
+            requester: name of the person or program, for the record.
             timeout_s: how long to repeat it.
 
         Returns:
@@ -152,7 +153,7 @@ class StopRequester:
         if opened is None:
             opened = _open_for(address)
             self._sockets[address] = opened
-        return _request_stop(opened, address, who, timeout_s)
+        return _request_stop(opened, address, requester, timeout_s)
 
     def test(self, address: Address, wait_s: float = TEST_WAIT_S) -> None:
         """Send a datagram that does nothing to a stop port.
@@ -165,7 +166,9 @@ class StopRequester:
         """
         opened = self._sockets.get(address)
         if opened is None:
-            raise NotConnectedError(f"no socket is prepared for udp/{address[0]}:{address[1]}")
+            raise NotConnectedError(
+                f"no socket is prepared for udp/{address[0]}:{address[1]}", code="network/nothing-listens"
+            )
         try:
             opened.connect(address)
             opened.send(TEST)
@@ -187,14 +190,14 @@ class StopRequester:
         self._sockets.clear()
 
 
-def request_stop(host: str, port: int, who: str, timeout_s: float) -> StopAnswer | None:
+def request_stop(host: str, port: int, requester: str, timeout_s: float) -> StopAnswer | None:
     """Send a stop request to one stop port, as `StopRequester.request_stop` does.
 
     Raises:
         NotConnectedError: the port is closed.
     """
-    with closing(StopRequester()) as requester:
-        return requester.request_stop((host, port), who, timeout_s)
+    with closing(StopRequester()) as stop_requester:
+        return stop_requester.request_stop((host, port), requester, timeout_s)
 
 
 def _open_for(address: Address) -> socket.socket:
@@ -202,10 +205,10 @@ def _open_for(address: Address) -> socket.socket:
     return socket.socket(address_family, socket.SOCK_DGRAM)
 
 
-def _request_stop(opened: socket.socket, address: Address, who: str, timeout_s: float) -> StopAnswer | None:
+def _request_stop(opened: socket.socket, address: Address, requester: str, timeout_s: float) -> StopAnswer | None:
     """Repeat a stop request until it is answered; None: no answer came in time."""
     nonce = os.urandom(NONCE_BYTES)
-    request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
+    request = REQUEST + nonce + requester.encode()[:MAX_REQUESTER_BYTES]
     deadline = time.monotonic() + timeout_s
     refused = 0
     opened.settimeout(REPEAT_S)
@@ -262,7 +265,7 @@ def _accept_requests_only(opened: socket.socket) -> None:
     Classic BPF; offsets count from the UDP header. If the kernel refuses the filter, `serve_stops` still checks each.
     """
     first, second = struct.unpack(">II", REQUEST)
-    max_bytes = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES
+    max_bytes = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_REQUESTER_BYTES
     program = [  # (code, jump if true, jump if false, constant)
         (0x20, 0, 0, UDP_HEADER),  # load the word there
         (0x15, 0, 3, first),  # continue if it is equal

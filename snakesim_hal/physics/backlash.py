@@ -40,8 +40,8 @@ def without_rotors(config: RunConfig, joints: Sequence[Joint], backlash_rad: Map
     return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, joints=exceptions))
 
 
-class BacklashModel:
-    """A `PhysicsModel` that wraps another one, and whose joint angles are those that encoders on the rotors measure."""
+class BacklashModel(PhysicsModel):
+    """Wraps another physics model. Its joint angles are those that encoders on the rotors measure."""
 
     def __init__(
         self, physics_model: PhysicsModel, joints: Sequence[Joint], backlash_rad: Mapping[str, float], seed: int

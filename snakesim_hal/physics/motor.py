@@ -54,5 +54,6 @@ def check_gains(robot: RobotFile) -> None:
                 f"robot {robot.name!r}, {joint.name}: position mode is unstable: a motor with "
                 f"`motor.response_time_s` = {motor.response_time_s} s with `motor.stiffness_nm_per_rad` = "
                 f"{motor.stiffness_nm_per_rad} N·m/rad needs `motor.damping_nm_s_per_rad` above {min_damping:g} "
-                f"N·m·s/rad; it is {motor.damping_nm_s_per_rad}"
+                f"N·m·s/rad; it is {motor.damping_nm_s_per_rad}",
+                code="drive/unsupported-setting",
             )

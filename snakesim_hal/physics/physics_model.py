@@ -4,10 +4,14 @@ A physics model is found by name among the entry points of the group `snakesim.p
 joint modules of one backend can use the physics of another without importing it.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar
+
+import msgspec
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import Vector
 
@@ -21,15 +25,29 @@ class LinkLoad:
     force_l: Vector  # N, on the body
 
 
-class PhysicsModel(Protocol):
+class PhysicsModel(ABC):
     """Joints that move under motor torques, with or without a world around them. Time advances only in `advance`.
 
-    A class of this kind has `Settings`, which is a Struct. It is constructed from a `RunConfig` and these settings, and
-    then the robot is at rest, at the start pose of the run.
+    Derive from it, set `step_s` in the constructor, and implement the abstract methods. The thread that operates the
+    emulated drives makes all calls, and no two overlap.
     """
 
+    Settings: ClassVar[type[msgspec.Struct]]  # the `physics_model_settings` of a backend; may be an empty Struct
     step_s: float  # the longest time for which torques may be held constant
 
+    def __init__(self, config: RunConfig, settings: Any) -> None:
+        """Place the robot at the start pose of the run, at rest.
+
+        Args:
+            config: The run, with motors as they are in truth.
+            settings: An instance of `Settings`.
+
+        Raises:
+            ConfigError: The model cannot simulate this robot or scene.
+        """
+        del config, settings
+
+    @abstractmethod
     def advance(self, torque_nm: Floats) -> None:
         """Advance by `step_s` under constant motor torques.
 
@@ -39,30 +57,29 @@ class PhysicsModel(Protocol):
         Raises:
             BackendError: The state has diverged.
         """
-        ...
 
     @property
+    @abstractmethod
     def angle_rad(self) -> Floats:
         """Return the joint angles now, (n_joints,), tail to head. It may be a view of the state of the model."""
-        ...
 
     @property
+    @abstractmethod
     def velocity_rad_s(self) -> Floats:
-        """Return the joint velocities now, (n_joints,), tail to head."""
-        ...
+        """Return the joint velocities now, (n_joints,), tail to head. It may be a view of the state of the model."""
 
+    @abstractmethod
     def shaft_torque_nm(self) -> Floats:
         """Return the torque through each joint's shaft, as its strain gauge measures it, (n_joints,)."""
-        ...
 
     def loads(self) -> list[LinkLoad]:
-        """Return the loads of the links in contact; empty in a physics model without a world."""
-        ...
+        """Return the loads of the links in contact; empty in a physics model without a world, which is the default."""
+        return []
 
     def imu(self) -> Imu | None:
-        """Return angular velocity and specific force of the links; None without a world. The tick of it is 0."""
-        ...
+        """Return angular velocity and specific force of the links, at tick 0; None without a world, the default."""
+        return None
 
     def pose(self) -> Pose | None:
-        """Return the pose of the base, as from motion capture; None without a world. The tick of it is 0."""
-        ...
+        """Return the pose of the base, as from motion capture, at tick 0; None without a world, the default."""
+        return None

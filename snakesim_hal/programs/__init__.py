@@ -1,7 +1,7 @@
 """The programs of a run, each of which `snakesim run` starts as a process.
 
-`host_program`      the HAL host: `snakesim host`
-`service_program`   guidance, navigation, control or a custom service: `snakesim service`
+`host_program`      the HAL host: `snakesim start host`
+`service_program`   guidance, navigation, control or a custom service: `snakesim start service`
 `router_program`    a router for one run
 `single_process`    a whole run in one process and one thread: `snakesim run --in-process`
 `in_host_service`   a controller in the host's process

@@ -47,28 +47,89 @@ def number_type(least: float, most: float, unit: str = "") -> Callable[[str], fl
 
 def add_scenario(parser: argparse.ArgumentParser) -> None:
     """Add the scenario, and flags that change it."""
+    add_scenario_name(parser)
+    parser.add_argument("--backend", metavar="NAME", help="backend, such as sim, can or odrive")
+    parser.add_argument("--controller", metavar="NAME", help="installed controller, or ./file.py:Class")
     parser.add_argument(
-        "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
+        "--clock-mode", choices=["realtime", "lockstep", "free"], help="how robot time follows the wall clock"
     )
-    parser.add_argument("--backend", help="sim or can")
-    parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
-    parser.add_argument("--clock-mode", choices=["realtime", "lockstep", "free"])
-    parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="change any value; may be repeated",
-    )
+    add_duration(parser, "seconds of robot time")
+    add_seed(parser, "default: the scenario's")
+    add_set(parser)
     parser.add_argument(
         "--unset",
         action="append",
         default=[],
-        metavar="SECTION.KEY",
-        help="leave out what a file may leave out, such as robot.sensors.contacts; may be repeated",
+        metavar="KEY",
+        help="remove an optional key, such as robot.sensors.contacts; may be repeated",
     )
+
+
+def add_scenario_name(parser: argparse.ArgumentParser) -> None:
+    """Add the scenario alone."""
+    parser.add_argument(
+        "scenario",
+        metavar="SCENARIO",
+        help="name of a shipped scenario, or path of a scenario file or a run's config.json",
+    )
+
+
+def add_set(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
+    """Add `--set`. about: for the help."""
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about}; may be repeated")
+
+
+def add_seed(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
+    """Add `--seed`, which fixes every random number. about: what else the help says."""
+    parser.add_argument(
+        "--seed", type=int, default=default, metavar="SEED", help=f"seed of all random numbers ({about})"
+    )
+
+
+def add_out(parser: argparse.ArgumentParser, about: str, *, required: bool = False) -> None:
+    """Add `--out`, the file or folder that a command writes. about: for the help."""
+    parser.add_argument("--out", type=Path, required=required, metavar="PATH", help=about)
+
+
+def add_duration(
+    parser: argparse.ArgumentParser, about: str, parse: Callable[[str], float] = float, default: float | None = None
+) -> None:
+    """Add `--duration`, in seconds.
+
+    Args:
+        parser: of a command.
+        about: for the help.
+        parse: reads and checks the number.
+        default: in seconds.
+    """
+    parser.add_argument("--duration", type=parse, default=default, metavar="S", help=about)
+
+
+def add_fields(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
+    """Add `--fields`, the number of random fields. about: what each number is for, for the help."""
+    parser.add_argument(
+        "--fields", type=number_type(1, 100_000), default=default, metavar="N", help=f"number of random fields {about}"
+    )
+
+
+def add_resume(parser: argparse.ArgumentParser) -> None:
+    """Add the option that continues what is in `--out`."""
+    parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add where runs are computed."""
+    parser.add_argument(
+        "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
+    )
+    parser.add_argument(
+        "--workers", type=number_type(1, 100_000), metavar="N", help="processes on this computer (default: one a core)"
+    )
+
+
+def add_task(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add `--task`, which describes a demonstration. about: for the help."""
+    parser.add_argument("--task", metavar="TEXT", help=about)
 
 
 def load_scenario(arguments: argparse.Namespace) -> "Loaded":
@@ -98,7 +159,9 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
 
 def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION})") -> None:
     """Add the options that select the network. session: text about the default of `--session`, for the help."""
-    parser.add_argument("--endpoint", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})")
+    parser.add_argument(
+        "--endpoint", metavar="ENDPOINT", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})"
+    )
     parser.add_argument(
         "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
     )
@@ -108,7 +171,12 @@ def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SE
         metavar="FILE",
         help=f"connect as a Zenoh session file says (JSON5: router, certificates) {session}".rstrip(),
     )
-    parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+    add_namespace(parser)
+
+
+def add_namespace(parser: argparse.ArgumentParser) -> None:
+    """Add the option that selects a robot among those on a network."""
+    parser.add_argument("--namespace", metavar="NAME", help="namespace of the robot (default: the robot's name)")
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -141,17 +209,19 @@ def add_host(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a HAL host.
 
     Three options are hidden, because only a run uses them for its host. --memory: path of an in-memory file for the
-    host's statistics; --channel: inherited socket to the parent process; --stop-port: inherited UDP socket for
+    host's statistics; --parent-socket: inherited socket to the parent process; --stop-port: inherited UDP socket for
     emergency stops.
     """
     add_scenario(parser)
     add_network(parser, "")
     add_insecure(parser)
-    parser.add_argument("--out", type=Path, help="folder for the record: black box, description, statistics")
-    parser.add_argument("--once", action="store_true", help="end when the robot was armed for the scenario's duration")
+    add_out(parser, "folder for the record: black box, description, statistics")
+    parser.add_argument(
+        "--end-after-duration", action="store_true", help="end when the robot was armed for the scenario's duration"
+    )
     parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
     add_parent(parser)
-    for flag, kind in (("--memory", str), ("--channel", int), ("--stop-port", int)):
+    for flag, kind in (("--memory", str), ("--parent-socket", int), ("--stop-port", int)):
         parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
 
 
@@ -169,7 +239,10 @@ def check_network(arguments: argparse.Namespace) -> None:
         if given is not None:
             check_endpoint(given, flag)
             if arguments.session is not None:
-                raise ConfigError(f"{flag} and --session: the session file names the endpoint; leave one out")
+                raise ConfigError(
+                    f"{flag} and --session: the session file names the endpoint; leave one out",
+                    code="command/conflicting-options",
+                )
     if arguments.namespace is not None:
         check_namespace(arguments.namespace, "--namespace")
 

@@ -1,4 +1,4 @@
-"""The HAL host as a program: `snakesim host SCENARIO`; `python -m snakesim_hal.programs.host_program` for a run's own.
+"""The HAL host as a program: `snakesim start host SCENARIO`; `python -m snakesim_hal.programs.host_program` in a run.
 
 It opens the backend, and runs until it receives a stop signal, or until the run that it belongs to is over.
 """
@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 
-from snakesim_hal.backend import BackendFactory
+from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import BackendError, RefusedError, SnakesimError
 from snakesim_hal.base.process import (
     HOST_PRIORITY,
@@ -29,7 +29,6 @@ from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.model.checked import CHECK, why_unchecked
 from snakesim_hal.model.fault_plan import check_without_run
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
@@ -37,7 +36,7 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.programs.arguments import add_host
-from snakesim_hal.programs.preflight import backend_settings, check_backend
+from snakesim_hal.programs.preflight import backend_settings, check_backend, find_backend
 from snakesim_hal.programs.service_program import ProcessOptions, open_session_when_ready, process_options
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
@@ -48,10 +47,12 @@ GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than t
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
-    parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
+    parser = argparse.ArgumentParser(
+        prog="snakesim start host", description="Run the HAL host of a robot, with its backend."
+    )
     add_host(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim host", lambda: host(process_options(arguments, hosts=True)))
+    return run_tool("snakesim start host", lambda: host(process_options(arguments, hosts=True)))
 
 
 def host(given: ProcessOptions) -> int:
@@ -59,7 +60,7 @@ def host(given: ProcessOptions) -> int:
 
     A simulator that is reset becomes another host, in the same process.
     """
-    if given.arguments.channel is None:
+    if given.arguments.parent_socket is None:
         check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
     if host.ended == "reset":
@@ -73,7 +74,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
     arguments = given.arguments
     with contextlib.ExitStack() as opened:
         stop_port = _open_stop_port(given, config, opened)
-        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
         network = open_session(given.link) if given.link.listen else open_session_when_ready(given.link, "host")
@@ -125,12 +126,12 @@ def _create_host(
     backend_with_faults, faults = create_host_faults(config, backend, session)
     options = HostOptions(
         # The end of the run.
-        max_ticks=round(config.duration_s * config.rate_hz) if arguments.once else None,
+        max_ticks=round(config.duration_s * config.rate_hz) if arguments.end_after_duration else None,
         end_after_fault_s=arguments.end_after_fault,
         stay=arguments.end_after_fault is None,
         # What connects the host with its surroundings.
         latch=EstopLatch(folder),
-        starter=HostEnd.from_descriptor(arguments.channel),
+        starter=HostEnd.from_descriptor(arguments.parent_socket),
         realtime_warnings=realtime_warnings,
         # The robot.
         faults=faults,
@@ -148,15 +149,16 @@ def refuse_second_host(session: Session, link: Link) -> None:
             raise RefusedError(
                 f"another HAL host is on {link.endpoint} as {link.namespace}: "
                 f"{keys.parse_service(others[0])}. End it, or "
-                f"give this robot another --namespace"
+                f"give this robot another --namespace",
+                code="robot/already-running",
             )
 
 
-def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
+def open_backend(backend_type: type[Backend], config: RunConfig) -> GuardedBackend:
     """Open the run's backend. Raises BackendError for any error in it."""
-    settings = backend_settings(config, factory)
+    settings = backend_settings(config, backend_type)
     try:
-        return GuardedBackend(factory(config, settings))
+        return GuardedBackend(backend_type(config, settings))
     except SnakesimError:
         raise
     except (Exception, SystemExit) as error:  # a backend may be third-party code
@@ -184,7 +186,7 @@ def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") ->
         faults=list(authority.faults_since_start.kept),
         faults_left_out=authority.faults_since_start.left_out,
         lifecycle=authority.state,
-        why=authority.reason,
+        reason=authority.reason,
         ended=host.ended,
         ended_why=host.ended_why,
         lost_ticks=lost_ticks,

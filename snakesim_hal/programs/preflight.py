@@ -1,21 +1,31 @@
-"""Checks before a run that all plugins of its configuration are installed, and that their settings are valid."""
+"""Checks before a run that all plugins of its configuration are installed, and that their sections are valid."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
+from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import ConfigError, shorten
+from snakesim_hal.controller import Controller, decode_parameters, require_controller
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
-from snakesim_hal.model.robot import describe_joints, with_modes
+from snakesim_hal.model.plugins import (
+    BACKENDS,
+    CONTROLLERS,
+    SERVICES,
+    find_installed,
+    find_plugin,
+    plugin_settings,
+    require_base_class,
+)
+from snakesim_hal.model.robot import describe_joints
 from snakesim_hal.model.scenario import CONTROL, RunConfig, describe_run_robot
+from snakesim_hal.service import Service
 from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
 POSE_SERVICES = {GUIDANCE, "navigation"}  # of no use without a pose of the robot
-SERVICE_ATTRIBUTES = ("name", "urgent", "too_slow", "configure", "outputs", "silence", "pause")
 
 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
@@ -34,27 +44,34 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
-    config = with_backend_modes(config, find(BACKENDS, config.backend))
-    controller = find(CONTROLLERS, config.controller)
-    if controller is not None:
+    backend = _find_backend(config.backend, run_files=run_files)
+    if backend is not None:
+        config = with_backend_modes(config, backend)
+    plugin = find(CONTROLLERS, config.controller)
+    if plugin is not None:
+        controller = require_controller(plugin, config.controller)
         config = _check_controller(config, controller, source, table)
     for service in config.own_services:
-        find_service(config, service, find)
+        code = _service_code(config, service)
+        service_type = find(SERVICES, code)
+        if service_type is not None:
+            _check_service(config, service, code, service_type)
     _check_in_host_services(config, source)
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
 
 
-def _check_controller(config: RunConfig, controller: Any, source: str, table: Table | None) -> RunConfig:
-    """Check a controller's settings and what it needs of the robot. Returns the configuration that it runs in."""
+def _check_controller(
+    config: RunConfig, controller: type[Controller[Any]], source: str, table: Table | None
+) -> RunConfig:
+    """Check a controller's parameters and what it needs of the robot. Returns the configuration that it runs in."""
     origin = table.origin if table is not None else None
-    settings = plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+    parameters = decode_parameters(controller, config.controller_parameters, source, config.control_section, origin)
     config = _without_pose_services(config, controller)
     problem = describe_missing_capability(describe_joints(config.robot), controller, config.controller)
     if problem is not None:
-        raise ConfigError(f"robot {config.robot.name!r}: {problem}")
-    if hasattr(controller, "check"):
-        controller.check(describe_run_robot(config), settings)
+        raise ConfigError(f"robot {config.robot.name!r}: {problem}", code="config/conflict")
+    controller.check(describe_run_robot(config), parameters)
     return config
 
 
@@ -64,55 +81,82 @@ def _check_in_host_services(config: RunConfig, source: str) -> None:
     if others:
         raise ConfigError(
             f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
-            'what plans or looks would keep the host from its ticks; leave it at "process"'
+            'what plans or looks would keep the host from its ticks; leave it at "process"',
+            code="config/conflict",
         )
 
 
-def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] = find_plugin) -> Any:
-    """Find the class of a service: of the scenario, installed, or `./file.py:Class`.
+def find_service(config: RunConfig, name: str) -> type[Service]:
+    """Find the class of a service: of the scenario, installed, or `./file.py:Class`, which is run.
 
     Args:
         config: configuration of the run.
         name: of the service.
-        find: or `find_installed`, which returns None for a file, and runs no code of it.
 
     Raises:
         ConfigError: the class is not found, or is not that of a service.
     """
+    code = _service_code(config, name)
+    service = find_plugin(SERVICES, code)
+    _check_service(config, name, code, service)
+    return service
+
+
+def _service_code(config: RunConfig, name: str) -> str:
+    """Return the plugin name of a service."""
     section = config.services.get(name)
-    code = (section.code if section is not None else "") or name
-    service = find(SERVICES, code)
-    if service is None:
-        return None
-    missing = [attribute for attribute in SERVICE_ATTRIBUTES if not hasattr(service, attribute)]
-    if missing:
-        raise ConfigError(
-            f"service {shorten(code)!r} has no {', '.join(missing)}; write its class as in snakesim_hal/service.py, "
-            "or derive it from Service there"
-        )
+    if section is not None and section.code:
+        return section.code
+    return name
+
+
+def _check_service(config: RunConfig, name: str, code: str, service: Any) -> None:
+    """Raise ConfigError if a plugin is not the class of the service of this name."""
+    require_base_class(service, Service, f"service {shorten(code)!r}")
+    section = config.services.get(name)
     if section is not None and service.name != name:
         raise ConfigError(
             f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
             f"services.{shorten(name)}, and both "
             f"have one name. Write [services.{service.name}] with code = {shorten(code)!r}, or change the "
-            "class's `name`"
+            "class's `name`",
+            code="plugin/not-loadable",
         )
-    return service
 
 
-def describe_missing_capability(joints: Sequence[JointDescription], controller: Any, name: str) -> str | None:
+def find_backend(name: str) -> type[Backend]:
+    """Find the class of a backend: an installed one, or `./file.py:Class`, which is run.
+
+    Raises:
+        ConfigError: the class is not found, or is not that of a backend.
+    """
+    plugin = find_plugin(BACKENDS, name)
+    require_base_class(plugin, Backend, f"backend {shorten(name)!r}")
+    return plugin
+
+
+def _find_backend(name: str, *, run_files: bool) -> type[Backend] | None:
+    """Find the class of a backend; None for that of a file that must not run."""
+    if not run_files and find_installed(BACKENDS, name) is None:
+        return None
+    return find_backend(name)
+
+
+def describe_missing_capability(
+    joints: Sequence[JointDescription], controller: type[Controller[Any]], name: str
+) -> str | None:
     """Return the first joint, with the capability, that a controller needs and the robot does not have.
 
     Args:
         joints: of the robot.
-        controller: its class; `MODES` and `MEASURES` name what it needs of every joint.
+        controller: its class; `required_modes` and `required_measurements` name what it needs of every joint.
         name: of the controller, for the message.
 
     Returns:
         A message, or None if the robot has everything.
     """
     for joint in joints:
-        for mode in getattr(controller, "MODES", ()):
+        for mode in controller.required_modes:
             if not joint.supports_mode(mode):
                 available = [mode.name.lower() for mode in joint.modes if mode is not Mode.PASSIVE]
                 return (
@@ -120,7 +164,7 @@ def describe_missing_capability(joints: Sequence[JointDescription], controller: 
                     f"{', '.join(available)}. Choose another controller; or correct `modes` in [drive] or "
                     f"[joints.{joint.name}] of the robot file"
                 )
-        for measured in getattr(controller, "MEASURES", ()):
+        for measured in controller.required_measurements:
             if measured not in joint.measures:
                 return (
                     f"controller {name!r} needs the measured {measured} of every joint, and {joint.name} does not "
@@ -130,7 +174,7 @@ def describe_missing_capability(joints: Sequence[JointDescription], controller: 
     return None
 
 
-def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
+def _without_pose_services(config: RunConfig, controller: type[Controller[Any]]) -> RunConfig:
     """Leave guidance and navigation out for a controller of joints, if the robot has no pose sensor.
 
     They stay if the scenario asks for dead reckoning itself, or has further services.
@@ -142,26 +186,21 @@ def _without_pose_services(config: RunConfig, controller: Any) -> RunConfig:
     services = config.own_services.keys()
     if GUIDANCE not in services or not services <= {*POSE_SERVICES, CONTROL}:
         return config
-    if getattr(controller, "NEEDS", "world") != "joints":
+    if controller.needs_world:
         return config
     remaining = {name: service for name, service in config.services.items() if name not in POSE_SERVICES}
     return msgspec.structs.replace(config, services=remaining)
 
 
-def with_backend_modes(config: RunConfig, backend: Any) -> RunConfig:
-    """Return the configuration with the control modes that the joints have on a backend.
-
-    These are all modes, unless the backend's class names them in `MODES`, or for each joint in `as_driven`.
-    """
-    if hasattr(backend, "as_driven"):
-        return msgspec.structs.replace(config, robot=backend.as_driven(config.robot))
-    modes = getattr(backend, "MODES", None)
-    if modes is None:
+def with_backend_modes(config: RunConfig, backend: type[Backend]) -> RunConfig:
+    """Return the configuration with the control modes that the joints have on a backend."""
+    robot = backend.limit_modes(config.robot)
+    if robot is config.robot:
         return config
-    return msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
+    return msgspec.structs.replace(config, robot=robot)
 
 
-def backend_settings(config: RunConfig, backend: Any, table: Table | None = None) -> Any:
+def backend_settings(config: RunConfig, backend: type[Backend], table: Table | None = None) -> Any:
     """Return the scenario's [backends.<name>] section, checked by the backend's own Struct. Raises ConfigError."""
     source = f"scenario {config.name!r}" if table is None else table.source
     origin = None if table is None else table.origin
@@ -182,8 +221,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     Raises:
         ConfigError: the backend is missing, its settings are wrong, or it does not support a requested clock mode.
     """
-    find = find_plugin if run_files else find_installed
-    backend = find(BACKENDS, config.backend)
+    backend = _find_backend(config.backend, run_files=run_files)
     if backend is None:
         return config
     settings = backend_settings(config, backend, table)
@@ -194,6 +232,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     origin = table.origin_of("clock_mode") if table is not None else f"scenario {config.name!r}"
     if origin.startswith("--"):
         raise ConfigError(
-            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}"
+            f"{origin}: backend {config.backend!r} cannot keep this clock mode, only {' or '.join(clock_modes)}",
+            code="backend/wrong-clock-mode",
         )
     return msgspec.structs.replace(config, clock_mode=clock_modes[0])

@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_insecure(parser)
     add_parent(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim router", lambda: _run_router(process_options(arguments, hosts=True)))
+    return run_tool("snakesim start router", lambda: _run_router(process_options(arguments, hosts=True)))
 
 
 def _run_router(options: ProcessOptions) -> int:

@@ -1,4 +1,4 @@
-"""A service as a program: `snakesim service NAME SCENARIO`.
+"""A service as a program: `snakesim start service NAME SCENARIO`.
 
 `python -m snakesim_hal.programs.service_program` takes the same arguments.
 It needs only the scenario, and how to reach the network. It waits for the network and for the robot, prints that it
@@ -58,7 +58,7 @@ def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> Pr
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a service. Returns the exit code: 0 stopped by a signal, 1 it could not continue, 2 wrong input."""
-    parser = argparse.ArgumentParser(prog="snakesim service", description="Run one service of a robot.")
+    parser = argparse.ArgumentParser(prog="snakesim start service", description="Run one service of a robot.")
     add_service(parser)
     return run(parser.parse_args(argv))
 

@@ -25,11 +25,10 @@ from snakesim_hal.base.terminal import report_error
 from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.model.fault_plan import parse_planned
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.host_program import open_backend
-from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.programs.preflight import find_backend, find_service
 from snakesim_hal.service import SERVICE_START_LIMIT_S, ServiceLoop
 from snakesim_hal.wire.messages import make_arm_request
 
@@ -47,16 +46,24 @@ def check(config: RunConfig) -> None:
     where = f"scenario {config.name!r} in one process"
     if config.clock_mode != "lockstep":
         raise ConfigError(
-            f"{where}: clock mode is {config.clock_mode!r}, must be 'lockstep'; add --clock-mode lockstep"
+            f"{where}: clock mode is {config.clock_mode!r}, must be 'lockstep'; add --clock-mode lockstep",
+            code="backend/wrong-clock-mode",
         )
     if not config.has_own_control:
-        raise ConfigError(f"{where}: no controller commands the robot; it needs a control service that is not external")
+        raise ConfigError(
+            f"{where}: no controller commands the robot; it needs a control service that is not external",
+            code="config/conflict",
+        )
     for name, service in config.services.items():
         if service.external:
-            raise ConfigError(f"{where}: services.{name} is external, and there is no network to meet it")
+            raise ConfigError(
+                f"{where}: services.{name} is external, and there is no network to meet it", code="config/conflict"
+            )
     for injection in parse_planned(config):
         if injection.target_type in ("process", "clock"):
-            raise ConfigError(f"{where}: fault {str(injection)!r} needs processes of their own")
+            raise ConfigError(
+                f"{where}: fault {str(injection)!r} needs processes of their own", code="injection/not-supported"
+            )
 
 
 class InProcessRun:
@@ -91,7 +98,9 @@ class InProcessRun:
                 with self._limit:
                     self._open(opening)
             except StepTooLongError as error:
-                raise RefusedError(f"the run did not begin: {self._explain(error)}") from error
+                raise RefusedError(
+                    f"the run did not begin: {self._explain(error)}", code="backend/step-timeout"
+                ) from error
             self._opened = opening.pop_all()
         self._limit.limit_s = self._turn_limit_s
         return self
@@ -114,12 +123,13 @@ class InProcessRun:
 
     def _open_host(self, opened: ExitStack) -> None:
         config = self.config
-        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         if not backend.describe().emulated:
             raise RefusedError(
                 f"backend {config.backend!r} moves real hardware, which could not be stopped from outside: run it in "
-                "processes of their own"
+                "processes of their own",
+                code="robot/real-hardware",
             )
         session = self.network.session()
         opened.callback(session.close)
@@ -180,7 +190,7 @@ class InProcessRun:
         """Request the arming if the robot is ready. Raises RefusedError if it is too late for that."""
         status = self.host.status()
         if is_too_late:
-            raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.why}")
+            raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.reason}", code="robot/not-ready")
         if status.ready_to_arm:
             self.host.submit_request(make_arm_request(self.host.description, REQUESTER), lambda _answer: None)
 
@@ -228,7 +238,7 @@ class InProcessRun:
                 loop.act()
         except StepTooLongError as error:
             traceback.print_exc()
-            raise ServiceError(self._explain(error)) from None
+            raise ServiceError(self._explain(error), code="backend/step-timeout") from None
 
     def _explain(self, error: StepTooLongError) -> str:
         """Return why a part was interrupted, and what the user can do about it."""

@@ -211,7 +211,9 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
             layout = msgspec.json.decode(line, type=Layout)
             return layout, layout.arrays(file.read())
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise ConfigError(f"{path} cannot be read as the black box of a run: {str(error)[:200]}") from None
+        raise ConfigError(
+            f"{path} cannot be read as the black box of a run: {str(error)[:200]}", code="recording/not-readable"
+        ) from None
 
 
 def compute_digest(columns: dict[str, NDArray[Any]]) -> str:

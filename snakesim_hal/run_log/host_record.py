@@ -29,7 +29,7 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     limited_commands: dict[str, int]
     faults: list[Fault]
     lifecycle: str
-    why: str
+    reason: str
     ended: Ending = "complete"
     ended_why: str = ""  # unless complete
     lost_ticks: int = 0  # missing from the black box on disk

@@ -89,7 +89,7 @@ class Authority:
         self._stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
 
         # Faults and counters.
-        self.faults_since_clear = FaultLog()
+        self.faults_since_reset = FaultLog()
         self.faults_since_start = FaultLog()
         self.accepted_count = 0
         self.standby_count = 0
@@ -150,12 +150,12 @@ class Authority:
 
     @property
     def faults(self) -> list[Fault]:
-        """Faults since the last clear, as far as they are kept."""
-        return self.faults_since_clear.kept
+        """Faults since the last reset, as far as they are kept."""
+        return self.faults_since_reset.kept
 
     @property
     def isolated_joints(self) -> list[str]:
-        """The names of joints that failed, and are passive until a clear."""
+        """The names of joints that failed, and are passive until a reset."""
         return self._isolation.names
 
     # --- inputs: commands and requests -----------------------------------------------------------------------
@@ -219,30 +219,30 @@ class Authority:
         return self._answer(decision.refusal, decision.refusal_word)
 
     def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
-        """Arm, disarm, clear or finish. A refused arming lists every condition that is not met."""
+        """Arm, disarm, reset or finish. A refused arming lists every condition that is not met."""
         match request.action:
             case "arm":
                 return self._arm(request, now_ns)
             case "disarm":
                 return self._disarm(request)
-            case "clear":
-                return self._clear(request)
+            case "reset":
+                return self._reset(request)
             case "finish":
                 if self.state == "armed":
-                    self._transition("disarm", f"finished by {request.who}")
+                    self._transition("disarm", f"finished by {request.requester}")
                 return self._answer(None)
 
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
         """Stop now, for any requester."""
-        latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
+        latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.requester}")
         self._record(latch_fault, stops=self.state != "estop")
-        self._transition("estop", f"emergency stop by {request.who}; clear it to go on")
+        self._transition("estop", f"emergency stop by {request.requester}; reset it to go on")
         return self._answer(None)
 
     # --- inputs: faults --------------------------------------------------------------------------------------
 
     def fault(self, fault: Fault, joints: Mask | None = None) -> None:
-        """Latch a fault: the joints take the stop mode until a clear.
+        """Latch a fault: the joints take the stop mode until a reset.
 
         A fault with the reach "none" is only recorded. A fault of only some joints isolates them instead of stopping
         the robot, if the robot file allows that.
@@ -390,7 +390,7 @@ class Authority:
             refusals = {condition.refusal for condition in unmet}
             return self._answer(reasons, min(refusals, key=lifecycle.REFUSAL_ORDER.index))
         as_it_is = ", unchecked" if self.unchecked else ""
-        self._transition("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
+        self._transition("arm", f"armed by {request.requester}{as_it_is}, commanded by {self.lease.holder}")
         self.arm_session += 1
         self._armed_tick = self._state_tick
         self._command = None
@@ -400,18 +400,18 @@ class Authority:
         return self._answer(None)
 
     def _disarm(self, request: LifecycleRequest) -> Answer:
-        if not self._transition("disarm", f"disarmed by {request.who}"):
-            return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
+        if not self._transition("disarm", f"disarmed by {request.requester}"):
+            return self._answer(f"cannot disarm in state {self.state}; reset it first", "wrong_state")
         return self._answer(None)
 
-    def _clear(self, request: LifecycleRequest) -> Answer:
-        if not self._transition("clear", f"cleared by {request.who}; arm to move again"):
+    def _reset(self, request: LifecycleRequest) -> Answer:
+        if not self._transition("reset", f"reset by {request.requester}; arm to move again"):
             hint = ""
             if self.isolated_joints:
-                hint = f"; disarm first, then a clear ends the isolation of {', '.join(self.isolated_joints)}"
-            return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
+                hint = f"; disarm first, then a reset ends the isolation of {', '.join(self.isolated_joints)}"
+            return self._answer(f"nothing to reset in state {self.state}{hint}", "wrong_state")
         self._end_isolation()
-        self.faults_since_clear = FaultLog()
+        self.faults_since_reset = FaultLog()
         return self._answer(None)
 
     def _transition(self, event: lifecycle.Event, why: str) -> bool:
@@ -438,8 +438,8 @@ class Authority:
         """Return every condition for arming that is not met, apart from those of the request."""
         unmet: list[UnmetCondition] = []
         if self.state != "disarmed":
-            clear_first = "; first `snakesim clear`" if self.state in ("fault", "estop") else ""
-            unmet.append(UnmetCondition("wrong_state", f"state is {self.state}, must be disarmed{clear_first}"))
+            reset_first = "; first `snakesim robot reset`" if self.state in ("fault", "estop") else ""
+            unmet.append(UnmetCondition("wrong_state", f"state is {self.state}, must be disarmed{reset_first}"))
         unmet += [UnmetCondition("cable", reason) for reason in self._cables.list_arming_obstacles()]
         not_ready = self._find_unready_robot(now_ns) + self._find_unready_commands(now_ns)
         unmet += [UnmetCondition("not_ready", reason) for reason in not_ready]
@@ -476,7 +476,7 @@ class Authority:
     def _record(self, fault: Fault, *, stops: bool) -> None:
         """Log a fault. `stops` means that the robot is in `fault` or `estop` now because of it."""
         fault = msgspec.structs.replace(fault, cause=fault.cause[:MAX_REASON_LENGTH])
-        self.faults_since_clear.add(fault, stops=stops)
+        self.faults_since_reset.add(fault, stops=stops)
         self.faults_since_start.add(fault, stops=stops)
 
     def _isolate(self, fault: Fault, joints: Mask) -> bool:
@@ -492,8 +492,8 @@ class Authority:
     def _end_isolation(self) -> None:
         """End the isolation of joints. Before the next arming, a new joint state must arrive."""
         if self.isolated_joints:
-            self._isolation.clear()
-            self._implausible = self._unknown_state("no joint state since the clear")
+            self._isolation.reset()
+            self._implausible = self._unknown_state("no joint state since the reset")
 
     def _is_of_isolated_joint(self, fault: Fault) -> bool:
         return fault.reach == "joint" and self._isolation.is_isolated(fault.joint)

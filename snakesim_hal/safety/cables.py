@@ -105,5 +105,5 @@ def _explain_winding(joint: CableJoint, drive_rad: float, angle_rad: float) -> s
         f"{joint.name}: its drive says {drive_rad:+.2f} rad, and counted over restarts it is at {angle_rad:+.2f} rad: "
         f"within its limits its cable would be wound by up to {max_turns:.2f} turns, and `cable_turns` = "
         f"{joint.cable_turns:g}. Turn it by hand by {abs(turns)} turn{plural} to {direction} angles, then switch its "
-        f"drive off and on and restart the host; or, if its cable is not wound, `snakesim joints zero`"
+        f"drive off and on and restart the host; or, if its cable is not wound, `snakesim robot calibrate zero`"
     )

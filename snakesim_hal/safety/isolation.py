@@ -1,7 +1,7 @@
 """Isolated joints: a failed joint is passive from then on, and the others go on, if the robot file allows it. Pure.
 
 Only a joint that fails while the robot is armed is isolated, and only as long as `max_isolated_joints` is not exceeded;
-one more is a fault of the whole robot. A clear ends all isolations.
+one more is a fault of the whole robot. A reset ends all isolations.
 """
 
 from dataclasses import replace
@@ -46,7 +46,7 @@ class Isolation:
         self._set_joints(together)
         return True
 
-    def clear(self) -> None:
+    def reset(self) -> None:
         """End all isolations."""
         self._set_joints(np.zeros_like(self.joints))
 

@@ -1,10 +1,10 @@
 """The lifecycle of a robot: disarmed, armed, fault, estop; and the conditions for arming. Pure functions.
 
     disarmed --arm--> armed --disarm--> disarmed
-    any but estop --fault--> fault --clear--> disarmed
-    any --estop--> estop --clear--> disarmed
+    any but estop --fault--> fault --reset--> disarmed
+    any --estop--> estop --reset--> disarmed
 
-Fault and estop are latched: only an explicit clear ends them, and leads to disarmed, never to armed.
+Fault and estop are latched: only an explicit reset ends them, and leads to disarmed, never to armed.
 Each unmet condition for arming has a reason as text and as one word.
 """
 
@@ -14,23 +14,23 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import Mask
 from snakesim_hal.wire.messages import Description, JointCommand, LifecycleRequest, LifecycleState, Mode
 
-Event = Literal["arm", "disarm", "fault", "estop", "clear"]
+Event = Literal["arm", "disarm", "fault", "estop", "reset"]
 
 _TRANSITIONS: dict[tuple[LifecycleState, Event], LifecycleState] = {
     ("disarmed", "arm"): "armed",
     ("disarmed", "disarm"): "disarmed",
     ("disarmed", "fault"): "fault",
     ("disarmed", "estop"): "estop",
-    ("disarmed", "clear"): "disarmed",
+    ("disarmed", "reset"): "disarmed",
     ("armed", "disarm"): "disarmed",
     ("armed", "fault"): "fault",
     ("armed", "estop"): "estop",
     ("fault", "fault"): "fault",
     ("fault", "estop"): "estop",
-    ("fault", "clear"): "disarmed",
+    ("fault", "reset"): "disarmed",
     ("estop", "estop"): "estop",
     ("estop", "fault"): "estop",
-    ("estop", "clear"): "disarmed",
+    ("estop", "reset"): "disarmed",
 }
 
 

@@ -30,8 +30,8 @@ DONE_ALL = "hal/done/*"
 WORLD = "guidance/world"
 TRAJECTORY = "navigation/trajectory"
 CONTROL_STATE = "control/state"
-SETTINGS = "control/settings"
-SETTINGS_IN_FORCE = "control/settings_in_force"
+PARAMETERS = "control/parameters"
+PARAMETERS_IN_FORCE = "control/parameters_in_force"
 INTENT = "operator/intent"
 ALIVE_ALL = "alive/*"
 HOST_ALL = "hal/host/*"
@@ -80,7 +80,7 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(
         LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"
     ),
-    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
+    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, reset, finish; replies Answer"),
     KeyRow(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
     KeyRow(
         SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator; replies Answer"
@@ -92,8 +92,12 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(
         CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"
     ),
-    KeyRow(SETTINGS, m.SettingsRequest, "any", "query", _ASKED, "other settings for the running controller; Answer"),
-    KeyRow(SETTINGS_IN_FORCE, m.ControlSettings, "control", "latched", "on a change", "the controller's settings now"),
+    KeyRow(
+        PARAMETERS, m.ParametersRequest, "any", "query", _ASKED, "other parameters for the running controller; Answer"
+    ),
+    KeyRow(
+        PARAMETERS_IN_FORCE, m.ControlParameters, "control", "latched", "on a change", "the controller's parameters now"
+    ),
     KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
     KeyRow(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
     KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),

@@ -28,7 +28,7 @@ A_JOINT = "one entry a joint"
 MAX_CONFIG = 500_000  # characters
 RANGE_SLACK_FRACTION = 0.05  # of the stated range of a camera or lidar: room for noise at its ends
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
-LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
+LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a reset")
 HOST = about("random id of the host process, new at each start; null: unknown")
 
 
@@ -482,14 +482,14 @@ class Status(Message, frozen=True, kw_only=True):
     clock_mode: Annotated[ClockMode, PACE]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     lifecycle: Annotated[LifecycleState, LIFECYCLE]
-    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arming")]
+    reason: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arming")]
     lease_holder: Annotated[q.Name | None, about("null: the lease is free")]
     lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")]
     commands_accepted: Annotated[q.Count, about("while armed")]
     commands_standby: Annotated[q.Count, about("valid commands while disarmed: received, not enacted")]
     commands_rejected: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")]
     commands_limited: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")]
-    faults: Annotated[list[Fault], Meta(max_length=64), about("since the last clear; not all of them stop the robot")]
+    faults: Annotated[list[Fault], Meta(max_length=64), about("since the last reset; not all of them stop the robot")]
     alive: Annotated[list[q.Name], Meta(max_length=64), about("services of the run with a liveliness token")]
     waiting_for: Annotated[list[q.Name], Meta(max_length=64), about("services that arming waits for")]
     overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
@@ -502,7 +502,7 @@ class Status(Message, frozen=True, kw_only=True):
         dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque left by derating")
     ] = {}
     isolated: Annotated[
-        list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a clear")
+        list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a reset")
     ] = []
     host: Annotated[q.Name | None, HOST] = None
     faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
@@ -549,10 +549,10 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/lifecycle`. Arming names robot and backend, so that the wrong one is not armed."""
 
     action: Annotated[
-        Literal["arm", "disarm", "clear", "finish"],
-        about("clear leads from fault or estop to disarmed; finish disarms, and ends the run"),
+        Literal["arm", "disarm", "reset", "finish"],
+        about("reset leads from fault or estop to disarmed; finish disarms, and ends the run"),
     ]
-    who: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
+    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
     host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
     robot: Annotated[q.Name | None, about("`Description.robot`; arm needs it, others may leave it null")] = None
     backend: Annotated[q.Name | None, about("`Description.backend`; arm needs it, others may leave it null")] = None
@@ -564,17 +564,17 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     ] = False
 
 
-def make_arm_request(robot: Description, who: str, *, unchecked: bool = False) -> LifecycleRequest:
+def make_arm_request(robot: Description, requester: str, *, unchecked: bool = False) -> LifecycleRequest:
     """Make a request to arm exactly the robot, backend, configuration and host process that are described.
 
     Args:
         robot: the description that the host publishes.
-        who: name of the requester, for status, log and summary.
+        requester: name of the requester, for status, log and summary.
         unchecked: arm also a robot whose joints were not checked as they are now.
     """
     return LifecycleRequest(
         action="arm",
-        who=who,
+        requester=requester,
         host=robot.host,
         robot=robot.robot,
         backend=robot.backend,
@@ -584,9 +584,9 @@ def make_arm_request(robot: Description, who: str, *, unchecked: bool = False) -
 
 
 class EstopRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
+    """Query payload on `hal/estop`; needs no lease. Latched until `reset` on `hal/lifecycle`."""
 
-    who: Annotated[q.Name, about("name of the requester, for status, log and summary")]
+    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")]
 
 
 class SimulatorRequest(Message, frozen=True, kw_only=True):
@@ -596,7 +596,7 @@ class SimulatorRequest(Message, frozen=True, kw_only=True):
         Literal["pause", "resume", "step", "speed", "reset"],
         about("step: some ticks, then paused; reset: another host, at the start and disarmed, takes the place of this"),
     ]
-    who: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
+    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
     host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
     ticks: Annotated[int, Meta(ge=1, le=1_000_000), about("of a step")] = 1
     speed: Annotated[q.Speed, about("robot time per wall time, in real time; 1: as the wall")] = 1.0
@@ -807,25 +807,29 @@ class ControlState(Message, frozen=True, kw_only=True):
     ] = ""
 
 
-class SettingsRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `control/settings`: go on with these settings of the running controller."""
+class ParametersRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `control/parameters`: go on with these parameters of the running controller."""
 
-    who: Annotated[q.Name, about("name of the requester, for log and record")]
-    controller: Annotated[q.Name, about("`ControlSettings.controller`; another one is refused")]
-    settings: Annotated[
-        str, Meta(max_length=q.MAX_SETTINGS), about("a JSON object; fields that it leaves out get their defaults")
+    requester: Annotated[q.Name, about("name of the requester, for log and record")]
+    controller: Annotated[q.Name, about("`ControlParameters.controller`; another one is refused")]
+    parameters: Annotated[
+        str,
+        Meta(max_length=q.MAX_PARAMETERS_JSON),
+        about("a JSON object; fields that it leaves out get their defaults"),
     ]
 
 
-class ControlSettings(Message, frozen=True, kw_only=True):
-    """`control/settings_in_force`, latched: what the controller runs with, and what it could."""
+class ControlParameters(Message, frozen=True, kw_only=True):
+    """`control/parameters_in_force`, latched: what the controller runs with, and what it could."""
 
     tick: Annotated[q.Tick, about("since when")]
     timestamp_ns: q.Stamp
     controller: q.Name
-    settings: Annotated[str, Meta(max_length=q.MAX_SETTINGS), about("all of them, as a JSON object")]
-    schema: Annotated[str, Meta(max_length=q.MAX_SCHEMA), about("JSON Schema of `settings`, with bounds and units")]
-    who: Annotated[q.Name | None, about("who has asked for them; null: the configuration of the run")] = None
+    parameters: Annotated[str, Meta(max_length=q.MAX_PARAMETERS_JSON), about("all of them, as a JSON object")]
+    schema: Annotated[str, Meta(max_length=q.MAX_SCHEMA), about("JSON Schema of `parameters`, with bounds and units")]
+    requester: Annotated[q.Name | None, about("name of the requester of them; null: the configuration of the run")] = (
+        None
+    )
     changes: Annotated[q.Count, about("how often they have been changed since control started")] = 0
 
 
@@ -837,7 +841,7 @@ class Intent(Message, frozen=True, kw_only=True):
     """
 
     timestamp_ns: Annotated[q.Stamp, about("robot time of the request, from hal/clock")]
-    who: q.Name
+    requester: q.Name
     speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
     go: Annotated[bool, about("false: stop")] = True
     valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `timestamp_ns`, at most 5 s")] = (
@@ -877,8 +881,8 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         World,
         Trajectory,
         ControlState,
-        SettingsRequest,
-        ControlSettings,
+        ParametersRequest,
+        ControlParameters,
         Intent,
     ),
     1,

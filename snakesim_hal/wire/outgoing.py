@@ -50,7 +50,7 @@ def _find_message_type(key: str, message: Message, own: CustomMessage | None) ->
     expected = keys.find_message(key)
     if expected is None:
         known = suggest_word(key, keys.ROW_AT)
-        raise WireError("unknown_key", f"there is no such key; {known}`snakesim echo` lists them")
+        raise WireError("unknown_key", f"there is no such key; {known}`snakesim topic echo` lists them")
     if expected is OwnSample and isinstance(message, OwnSample):
         return type(message) if own is None else own.message
     if type(message) is not expected:

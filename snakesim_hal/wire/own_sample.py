@@ -78,7 +78,8 @@ def make_message_schema(message: Any, whose: str) -> str:
     if not (isinstance(message, type) and issubclass(message, OwnSample) and message is not OwnSample):
         raise ConfigError(
             f"{whose}: `message` is {shorten(repr(message))}, must be a class derived from OwnSample of "
-            "snakesim_hal.wire.messages, frozen and keyword-only"
+            "snakesim_hal.wire.messages, frozen and keyword-only",
+            code="plugin/not-loadable",
         )
     try:
         schema = msgspec.json.schema(message)["$defs"][message.__name__]
@@ -86,9 +87,9 @@ def make_message_schema(message: Any, whose: str) -> str:
         text = msgspec.json.encode(schema).decode()
         parse_custom_message(text)
     except WireError as error:
-        raise ConfigError(f"{whose}: {message.__name__}{error.detail}") from None
+        raise ConfigError(f"{whose}: {message.__name__}{error.detail}", code="plugin/not-loadable") from None
     except UNBUILDABLE as error:
-        raise ConfigError(f"{whose}: {message.__name__} is no message: {error}") from None
+        raise ConfigError(f"{whose}: {message.__name__} is no message: {error}", code="plugin/not-loadable") from None
     return text
 
 

@@ -27,7 +27,7 @@ class Role(StrEnum):
 ROLE_DESCRIPTIONS: dict[Role, str] = {
     Role.ROBOT: "the HAL host on the robot's computer, with what runs beside it there",
     Role.GNC: "guidance, navigation and control of one robot",
-    Role.OPERATOR: "a person who arms, disarms, clears, stops, and asks for a speed or a direction",
+    Role.OPERATOR: "a person who arms, disarms, resets, stops, and asks for a speed or a direction",
     Role.VIEWER: "a person who watches, and may stop the robot",
     Role.RECORDER: "a process that writes down everything",
     Role.ADMINISTRATOR: "an operator who may also read the routers' own state, and inject faults if the lab allows it",
@@ -54,12 +54,12 @@ _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.SIMULATOR: _PERSONS,
     keys.ESTOP: (Role.GNC, Role.VIEWER, *_PERSONS),
     keys.FAULT_ALL: (Role.ADMINISTRATOR,),
-    keys.SETTINGS: _PERSONS,
+    keys.PARAMETERS: _PERSONS,
 }
 # The roles that answer a query, by its key. All other queries are answered by the robot alone.
 _ANSWERERS: dict[str, tuple[Role, ...]] = {
     keys.FAULT_ALL: (Role.ROBOT, Role.GNC),
-    keys.SETTINGS: (Role.GNC,),
+    keys.PARAMETERS: (Role.GNC,),
 }
 # What follows the name of a service or a process at a key, if anything: here the process's random id.
 _SUFFIX_OF_NAME = {keys.PROCESS_ALL: "-$*"}

@@ -18,7 +18,9 @@ def open_port(port: int | None) -> socket.socket:
     for candidate in candidates:
         with contextlib.suppress(OSError):
             return socket.create_server((LOOPBACK, candidate))
-    raise NotConnectedError(f"--port {port}: another program listens there; choose another, or leave --port out")
+    raise NotConnectedError(
+        f"--port {port}: another program listens there; choose another, or leave --port out", code="network/port-in-use"
+    )
 
 
 def page_address(listening: socket.socket) -> str:

@@ -16,7 +16,9 @@ CONNECT_LIMIT_S = 20.0  # for the scheduler to answer, and again for its first w
 def check_address(address: str | None) -> None:
     """Check the form of a scheduler's address. Raises ConfigError if it is not tcp://HOST:PORT or tls://HOST:PORT."""
     if address is not None and not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
-        raise ConfigError(f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT")
+        raise ConfigError(
+            f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT", code="network/invalid-address"
+        )
 
 
 @contextmanager
@@ -38,7 +40,8 @@ def connected(address: str) -> "Iterator[Client]":
         client = Client(address, timeout=CONNECT_LIMIT_S, set_as_default=False)
     except (OSError, TimeoutError):
         raise NotConnectedError(
-            f"--cluster {address}: no Dask scheduler answers within {CONNECT_LIMIT_S:g} s"
+            f"--cluster {address}: no Dask scheduler answers within {CONNECT_LIMIT_S:g} s",
+            code="network/nothing-listens",
         ) from None
     with client:
         try:
@@ -46,7 +49,8 @@ def connected(address: str) -> "Iterator[Client]":
         except TimeoutError:
             raise NotConnectedError(
                 f"--cluster {address}: no worker within {CONNECT_LIMIT_S:g} s; start some: "
-                f"dask worker {address} --nthreads 1"
+                f"dask worker {address} --nthreads 1",
+                code="network/nothing-listens",
             ) from None
         yield client
 
@@ -58,9 +62,13 @@ def _check_certificates(address: str) -> None:
     try:
         context = Security().get_connection_args("client")["ssl_context"]
     except OSError as error:  # that of the ssl module, too
-        raise ConfigError(f"--cluster {address}: a file of Dask's TLS configuration cannot be used: {error}") from None
+        raise ConfigError(
+            f"--cluster {address}: a file of Dask's TLS configuration cannot be used: {error}",
+            code="certificate/rejected",
+        ) from None
     if address.startswith("tls:") and context is None:
         raise ConfigError(
             f"--cluster {address}: Dask has no certificate for TLS; name the files in its configuration, "
-            "distributed.comm.tls, as docs/evaluation.md shows"
+            "distributed.comm.tls, as docs/evaluation.md shows",
+            code="certificate/rejected",
         )

@@ -10,23 +10,16 @@ from snakesim_hal.model.plugins import pip_install
 
 BRINGS = {  # import names; messages about a package name the first extra with it
     "sim": ("mujoco",),
-    "record": ("foxglove_schemas_protobuf", "google", "lz4", "mcap", "zstandard"),
-    "report": ("jinja2", "markupsafe"),
     "can": ("bitstruct", "can", "cantools"),
-    "commission": ("tomlkit",),
-    "dynamixel": ("serial",),
-    "console": ("viser", "websockets"),
-    "export": ("pyarrow",),
-    "evaluate": ("dask", "distributed", "optuna", "pyarrow"),
-    "foxglove": ("foxglove",),
-    "gym": ("gymnasium",),
-    "lab": ("cryptography", "jinja2"),
-    "plot": ("matplotlib",),
+    "serial": ("serial",),
+    "record": ("foxglove_schemas_protobuf", "google", "jinja2", "lz4", "markupsafe", "mcap", "zstandard"),
+    "console": ("foxglove", "PIL", "viser", "websockets"),
+    "report": ("imageio_ffmpeg", "matplotlib", "PIL", "pyarrow"),
+    "lab": ("cryptography", "jinja2", "tomlkit"),
     "policy": ("onnxruntime",),
-    "preview": ("PIL",),
     "ros2": ("rosbags", "xxhash"),
-    "train": ("cmaes", "onnx"),
-    "video": ("imageio_ffmpeg", "PIL"),
+    "gym": ("gymnasium",),
+    "train": ("cmaes", "dask", "distributed", "onnx", "optuna"),
 }
 
 
@@ -39,13 +32,15 @@ def require(extra: str, who: str, otherwise: str = "") -> None:
     """Raise ConfigError when an extra is missing.
 
     Args:
-        extra: its name.
-        who: the command or function that needs it.
-        otherwise: how to continue without it, added to the message.
+        extra: Its name.
+        who: The command or function that needs it.
+        otherwise: How to continue without it, added to the message.
     """
     missing = _missing_packages(extra)
     if missing:
-        raise ConfigError(f"{who} needs {', '.join(missing)}: {pip_install(extra)}{otherwise}")
+        raise ConfigError(
+            f"{who} needs {', '.join(missing)}: {pip_install(extra)}{otherwise}", code="extra/not-installed"
+        )
 
 
 def explained(error: ModuleNotFoundError) -> ConfigError | None:
@@ -53,7 +48,7 @@ def explained(error: ModuleNotFoundError) -> ConfigError | None:
     package = (error.name or "").partition(".")[0]
     for extra, packages in BRINGS.items():
         if package in packages:
-            return ConfigError(f"this command needs {package}: {pip_install(extra)}")
+            return ConfigError(f"this command needs {package}: {pip_install(extra)}", code="extra/not-installed")
     return None
 
 

@@ -60,7 +60,8 @@ def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tup
             found.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
     if not found:
         raise NotConnectedError(
-            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
+            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first",
+            code="network/nothing-listens",
         )
     return found
 
@@ -71,9 +72,10 @@ def only_robot(where: RobotSelection, command: str) -> Link:
     if not found:
         named = "" if where.namespace is None else f" named {where.namespace}"
         raise NotConnectedError(
-            f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or give --endpoint"
+            f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or give --endpoint",
+            code="network/no-robot",
         )
     if len(found) > 1:
         choices = [f"  snakesim {command}{flags_of(link, None)}" for link in found]
-        raise RefusedError("several robots found; choose one:", *choices)
+        raise RefusedError("several robots found; choose one:", *choices, code="network/several-robots")
     return found[0]

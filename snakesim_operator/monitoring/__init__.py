@@ -1,4 +1,4 @@
-"""Commands that watch running robots and change nothing: `snakesim top`, `echo`, `preview`.
+"""Commands that watch running robots and change nothing: `snakesim topic rate`, `echo`, `preview`.
 
 `watching`   the arguments of these commands; imports little, so that the command line starts quickly
 `top`        every key of the robots on a network, as a table

@@ -1,4 +1,4 @@
-"""`snakesim echo`: prints the messages on a key, as one JSON object a line, or their rate."""
+"""`snakesim topic`: lists the keys, prints the messages on one as one JSON object a line, or measures their rate."""
 
 import contextlib
 import itertools
@@ -6,14 +6,14 @@ import json
 import statistics
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from queue import Empty
 from typing import Any
 
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_word
-from snakesim_hal.base.terminal import print_line, print_stderr
+from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Session, intersects, key_expression
 from snakesim_hal.wire import keys
@@ -25,40 +25,72 @@ RATE_PERIOD_S = 1.0
 MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network
 
 
-def echo(key: str | None, where: RobotSelection, *, rate_only: bool, count: int | None) -> int:
+def list_topics(*, as_json: bool) -> int:
+    """Print the keys on which a robot publishes, with their content."""
+    if as_json:
+        rows = [
+            {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about} for row in _published_rows()
+        ]
+        print_json({"topics": rows})
+        return 0
+    for line in _key_lines():
+        print_line(line)
+    print_stderr("`snakesim topic echo KEY` prints the messages; `snakesim topic rate` shows the rates of all keys")
+    return 0
+
+
+def echo(key: str, where: RobotSelection, *, count: int | None) -> int:
     """Print messages on a key, from every addressed robot.
 
     Args:
-        key: relative to the robot, wildcards allowed; None: print the list of keys.
+        key: relative to the robot, wildcards allowed.
         where: selects the robots.
-        rate_only: whether to print the rate instead of the messages.
-        count: of messages or rates after which the command ends; None: it does not end.
+        count: of messages after which the command ends; None: it does not end.
 
     Raises:
         NotConnectedError: no robot is reachable.
         ConfigError: there is no such key.
     """
-    if key is None:
-        for line in _key_lines():
-            print_line(line)
-        print_stderr("`snakesim echo KEY` prints the messages, --hz their rate; `snakesim top` shows all rates at once")
-        return 0
+    with _listen(key, where) as queue:
+        _print_messages(queue, count)
+    return 0
+
+
+def show_rate(key: str, where: RobotSelection, *, count: int | None, as_json: bool) -> int:
+    """Print the rate of the messages on a key once a second, from every addressed robot.
+
+    Args:
+        key: relative to the robot, wildcards allowed.
+        where: selects the robots.
+        count: of seconds after which the command ends; None: it does not end.
+        as_json: whether to print one JSON object a second.
+
+    Returns:
+        The exit code: 1 if no message has arrived in the last second, otherwise 0.
+
+    Raises:
+        NotConnectedError: no robot is reachable.
+        ConfigError: there is no such key.
+    """
+    with _listen(key, where) as queue:
+        return _print_rates(queue, count, as_json=as_json)
+
+
+@contextlib.contextmanager
+def _listen(key: str, where: RobotSelection) -> Iterator["OutputQueue"]:
+    """Subscribe to a key of every addressed robot. Raises NotConnectedError and ConfigError."""
     relative_key = key_expression(key.strip("/"))
     rows = [row for row in _published_rows() if intersects(relative_key, row.key)]
     if not rows:
         hint = suggest_word(key, [row.key for row in _published_rows()]).strip()
         lines = [*_key_lines(), hint] if hint else _key_lines()
-        raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines)
+        raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines, code="network/unknown-key")
     prefix = "" if where.namespace is not None else "**/"
     queue = OutputQueue()
     with contextlib.ExitStack() as stack:
         for _, session in sessions_on(where, stack):
             _subscribe(session, queue, key_expression(f"{prefix}{relative_key}"), prefix, rows)
-        if rate_only:
-            _print_rates(queue, count)
-        else:
-            _print_messages(queue, count)
-    return 0
+        yield queue
 
 
 def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.KeyRow]) -> None:
@@ -92,6 +124,24 @@ def _key_lines() -> list[str]:
     rows = _published_rows()
     width = max(len(row.key) for row in rows)
     return [f"  {row.key:<{width}}  {row.about}" for row in rows]
+
+
+class MeasuredRate(msgspec.Struct, frozen=True, kw_only=True):
+    """The rate of the messages on a key within RATE_PERIOD_S."""
+
+    key: str
+    rate_hz: float
+    min_gap_ms: float
+    max_gap_ms: float
+    deviation_ms: float
+    messages: int
+
+    def describe(self) -> str:
+        """Return a line for the terminal."""
+        return (
+            f"{self.key}: {self.rate_hz:.1f} Hz  gap {self.min_gap_ms:.2f} to {self.max_gap_ms:.2f} ms"
+            f"  deviation {self.deviation_ms:.2f} ms  over {self.messages}"
+        )
 
 
 class OutputQueue:
@@ -162,14 +212,21 @@ def _decode_content(arrival: Arrival) -> dict[str, Any]:
     return {"message": msgspec.to_builtins(decoded)}
 
 
-def _print_rates(queue: OutputQueue, count: int | None) -> None:
-    """Print the rate of each key once in RATE_PERIOD_S."""
+def _print_rates(queue: OutputQueue, count: int | None, *, as_json: bool) -> int:
+    """Print the rate of each key once in RATE_PERIOD_S. Returns 1 if nothing arrived in the last period."""
+    exit_code = 0
     for _ in _repeat(count):
         times_ns = _collect_times(queue)
-        for key, key_times_ns in sorted(times_ns.items()):
-            _print_rate(key, key_times_ns)
+        rates = [rate for key in sorted(times_ns) if (rate := _measure_rate(key, times_ns[key])) is not None]
+        exit_code = 0 if times_ns else 1
+        if as_json:
+            print_json({"rates": rates})
+            continue
+        for rate in rates:
+            print_line(rate.describe())
         if not times_ns:
             print_line("nothing arrives")
+    return exit_code
 
 
 def _collect_times(queue: OutputQueue) -> dict[str, list[int]]:
@@ -185,13 +242,16 @@ def _collect_times(queue: OutputQueue) -> dict[str, list[int]]:
     return times_ns
 
 
-def _print_rate(key: str, times_ns: list[int]) -> None:
+def _measure_rate(key: str, times_ns: list[int]) -> MeasuredRate | None:
+    """Return the rate of a key; None if fewer than two messages arrived."""
     gaps_ms = [(later - earlier) / 1e6 for earlier, later in itertools.pairwise(times_ns)]
     if not gaps_ms:
-        return
-    rate_hz = 1000 / statistics.fmean(gaps_ms)
-    deviation_ms = statistics.pstdev(gaps_ms)
-    print_line(
-        f"{key}: {rate_hz:.1f} Hz  gap {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms"
-        f"  deviation {deviation_ms:.2f} ms  over {len(times_ns)}"
+        return None
+    return MeasuredRate(
+        key=key,
+        rate_hz=1000 / statistics.fmean(gaps_ms),
+        min_gap_ms=min(gaps_ms),
+        max_gap_ms=max(gaps_ms),
+        deviation_ms=statistics.pstdev(gaps_ms),
+        messages=len(times_ns),
     )

@@ -1,4 +1,4 @@
-"""`snakesim preview`: small, compressed copies of a robot's images, for viewers behind a slow link.
+"""`snakesim start preview`: small, compressed copies of a robot's images, for viewers behind a slow link.
 
 It runs on the robot's computer and reads the full images there. A distant viewer subscribes to `preview/**` instead of
 `sensor/depth/*`: nothing changes for subscribers to the full images. This is a program of its own, because compressing
@@ -35,19 +35,26 @@ QUEUED_IMAGES = 4  # a few invalid images do not displace the valid one
 
 def preview(where: RobotSelection, hz: float, width: int) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    extras.require("preview", "`snakesim preview`")
+    extras.require("console", "`snakesim start preview`")
     if not MIN_HZ <= hz <= MAX_HZ:
-        raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz")
+        raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz", code="command/invalid-option")
     if not MIN_WIDTH_PX <= width <= MAX_WIDTH_PX:
-        raise ConfigError(f"--width {width}: give from {MIN_WIDTH_PX} to {MAX_WIDTH_PX} pixels")
-    link = only_robot(where, "preview")
+        raise ConfigError(
+            f"--width {width}: give from {MIN_WIDTH_PX} to {MAX_WIDTH_PX} pixels", code="command/invalid-option"
+        )
+    link = only_robot(where, "start preview")
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
         if robot is None:
-            raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s")
+            raise NotConnectedError(
+                f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s", code="network/no-robot"
+            )
         cameras = cameras_of(session, robot, width)
         if not cameras:
-            raise ConfigError(f"{link.namespace} has no camera: nothing at {keys.DEPTH_ALL} or {keys.COLOR_ALL}")
+            raise ConfigError(
+                f"{link.namespace} has no camera: nothing at {keys.DEPTH_ALL} or {keys.COLOR_ALL}",
+                code="network/unknown-key",
+            )
         print_line(f"{link.namespace}: previews of {', '.join(camera.key for camera in cameras)}; Ctrl-C ends it")
         while True:
             for camera in cameras:

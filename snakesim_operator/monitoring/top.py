@@ -1,4 +1,4 @@
-"""`snakesim top`: every key of the robots on a network, as a table that is redrawn every second."""
+"""`snakesim topic rate`: every key of the robots on a network, as a table that is redrawn every second."""
 
 import contextlib
 import sys

@@ -42,7 +42,7 @@ decoder_of = cache(Decoder)
 
 
 class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
-    """One line of `snakesim top`; None where it is unknown."""
+    """One line of `snakesim topic rate`; None where it is unknown."""
 
     robot: str
     key: str

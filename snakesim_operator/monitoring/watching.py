@@ -1,51 +1,56 @@
-"""Arguments of the commands that read what a robot publishes: `snakesim status`, `top`, `echo`, `record`, `preview`."""
+"""The commands that read what a robot publishes: `snakesim status`, `topic`, `record` and `start preview`."""
 
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.programs.arguments import add_json, add_network, number_type
+from snakesim_hal.programs.arguments import add_duration, add_json, add_network, add_out, add_task, number_type
+from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.recording.message import RAW_ONLY
 
 MAX_TASK = 200
 
 
-def add_commands(commands: Any) -> None:
-    """Add them to the parser of `snakesim`."""
-    status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
-    add_network(status)
-    add_json(status)
-    status.set_defaults(act=_status)
+def _add_status(parser: argparse.ArgumentParser) -> None:
+    add_network(parser)
+    add_json(parser)
 
-    top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
-    top.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
-    add_network(top)
-    add_json(top)
-    top.set_defaults(act=_top)
 
-    echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
-    echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
-    echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
-    echo.add_argument("--count", type=number_type(1, 10**9), help="end after this many messages")
-    add_network(echo)
-    echo.set_defaults(act=_echo)
+def _add_topic_list(parser: argparse.ArgumentParser) -> None:
+    add_json(parser)
 
-    record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
-    record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
-    record.add_argument(
+
+def _add_echo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("key", metavar="KEY", help="such as sensor/joints or sensor/*; `snakesim topic list` has all")
+    _add_count(parser, "end after this many messages")
+    add_network(parser)
+
+
+def _add_rate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("key", nargs="?", metavar="KEY", help="only this key, such as sensor/joints or sensor/*")
+    parser.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
+    _add_count(parser, "end after this many seconds; with KEY")
+    add_network(parser)
+    add_json(parser)
+
+
+def _add_count(parser: argparse.ArgumentParser, about: str) -> None:
+    parser.add_argument("--count", type=number_type(1, 10**9), metavar="N", help=about)
+
+
+def _add_record(parser: argparse.ArgumentParser) -> None:
+    add_out(parser, "the MCAP file (default: NAMESPACE-TIME.mcap)")
+    parser.add_argument(
         "--episodes",
         type=Path,
         metavar="DIR",
-        help="record demonstrations, one after the other, begun and ended by Enter",
+        help="record demonstrations into this folder, one after the other, begun and ended by Enter",
     )
-    record.add_argument("--task", metavar="TEXT", help="with --episodes: what is demonstrated, in words")
-    record.add_argument(
-        "--duration", type=number_type(0.0, 1e9, "s"), metavar="S", help="end after this time by the wall clock"
-    )
-    viewers = record.add_mutually_exclusive_group()
+    add_task(parser, "with --episodes: what is demonstrated, in words")
+    add_duration(parser, "end after this time by the wall clock", number_type(0.0, 1e9, "s"))
+    viewers = parser.add_mutually_exclusive_group()
     viewers.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
     viewers.add_argument(
         "--foxglove",
@@ -55,23 +60,24 @@ def add_commands(commands: Any) -> None:
         metavar="PORT",
         help="serve Foxglove live as well, at ws://127.0.0.1:PORT (8765)",
     )
-    record.add_argument(
+    parser.add_argument(
         "--foxglove-origin",
         action="append",
         default=[],
         metavar="ORIGIN",
         help="a web page that may read the robot there, such as https://app.foxglove.dev; may be repeated",
     )
-    add_network(record)
-    record.set_defaults(act=_record)
+    add_network(parser)
 
-    preview = commands.add_parser(
-        "preview", help="publish small, compressed copies of a robot's images; beside its host"
+
+def _add_preview(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--hz", type=float, default=2.0, metavar="HZ", help="maximum previews a second of a camera (default: 2)"
     )
-    preview.add_argument("--hz", type=float, default=2.0, metavar="HZ", help="most previews a second of a camera (2)")
-    preview.add_argument("--width", type=int, default=320, metavar="PIXELS", help="widest preview (320)")
-    add_network(preview)
-    preview.set_defaults(act=_preview)
+    parser.add_argument(
+        "--width", type=int, default=320, metavar="PIXELS", help="maximum width of a preview (default: 320)"
+    )
+    add_network(parser)
 
 
 def _status(arguments: argparse.Namespace) -> int:
@@ -80,16 +86,29 @@ def _status(arguments: argparse.Namespace) -> int:
     return show_status(select_robots(arguments), as_json=arguments.json)
 
 
-def _top(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.monitoring.top import top
+def _list_topics(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.monitoring.echo import list_topics
 
-    return top(select_robots(arguments), once=arguments.once, as_json=arguments.json)
+    return list_topics(as_json=arguments.json)
 
 
 def _echo(arguments: argparse.Namespace) -> int:
     from snakesim_operator.monitoring.echo import echo
 
-    return echo(arguments.key, select_robots(arguments), rate_only=arguments.hz, count=arguments.count)
+    return echo(arguments.key, select_robots(arguments), count=arguments.count)
+
+
+def _show_rates(arguments: argparse.Namespace) -> int:
+    if arguments.key is None:
+        if arguments.count is not None:
+            raise ConfigError("--count is for one KEY; name it, or give --once")
+        from snakesim_operator.monitoring.top import top
+
+        return top(select_robots(arguments), once=arguments.once, as_json=arguments.json)
+    from snakesim_operator.monitoring.echo import show_rate
+
+    count = 1 if arguments.once else arguments.count
+    return show_rate(arguments.key, select_robots(arguments), count=count, as_json=arguments.json)
 
 
 def _record(arguments: argparse.Namespace) -> int:
@@ -98,9 +117,11 @@ def _record(arguments: argparse.Namespace) -> int:
     if arguments.episodes is not None:
         return _record_episodes(arguments)
     if arguments.task is not None:
-        raise ConfigError("--task is for --episodes DIR; add it, or leave --task out")
+        raise ConfigError(
+            "--task is for --episodes DIR; add it, or leave --task out", code="command/conflicting-options"
+        )
     if arguments.foxglove is not None:
-        extras.require("foxglove", "--foxglove")
+        extras.require("console", "--foxglove")
     from snakesim_operator.playback.record_command import record_robot
 
     return record_robot(
@@ -116,11 +137,15 @@ def _record(arguments: argparse.Namespace) -> int:
 def _record_episodes(arguments: argparse.Namespace) -> int:
     for name in ("out", "duration", "foxglove"):
         if getattr(arguments, name) is not None:
-            raise ConfigError(f"--{name} and --episodes: episodes are files in a folder, begun and ended by Enter")
+            raise ConfigError(
+                f"--{name} and --episodes: episodes are files in a folder, begun and ended by Enter",
+                code="command/conflicting-options",
+            )
     task = (arguments.task or "").strip()
     if not 0 < len(task) <= MAX_TASK:
         raise ConfigError(
-            f"--task: say what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'"
+            f"--task: say what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'",
+            code="command/invalid-option",
         )
     from snakesim_operator.playback.demonstrations import record_demonstrations
 
@@ -131,3 +156,53 @@ def _preview(arguments: argparse.Namespace) -> int:
     from snakesim_operator.monitoring.preview import preview
 
     return preview(select_robots(arguments), arguments.hz, arguments.width)
+
+
+COMMANDS: Commands = (
+    Command(
+        name="record",
+        heading="daily work",
+        help="Record everything that a robot publishes into an MCAP file.",
+        add=_add_record,
+        run=_record,
+        examples=("record --out test.mcap --duration 30", "record --episodes demos --task 'through the pegs'"),
+    ),
+    Command(
+        name="status",
+        heading="daily work",
+        help="Print the state of the robots on the network, and its reason.",
+        add=_add_status,
+        run=_status,
+        details="Exit code: 0 every robot is armed or disarmed without a fault, 1 otherwise or without a robot.",
+        examples=("status", "status --json --endpoint tcp/127.0.0.1:7447"),
+    ),
+    Noun(name="topic", heading="robot", help="List keys, print their messages, and measure their rates."),
+    Command(
+        name="topic list",
+        help="List the keys on which a robot publishes.",
+        add=_add_topic_list,
+        run=_list_topics,
+        examples=("topic list", "topic list --json"),
+    ),
+    Command(
+        name="topic echo",
+        help="Print what is published on a key, one JSON object a line.",
+        add=_add_echo,
+        run=_echo,
+        examples=("topic echo sensor/joints --count 1", "topic echo 'sensor/*'"),
+    ),
+    Command(
+        name="topic rate",
+        help="Show rate, jitter, size and age of every key, and the latency of commands.",
+        add=_add_rate,
+        run=_show_rates,
+        examples=("topic rate", "topic rate sensor/joints --count 5"),
+    ),
+    Command(
+        name="start preview",
+        help="Start the process that publishes small, compressed copies of a robot's images, beside its host.",
+        add=_add_preview,
+        run=_preview,
+        examples=("start preview", "start preview --hz 5 --width 160"),
+    ),
+)

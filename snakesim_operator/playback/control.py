@@ -3,7 +3,7 @@
 The services are those of a run, on a network within this process; the recording stands in for the host. They get the
 recorded bytes, tick by tick, and a lease of the recorded number. From a run in lockstep the commands come out the same
 to the bit. With a changed setting they differ, but the robot moves as it did: it shows what another gain would have
-commanded in the situations of the recording, not where that would have led. Settings that somebody changed during the
+commanded in the situations of the recording, not where that would have led. Parameters that somebody changed during the
 run are changed in the same tick again.
 """
 
@@ -31,23 +31,23 @@ from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
     Configuration,
-    ControlSettings,
+    ControlParameters,
     Description,
     JointCommand,
-    SettingsRequest,
+    ParametersRequest,
 )
 from snakesim_operator.playback.play import in_robot_order
 from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import CONFIG
-from snakesim_operator.results.recording_contents import Contents, read_recording
+from snakesim_operator.results.recording_contents import RecordingContents, read_recording
+from snakesim_operator.results.run_reader import CONFIG
 
 SERVICE_OUTPUTS = {
     "guidance": (keys.WORLD,),
     "navigation": (keys.TRAJECTORY,),
-    "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE, keys.SETTINGS_IN_FORCE),
+    "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE, keys.PARAMETERS_IN_FORCE),
 }
 """The keys at which the replayed services publish. Recorded messages at these keys are not replayed."""
 
@@ -99,7 +99,7 @@ def same(a: JointCommand, b: JointCommand) -> bool:
     return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (b.arm_session, b.mode, b.target, b.torque_limit_nm)
 
 
-def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
+def config_of(contents: RecordingContents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
     """Return the configuration of a recording, with changes.
 
     Args:
@@ -112,7 +112,10 @@ def config_of(contents: Contents, overrides: list[Override], *, run_recorded_cod
         ConfigError: There is no configuration, it is invalid, or it names Python files that are not allowed.
     """
     if contents.config is None:
-        raise ConfigError(f"{contents.path}: holds no hal/config, so it is not known which controller was at work")
+        raise ConfigError(
+            f"{contents.path}: holds no hal/config, so it is not known which controller was at work",
+            code="recording/missing-data",
+        )
     with TemporaryDirectory(prefix="snakesim-") as folder:
         path = Path(folder) / "config.json"
         path.write_text(contents.config.content)
@@ -142,7 +145,8 @@ def _refuse_recorded_files(path: Path, config: RunConfig, overridden: set[str]) 
             raise ConfigError(
                 f"{path}: the recording names {shorten(code)!r} as {what}, and would have that Python file run on this "
                 f"computer. If you trust the file, name it yourself, with {flag}{shorten(code)}, or run what the "
-                f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME"
+                f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME",
+                code="recording/untrusted-code",
             )
 
 
@@ -164,14 +168,14 @@ class Replay:
             ConfigError: The recording cannot be replayed.
         """
         contents = read_recording(path, (keys.DESCRIPTION, keys.CONFIG, keys.CLOCK))
-        self.lacks = contents.lacks
+        self.missing = contents.missing
         self.config = config_of(contents, overrides, run_recorded_code=run_recorded_code)
         self.changed = bool(overrides) and self.config != config_of(contents, [], run_recorded_code=True)
         if contents.description is None:
-            raise ConfigError(f"{path}: holds no hal/description")
+            raise ConfigError(f"{path}: holds no hal/description", code="recording/missing-data")
         self.robot: Description = contents.description
         self.clock_mode = self.config.clock_mode
-        self.stopped = ""  # why it did not reach the end of a recording that lacks something
+        self.stopped = ""  # why it did not reach the end of an incomplete recording
         self.comparison = Comparison()
 
         # What is replayed.
@@ -179,7 +183,7 @@ class Replay:
         self._services = [name for name in SERVICE_OUTPUTS if name in self.config.own_services]
         self._output_keys = {key for name in self._services for key in SERVICE_OUTPUTS[name]}
         self._output_keys |= {keys.done_key(name) for name in self._services}
-        clocks: list[tuple[int, Clock]] = sorted(contents.at[keys.CLOCK].items())
+        clocks: list[tuple[int, Clock]] = sorted(contents.messages_by_tick[keys.CLOCK].items())
         self._last_tick = clocks[-1][0] if clocks else -1
         self._epochs = [(tick, clock.lease_epoch) for tick, clock in clocks if clock.lease_epoch]
 
@@ -189,7 +193,7 @@ class Replay:
         self._publishers: dict[str, Publisher[Any]] = {}
         self._loops: list[ServiceLoop] = []
         self._joined = False
-        self._recording = Recording(out, self.config.robot.name) if out is not None else None
+        self._recording = RecordingWriter(out, self.config.robot.name) if out is not None else None
 
         # Commands.
         self._now_ns = 0
@@ -198,13 +202,13 @@ class Replay:
         self._applied_decoder = Decoder(AppliedCommand)
 
         # Parameters of the controller.
-        self._settings_decoder = Decoder(ControlSettings)
-        self._overridden_settings = {
+        self._parameters_decoder = Decoder(ControlParameters)
+        self._overridden_parameters = {
             override.key.removeprefix(CHOSEN[0]): override.value
             for override in overrides
             if override.key.startswith(CHOSEN[0])
         }
-        self._pending_changes: list[tuple[ControlSettings, LocalQuery]] = []  # without an answer yet
+        self._pending_changes: list[tuple[ControlParameters, LocalQuery]] = []  # without an answer yet
 
     def run(self) -> Comparison:
         """Replay the whole recording. Raises SnakesimError if a service fails."""
@@ -225,7 +229,7 @@ class Replay:
                 self._replay_messages()
                 self.comparison.ignore_unanswered(self._last_tick)
             except SnakesimError as error:
-                if not self.lacks:
+                if not self.missing:
                     raise
                 self.stopped = str(error)  # a service waits for a message that is lost
                 self.comparison.ignore_after(max(self.comparison.replayed, default=-1))
@@ -253,8 +257,8 @@ class Replay:
             command = self._command_decoder.decode(recorded.payload, recorded.encoding)
             self.comparison.recorded[command.tick] = command
             self._recorded_by_sequence[command.sequence] = command
-        if recorded.key == keys.SETTINGS_IN_FORCE and recorded.key in self._output_keys:
-            self._change_settings(self._settings_decoder.decode(recorded.payload, recorded.encoding))
+        if recorded.key == keys.PARAMETERS_IN_FORCE and recorded.key in self._output_keys:
+            self._change_parameters(self._parameters_decoder.decode(recorded.payload, recorded.encoding))
         if recorded.key in self._output_keys or recorded.key in (keys.CONFIG, keys.DESCRIPTION):
             return
         payload = recorded.payload
@@ -282,23 +286,26 @@ class Replay:
                 continue
             self._pending_changes.remove((change, query))
             if not answer.ok:
-                raise ConfigError(f"{self._path}: what {change.who} set at tick {change.tick}: {answer.reason}")
+                raise ConfigError(
+                    f"{self._path}: what {change.requester} set at tick {change.tick}: {answer.reason}",
+                    code="controller/unknown-parameter",
+                )
 
-    def _change_settings(self, recorded: ControlSettings) -> None:
+    def _change_parameters(self, recorded: ControlParameters) -> None:
         """Change the parameters of the controller as in the recording, where they come before their tick's clock.
 
         Parameters that the command line sets stay.
         """
-        if recorded.who is None or recorded.controller != self.config.controller[-64:]:
+        if recorded.requester is None or recorded.controller != self.config.controller[-64:]:
             return
-        values = msgspec.json.decode(recorded.settings, type=dict[str, Any])
-        values |= self._overridden_settings
-        request = SettingsRequest(
-            who=recorded.who,
+        values = msgspec.json.decode(recorded.parameters, type=dict[str, Any])
+        values |= self._overridden_parameters
+        request = ParametersRequest(
+            requester=recorded.requester,
             controller=recorded.controller,
-            settings=msgspec.json.encode(values).decode(),
+            parameters=msgspec.json.encode(values).decode(),
         )
-        self._pending_changes.append((recorded, self._session.send_query(keys.SETTINGS, request)))
+        self._pending_changes.append((recorded, self._session.send_query(keys.PARAMETERS, request)))
 
     def _applied_payload(self, recorded: RecordedMessage) -> bytes:
         """Return the setpoints that the host would have applied.
@@ -358,19 +365,21 @@ def replay_control(
         recording = None if out is None else out / RECORDING
         replay = Replay(path, overrides, recording, run_recorded_code=run_recorded_code)
     except FileExistsError:
-        raise ConfigError(f"--out {out}: holds a recording already; choose another folder") from None
+        raise ConfigError(
+            f"--out {out}: holds a recording already; choose another folder", code="file/already-exists"
+        ) from None
     comparison = replay.run()
     if out is not None:
         write_config(replay.config, out / CONFIG)
-        say(f"replayed: {out}; `snakesim compare {path} {out}` shows the difference")
+        say(f"replayed: {out}; `snakesim study compare {path} {out}` shows the difference")
     if replay.stopped:
         say(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
     elif not comparison.recorded:
-        raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}")
+        raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
     are_same = _print_comparison(comparison, replay, say)
-    if are_same or replay.changed or replay.lacks:
-        return exit_code(path, replay.lacks)
-    return exit_code(path, replay.lacks, 1)
+    if are_same or replay.changed or replay.missing:
+        return exit_code(path, replay.missing)
+    return exit_code(path, replay.missing, 1)
 
 
 def _print_comparison(comparison: Comparison, replay: Replay, say: PrintLine) -> bool:

@@ -2,7 +2,7 @@
 
 The operator drives the robot by `snakesim teleop`, the console or from ROS, while this command records. Enter begins an
 episode and ends it; then s, f or d mark it as succeeded, failed, or to be dropped; q ends the command. Each episode is
-a recording of its own, and a line of EPISODES, from which `snakesim export --format lerobot` makes a data set.
+a recording of its own, and a line of EPISODES, from which `snakesim recording export --format lerobot` makes a dataset.
 """
 
 import signal
@@ -21,7 +21,7 @@ from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.session import Link
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, only_robot
-from snakesim_operator.recording.process import record_to_file
+from snakesim_operator.recording.recorder_process import record_to_file
 
 EPISODES = "episodes.jsonl"
 SUCCESS_BY_KEY = {"s": True, "f": False, "d": None}  # None: the episode is dropped
@@ -106,7 +106,8 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
     print_line(
-        f"{demonstrations.kept} episodes; `snakesim export {folder} --format lerobot` makes a data set of {folder}"
+        f"{demonstrations.kept} episodes; `snakesim recording export {folder} --format lerobot` makes a dataset "
+        f"of {folder}"
     )
     return 1 if demonstrations.failure else 0
 

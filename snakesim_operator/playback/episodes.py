@@ -1,10 +1,11 @@
-"""Runs as episodes of a data set: what each was for, whether it succeeded, the reward of each step, the pictures.
+"""Divides runs into the episodes of a data set: task, success, reward of each step, pictures.
 
-`snakesim record --episodes` leaves a folder with EPISODES in it, which says what the operator says of each episode. Of
-other runs the task is the scenario, and success is the mission's goal; where there is none, success is unknown.
+`snakesim record --episodes` leaves a folder with the file EPISODES, in which the operator labels each episode. The task
+of any other run is its scenario, and its success is that it reached the mission's goal. Without a goal, success is
+unknown.
 
-A gap in a recording ends an episode, because neither the time nor the motion in the gap is known; what follows the gap
-is an episode of its own.
+A gap in a recording ends an episode, because neither the time nor the motion in the gap is known. What follows the gap
+is another episode.
 """
 
 from collections.abc import Sequence
@@ -19,40 +20,49 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.playback.demonstrations import EPISODES, EpisodeLabel
-from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.pictures import Pictures, read_pictures
 from snakesim_operator.results.metrics.advance import Advance
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import find_recording
 
 
 @dataclass(frozen=True)
 class Episode:
-    """A run, or what lies between two gaps of its recording."""
+    """A run, or a part of it between two gaps of its recording."""
 
     record: RunRecord
     task: str
     success: bool | None  # None: unknown
-    # (n,) of every row of the record: how far the robot comes on until the next row; None: its pose is unknown
-    reward_m: Floats | None
+    reward_m: Floats | None  # (n,) advance from each row of the record to the next; None: the pose is unknown
     rows: NDArray[np.int64]  # of the record, without a gap between them
-    pictures: dict[str, Pictures] = field(default_factory=dict[str, Pictures])
-    pictures_after_tick: int = -1  # older pictures are from before a gap, and show what the robot no longer sees
+    pictures: dict[str, Pictures] = field(default_factory=dict[str, Pictures])  # of the whole run, by camera
+    pictures_after_tick: int = -1  # older pictures are from before a gap, and show another scene
 
 
 def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[Episode]:
-    """Reads folders of runs, recordings, and folders of demonstrations. Raises ConfigError. task: for all of them."""
-    found: list[Episode] = []
+    """Read the episodes of several runs.
+
+    Args:
+        runs: Folders of runs, recordings, and folders of demonstrations.
+        task: The task of all episodes; None: the one of each run.
+        images: Whether to read the pictures of the cameras.
+
+    Raises:
+        ConfigError: A run or its labels cannot be read.
+    """
+    episodes: list[Episode] = []
     for run in runs:
-        if (run / EPISODES).is_file():
-            for label in read_labels(run / EPISODES):
-                found += _episodes_of(run / label.file, task or label.task, label.success, images=images)
-        else:
-            found += _episodes_of(run, task, None, images=images)
-    return found
+        labels_path = run / EPISODES
+        if not labels_path.is_file():
+            episodes += _read_run(run, task, None, images=images)
+            continue
+        for label in read_labels(labels_path):
+            episodes += _read_run(run / label.file, task or label.task, label.success, images=images)
+    return episodes
 
 
-def gaps_in_words(episodes: Sequence[Episode]) -> list[str]:
-    """Returns a sentence for each gap that ended an episode."""
+def describe_gaps(episodes: Sequence[Episode]) -> list[str]:
+    """Return a sentence for each gap that ended an episode."""
     sentences: list[str] = []
     for before, after in pairwise(episodes):
         if after.record is not before.record:
@@ -67,43 +77,62 @@ def gaps_in_words(episodes: Sequence[Episode]) -> list[str]:
 
 
 def read_labels(path: Path) -> list[EpisodeLabel]:
-    """What the operator said of each episode. Raises ConfigError."""
+    """Return the operator's label of each episode. Raises ConfigError."""
     try:
-        return [msgspec.json.decode(line, type=EpisodeLabel) for line in path.read_bytes().splitlines() if line.strip()]
+        lines = path.read_bytes().splitlines()
+        return [msgspec.json.decode(line, type=EpisodeLabel) for line in lines if line.strip()]
     except (msgspec.DecodeError, OSError) as error:
-        raise ConfigError(f"{path}: {str(error)[:200]}; it has a line of JSON for each episode") from None
+        raise ConfigError(
+            f"{path}: {str(error)[:200]}; it has a line of JSON for each episode", code="recording/not-readable"
+        ) from None
 
 
-def _episodes_of(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:
-    """Returns the episodes of one recording: one, and one more for each gap."""
+def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:
+    """Return the episodes of one run: one, and one more for each gap.
+
+    Args:
+        run: Folder or recording.
+        task: The task; None: the scenario.
+        success: The operator's label; None: success is that the run reached its goal.
+        images: Whether to read the pictures of the cameras.
+    """
     record = RunRecord.load(run)
-    advance = Advance.of(record)
     reward_m = None
+    advance = Advance.of(record)
     if advance is not None:
-        reward_m = _reward_m(record, advance)
+        reward_m = _compute_reward_m(record, advance)
         if success is None and advance.goal_m is not None:
             success = advance.crossed_s is not None
-    pictures = read_pictures(recording_of(run)) if images else {}
-    stretches = record.stretches or [np.arange(0)]  # of a run that was never armed: no row
+    pictures: dict[str, Pictures] = {}
+    if images:
+        pictures = read_pictures(find_recording(run))
+    stretches = record.stretches
+    if not stretches:  # the robot was never armed
+        stretches = [np.arange(0)]
     episodes: list[Episode] = []
     for number, rows in enumerate(stretches):
         is_last = number == len(stretches) - 1
-        episodes.append(
-            Episode(
-                record,
-                task or record.config.name,
-                success=success if success is None else success and is_last,  # the others end at a gap, not at the goal
-                reward_m=reward_m,
-                rows=rows,
-                pictures=pictures,
-                pictures_after_tick=int(record.ticks[rows[0] - 1]) if number > 0 else -1,
-            )
+        episode_success = success
+        if success and not is_last:  # it ended at a gap, not at the goal
+            episode_success = False
+        pictures_after_tick = -1
+        if number > 0:
+            pictures_after_tick = int(record.ticks[rows[0] - 1])
+        episode = Episode(
+            record=record,
+            task=task or record.config.name,
+            success=episode_success,
+            reward_m=reward_m,
+            rows=rows,
+            pictures=pictures,
+            pictures_after_tick=pictures_after_tick,
         )
+        episodes.append(episode)
     return episodes
 
 
-def _reward_m(record: RunRecord, advance: Advance) -> Floats:
-    """Returns (n,) how far the robot comes on from each row to the next; 0 at the end and at a gap."""
+def _compute_reward_m(record: RunRecord, advance: Advance) -> Floats:
+    """Return the advance from each row to the next, (n,); 0 at the end and at a gap."""
     along_m = np.interp(record.time_s - record.time_s[0], advance.time_s, advance.along_m)
     reward_m = np.append(np.diff(along_m), 0.0)
     for rows in record.stretches:

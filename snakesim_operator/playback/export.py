@@ -1,8 +1,8 @@
-"""`snakesim export`: a run as a table (CSV, Parquet), as arrays (NumPy), as a LeRobot dataset, or a whole MCAP file.
+"""`snakesim recording export`: a run as a table (CSV, Parquet), as arrays (NumPy), a LeRobot dataset or a whole MCAP.
 
 A table has a row for each tick since the first arming. Its columns have the units in their names, and what they are of
-behind a dot: `angle_rad.joint_1`, `position_w_m.x`. What is not known is empty (CSV, Parquet) or NaN. What the record
-lacks is told in each format's own way.
+behind a dot: `angle_rad.joint_1`, `position_w_m.x`. What is not known is empty (CSV, Parquet) or NaN. Each format
+states in its own way which data is missing.
 """
 
 import csv
@@ -19,14 +19,14 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import PrintLine, escape_invisible
 from snakesim_hal.model.textfiles import exported
 from snakesim_hal.wire.own_sample import find_custom_messages
-from snakesim_operator.playback.episodes import gaps_in_words, read_episodes
-from snakesim_operator.playback.info import recording_of
+from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import find_recording
 
-LACKS = b"snakesim.lacks"  # metadata of a Parquet file: JSON
+MISSING = b"snakesim.missing"  # metadata of a Parquet file: JSON
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
 UNITS = {
     "time_s": "s",
@@ -61,27 +61,30 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: PrintLine) ->
         ConfigError: There are several runs, the run cannot be read, or the file cannot be written.
     """
     if len(runs) > 1:
-        raise ConfigError(f"--format {form}: one run at a time; several make a dataset, with --format lerobot")
+        raise ConfigError(
+            f"--format {form}: one run at a time; several make a dataset, with --format lerobot",
+            code="command/invalid-option",
+        )
     run = runs[0]
     path = _reserve(out or _default_path(run, form))
     if form == "mcap":
         with exported(path) as partial:
-            count, lacks = recover_recording(recording_of(run), partial)
+            count, missing = recover_recording(find_recording(run), partial)
         say(f"{count} messages: {path}")
-        return exit_code(run, lacks)
+        return exit_code(run, missing)
     record = RunRecord.load(run)
     with exported(path) as partial:
         match form:
             case "npz":
                 _write_npz(record, partial)
             case "csv":
-                _write_csv(table(record), partial, record.lacks)
+                _write_csv(table(record), partial, record.missing)
             case _:
                 columns = {name: values.tolist() for name, values in table(record).items()}
-                metadata = {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None
+                metadata = {MISSING: json.dumps(record.missing).encode()} if record.missing else None
                 write_parquet(columns, partial, metadata)
     say(f"{len(record.time_s)} ticks: {path}")
-    return exit_code(run, record.lacks)
+    return exit_code(run, record.missing)
 
 
 def export_dataset(
@@ -107,10 +110,10 @@ def export_dataset(
     episodes = read_episodes(runs, task, images=images)
     with exported(path) as partial:
         size = write_lerobot(episodes, partial, write_parquet, fps)
-    for sentence in gaps_in_words(episodes):
+    for sentence in describe_gaps(episodes):
         say(sentence)
     say(f"{size.episodes} episodes, {size.frames} frames: {path}")
-    return max(exit_code(episode.record.folder, episode.record.lacks) for episode in episodes)
+    return max(exit_code(episode.record.folder, episode.record.missing) for episode in episodes)
 
 
 def _reserve(path: Path) -> Path:
@@ -121,9 +124,13 @@ def _reserve(path: Path) -> Path:
         path.unlink()
     except FileExistsError:
         what = "a symbolic link" if path.is_symlink() else "such a file"
-        raise ConfigError(f"{path}: there is {what} already; choose another one with --out") from None
+        raise ConfigError(
+            f"{path}: there is {what} already; choose another one with --out", code="file/already-exists"
+        ) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another one with --out") from None
+        raise ConfigError(
+            f"{path}: cannot be written: {error.strerror}; choose another one with --out", code="file/not-writable"
+        ) from None
     return path
 
 
@@ -142,7 +149,7 @@ def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
         value = getattr(record, column.name)
         if isinstance(value, np.ndarray):
             signals[column.name] = value
-    return signals | record.own
+    return signals | record.custom
 
 
 def unit_of(name: str, record: RunRecord) -> str:
@@ -178,16 +185,16 @@ def table(record: RunRecord) -> dict[str, NDArray[Any]]:
 
 def _write_npz(record: RunRecord, path: Path) -> None:
     joints = np.array([joint.name for joint in record.description.joints])
-    lacks = np.array(record.lacks, dtype=str)
-    names: dict[str, Any] = {"joints": joints, "lacks": lacks}
+    missing = np.array(record.missing, dtype=str)
+    names: dict[str, Any] = {"joints": joints, "missing": missing}
     with path.open("xb") as file:
         np.savez_compressed(file, **arrays(record), **names)
 
 
-def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str]) -> None:
+def _write_csv(columns: dict[str, NDArray[Any]], path: Path, missing: Sequence[str]) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
-        for lack in lacks:
-            file.write(f"# incomplete: {escape_invisible(lack)}\n")
+        for sentence in missing:
+            file.write(f"# incomplete: {escape_invisible(sentence)}\n")
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):
@@ -195,7 +202,7 @@ def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str
 
 
 def write_parquet(columns: dict[str, Any], path: Path, metadata: dict[bytes, bytes] | None = None) -> None:
-    """Write columns as a Parquet file. Needs the extra `export`.
+    """Write columns as a Parquet file. Needs the extra `report`.
 
     Args:
         columns: Values by column.

@@ -1,4 +1,4 @@
-"""`snakesim info`: what a recording holds, and what it lacks."""
+"""`snakesim recording info`: what a recording holds, and what is missing in it."""
 
 import contextlib
 import json
@@ -14,17 +14,16 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arithmetic import find_differing_parts, format_digest
-from snakesim_hal.base.errors import ConfigError, WireError
+from snakesim_hal.base.errors import WireError
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import ControlSettings, Status
+from snakesim_hal.wire.messages import ControlParameters, Status
 from snakesim_operator.recording.losses import LossGap
-from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.missing_data import describe_undecodable, exit_code
-from snakesim_operator.results.record import GIVE
-from snakesim_operator.results.recording_contents import ALL, Contents
+from snakesim_operator.results.recording_contents import ALL, RecordingContents
+from snakesim_operator.results.run_reader import find_recording
 from snakesim_operator.robot_commands.parameters import PREFIX, find_changed_parameters
 
 # Published on a change too, so that nothing is missing there.
@@ -47,11 +46,11 @@ class KeyInfo:
         return int((np.round(steps / np.median(steps)) - 1).clip(0).sum())
 
 
-class SettingsChange(msgspec.Struct, kw_only=True):
+class ParameterChange(msgspec.Struct, kw_only=True):
     """Parameters that an operator changed while the controller ran."""
 
     time_s: float
-    who: str
+    requester: str
     changed: dict[str, tuple[Any, Any]]  # name -> before, then
 
 
@@ -61,7 +60,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     file: str
     size_bytes: int
     finished: bool
-    lacks: list[str]
+    missing: list[str]
     gaps: list[LossGap]  # what of it is lost in between, by time and key
     robot: str | None
     backend: str | None
@@ -74,35 +73,27 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     command_digest: str | None
     own_arithmetic: list[str]  # what rounds otherwise than on most computers with the lock's NumPy
     lifecycle: str | None
-    settings: list[SettingsChange]
+    parameter_changes: list[ParameterChange]
     dropped: dict[str, int]
     keys: dict[str, dict[str, float]]
-
-
-def recording_of(given: Path) -> Path:
-    """Return the recording of a run's folder, or the file itself. Raises ConfigError if there is none."""
-    path = given / RECORDING if given.is_dir() else given
-    if not path.is_file():
-        raise ConfigError(f"{path}: there is no such recording; {GIVE}")
-    return path
 
 
 def inspect_recording(path: Path) -> RecordingInfo:
     """Read a recording once, and describe it. Raises ConfigError for a file that is no recording."""
     reader = RecordingReader(path)
-    contents = Contents(path)
+    contents = RecordingContents(path)
     by_key: dict[str, KeyInfo] = {}
-    settings_in_force: list[ControlSettings] = []
-    settings_decoder = Decoder(ControlSettings)
+    parameters_in_force: list[ControlParameters] = []
+    parameters_decoder = Decoder(ControlParameters)
     for recorded in reader.read_messages():
         key_info = by_key.setdefault(recorded.key, KeyInfo())
         key_info.time_ns.append(recorded.time_ns)
         key_info.bytes += len(recorded.payload)
         if recorded.key in ALL:
             contents.add(recorded)
-        if recorded.key == keys.SETTINGS_IN_FORCE:
+        if recorded.key == keys.PARAMETERS_IN_FORCE:
             with contextlib.suppress(WireError):
-                settings_in_force.append(settings_decoder.decode(recorded.payload, recorded.encoding))
+                parameters_in_force.append(parameters_decoder.decode(recorded.payload, recorded.encoding))
 
     robot = contents.description
     status = contents.status
@@ -113,8 +104,8 @@ def inspect_recording(path: Path) -> RecordingInfo:
         irregular.append(keys.IMU)
     host = None
     if robot is not None and status is not None:
-        host = contents.host(contents.columns(robot))
-    lacks = [
+        host = contents.make_host_record(contents.make_columns(robot))
+    missing = [
         *reader.missing,
         *_describe_skipped(by_key, reader.losses.lost_by_key, irregular),
         *describe_undecodable(contents.refused),
@@ -126,7 +117,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         file=str(path),
         size_bytes=path.stat().st_size,
         finished=reader.finished,
-        lacks=lacks,
+        missing=missing,
         gaps=[gap for gap in reader.losses.gaps if gap.lost],
         robot=None if robot is None else robot.robot,
         backend=None if robot is None else robot.backend,
@@ -139,7 +130,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
         command_digest=None if host is None or not host.ticks else host.command_digest,
         own_arithmetic=[] if robot is None else find_differing_parts(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_lifecycle_reason(status)}",
-        settings=_settings_changes(settings_in_force),
+        parameter_changes=_find_parameter_changes(parameters_in_force),
         dropped=reader.losses.dropped,
         keys=numbers_by_key,
     )
@@ -157,14 +148,14 @@ def _duration_s(by_key: dict[str, KeyInfo]) -> float:
     return (ended_ns - began_ns) * 1e-9
 
 
-def _settings_changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
+def _find_parameter_changes(in_force: Sequence[ControlParameters]) -> list[ParameterChange]:
     """Return the changes that an operator made, in order of time."""
-    changes: list[SettingsChange] = []
+    changes: list[ParameterChange] = []
     for before, now in pairwise(in_force):
-        if now.who is None or now.changes == before.changes:
+        if now.requester is None or now.changes == before.changes:
             continue
         changed = {PREFIX + new.name: (old.value, new.value) for old, new in find_changed_parameters(before, now)}
-        changes.append(SettingsChange(time_s=now.timestamp_ns * 1e-9, who=now.who, changed=changed))
+        changes.append(ParameterChange(time_s=now.timestamp_ns * 1e-9, requester=now.requester, changed=changed))
     return changes
 
 
@@ -174,8 +165,8 @@ def _lifecycle_reason(status: Status) -> str:
     While disarmed, the status appends what prevents arming; that part is left out.
     """
     if status.lifecycle == "disarmed":
-        return status.why.partition("; ")[0]
-    return status.why
+        return status.reason.partition("; ")[0]
+    return status.reason
 
 
 def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
@@ -191,27 +182,27 @@ def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
 
 def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
     """Print what a recording holds, and return the exit code: 3 if it is incomplete."""
-    info = inspect_recording(recording_of(given))
+    info = inspect_recording(find_recording(given))
     if as_json:
         say(msgspec.json.encode(info).decode())
-        return exit_code(given, info.lacks)
+        return exit_code(given, info.missing)
     say(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
     say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}")
     say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     say(f"  ended     {info.lifecycle or 'unknown'}")
     digest = format_digest(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
-    of_what = " of these ticks alone" if info.lacks else ""
+    of_what = " of these ticks alone" if info.missing else ""
     say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
-    for change in info.settings:
+    for change in info.parameter_changes:
         said = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
-        say(f"  set       at {change.time_s:.2f} s by {change.who}: {said}")
+        say(f"  set       at {change.time_s:.2f} s by {change.requester}: {said}")
     say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]
         say(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
-    for lack in info.lacks:
-        say(f"  lacks: {lack}")
-    return exit_code(given, info.lacks)
+    for sentence in info.missing:
+        say(f"  missing: {sentence}")
+    return exit_code(given, info.missing)
 
 
 def _describe_skipped(by_key: dict[str, KeyInfo], lost: Counter[str], irregular: Sequence[str]) -> list[str]:

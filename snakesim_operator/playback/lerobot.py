@@ -27,14 +27,14 @@ from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.playback.episodes import Episode
 from snakesim_operator.playback.lerobot_statistics import (
     Statistics,
-    feature_statistics,
-    join_picture_statistics,
-    picture_statistics,
+    compute_feature_statistics,
+    compute_picture_statistics,
+    merge_picture_statistics,
 )
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 VERSION = "v3.0"
-LACKS = "meta/lacks.json"  # of each episode that lacks something; not a file of LeRobot's
+MISSING = "meta/missing.json"  # of each incomplete episode; LeRobot knows no such file
 FILES_A_CHUNK = 1000
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA = f"data/{FILE}"
@@ -77,7 +77,8 @@ def write_lerobot(
     for episode in episodes:
         if not any(one.record is episode.record for one, _, _ in kept):
             raise ConfigError(
-                f"{episode.record.folder}: no picture came while it was armed; export it without --images"
+                f"{episode.record.folder}: no picture came while it was armed; export it without --images",
+                code="recording/missing-data",
             )
     dataset = _Dataset(folder, write_table, content, seconds_per_frame=step / robot_hz)
     for episode, rows, shown in kept:
@@ -134,13 +135,13 @@ class _Dataset:
         columns: dict[str, Any] = {}
         for name, values in frames.items():
             columns[name] = list(values) if values.ndim > 1 else values
-            row |= _columns_of(name, feature_statistics(values))
+            row |= _columns_of(name, compute_feature_statistics(values))
         for camera, picture_numbers in shown.items():
             pictures = episode.pictures[camera]
             columns[IMAGES + camera] = [
                 {"bytes": pictures.png[i], "path": f"frame-{i:06d}.png"} for i in picture_numbers
             ]
-            statistics = picture_statistics(pictures, picture_numbers)
+            statistics = compute_picture_statistics(pictures, picture_numbers)
             self._picture_statistics[camera].append(statistics)
             row |= _columns_of(IMAGES + camera, statistics)
         self._write_table(columns, self._folder / DATA.format(chunk_index=chunk, file_index=file), None)
@@ -158,13 +159,13 @@ class _Dataset:
         self._write_table(task_columns, self._folder / "meta" / "tasks.parquet", metadata)
         statistics: dict[str, Statistics] = {}
         for name in self._frames[0]:
-            statistics[name] = feature_statistics(np.concatenate([frames[name] for frames in self._frames]))
+            statistics[name] = compute_feature_statistics(np.concatenate([frames[name] for frames in self._frames]))
         for camera, parts in self._picture_statistics.items():
-            statistics[IMAGES + camera] = join_picture_statistics(parts)
+            statistics[IMAGES + camera] = merge_picture_statistics(parts)
         self._write_json("meta/stats.json", statistics)
-        lacks = {number: record.lacks for number, record in enumerate(self._records) if record.lacks}
-        if lacks:
-            self._write_json(LACKS, lacks)
+        missing = {number: record.missing for number, record in enumerate(self._records) if record.missing}
+        if missing:
+            self._write_json(MISSING, missing)
         totals = {
             "total_episodes": len(self.rows),
             "total_frames": self.frame_count,
@@ -221,7 +222,9 @@ def _step(robot_hz: int, fps: float | None) -> int:
     step = max(round(robot_hz / fps), 1)
     if fps != round(fps) or robot_hz != step * fps:
         allowed = ", ".join(str(hz) for hz in range(1, robot_hz + 1) if robot_hz % hz == 0)
-        raise ConfigError(f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}")
+        raise ConfigError(
+            f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}", code="command/invalid-option"
+        )
     return step
 
 
@@ -247,13 +250,20 @@ def _rows(episode: Episode, content: _Content, step: int) -> tuple[NDArray[np.in
 
 def _common_rate_hz(records: Sequence[RunRecord]) -> int:
     if any(one.description.layout != records[0].description.layout for one in records):
-        raise ConfigError("the runs are of robots with different joints; a dataset is of one")
+        raise ConfigError(
+            "the runs are of robots with different joints; a dataset is of one", code="recording/not-comparable"
+        )
     rate_hz = records[0].config.rate_hz
     if any(one.config.rate_hz != rate_hz for one in records) or rate_hz != round(rate_hz):
-        raise ConfigError("a dataset has one rate, a whole number of Hz; export the runs of each rate apart")
+        raise ConfigError(
+            "a dataset has one rate, a whole number of Hz; export the runs of each rate apart",
+            code="recording/not-comparable",
+        )
     empty = [one.folder for one in records if not len(one.time_s)]
     if empty:
-        raise ConfigError(f"{empty[0]} has no tick after arming, so no frame; leave it out")
+        raise ConfigError(
+            f"{empty[0]} has no tick after arming, so no frame; leave it out", code="recording/missing-data"
+        )
     return round(rate_hz)
 
 

@@ -13,7 +13,7 @@ from snakesim_hal.base.terminal import print_line
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, only_robot
 from snakesim_operator.recording.live import LiveServer
-from snakesim_operator.recording.process import record_to_file
+from snakesim_operator.recording.recorder_process import record_to_file
 
 
 def record_robot(

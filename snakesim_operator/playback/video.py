@@ -1,4 +1,4 @@
-"""`snakesim video`: a film of a recorded run, as MP4 or GIF, rendered by MuJoCo without a screen."""
+"""`snakesim recording video`: a film of a recorded run, as MP4 or GIF, rendered by MuJoCo without a screen."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +16,7 @@ from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.model.textfiles import exported
 from snakesim_operator.base import extras
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 Picture = NDArray[np.uint8]
 Write = Callable[[Picture], None]
@@ -51,7 +51,7 @@ def video(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: flo
     """Film a run from its folder or recording, and return the exit code. Takes and raises what `film` does."""
     record = RunRecord.load(run)
     film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=print_line)
-    return exit_code(run, record.lacks)
+    return exit_code(run, record.missing)
 
 
 def film(
@@ -72,8 +72,8 @@ def film(
         ConfigError: The record has no pose, `out` is no film, or something that a film needs is not installed.
     """
     if out.suffix not in (".mp4", ".gif"):
-        raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
-    extras.require("video", "a film")
+        raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif", code="command/invalid-option")
+    extras.require("report", "a film")
     times = times_of_pictures(record, fps, speed, span_s)
     picture_s = speed / fps
     for sentence in standstills_in_words(times, picture_s, record.config.period_ns * 1e-9):
@@ -83,7 +83,7 @@ def film(
     with (
         contextlib.closing(camera),
         exported(out) as partial,
-        _open_writer(partial, size, fps, record.lacks) as write,
+        _open_writer(partial, size, fps, record.missing) as write,
     ):
         look_at = _center(record, record.row_at(times[0]))
         for i, time_s in enumerate(times):
@@ -113,12 +113,18 @@ def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span)
     """Return the robot time of the pose in each picture. In a gap the last pose before it stays."""
     known = record.time_s[record.posed]
     if not len(known):
-        raise ConfigError(f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film")
+        raise ConfigError(
+            f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film",
+            code="recording/missing-data",
+        )
     first = max(float(known[0]), float(record.time_s[0]) + span_s[0])
     last = min(float(known[-1]), float(record.time_s[0]) + span_s[1])
     if last <= first:
         lasts_s = known[-1] - known[0]
-        raise ConfigError(f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s")
+        raise ConfigError(
+            f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s",
+            code="command/invalid-option",
+        )
     wanted = np.arange(first, last, speed / fps)
     rounding_s = 0.5 * record.config.period_ns * 1e-9
     newest = np.searchsorted(known, wanted + rounding_s, side="right") - 1
@@ -169,9 +175,9 @@ def _check_film(path: Path, pictures: int) -> None:
 
 
 @contextlib.contextmanager
-def _open_writer(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str]) -> Iterator[Write]:
+def _open_writer(out: Path, size: tuple[int, int], fps: float, missing: Sequence[str]) -> Iterator[Write]:
     """Yield a function that appends a picture to a film. The film's comment names what the record does not hold."""
-    comment = f"incomplete: {'; '.join(lacks)}" if lacks else ""
+    comment = f"incomplete: {'; '.join(missing)}" if missing else ""
     if out.suffix == ".mp4":
         with _open_mp4(out, size, fps, comment) as write:
             yield write

@@ -36,7 +36,7 @@ class LiveServer:
         Raises:
             NotConnectedError: The port is in use.
         """
-        import foxglove  # needs the extra `foxglove`
+        import foxglove  # needs the extra `console`
 
         self._channel_type = foxglove.Channel
         self._schema_type = foxglove.Schema
@@ -49,7 +49,7 @@ class LiveServer:
         try:
             self._server = foxglove.start_server(name=robot, host=hidden_host, port=0, context=self._context)
         except RuntimeError as error:
-            raise NotConnectedError(f"cannot serve Foxglove: {error}") from error
+            raise NotConnectedError(f"cannot serve Foxglove: {error}", code="network/port-in-use") from error
         self._relay = OriginRelay(port, (hidden_host, self._server.port), origins, report)
         self.address = f"ws://{HOST}:{self._relay.port}"
 

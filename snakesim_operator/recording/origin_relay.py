@@ -57,7 +57,7 @@ class OriginRelay:
         except OSError as error:
             self._loop.close()
             raise NotConnectedError(
-                f"cannot serve Foxglove on port {port}: {error.strerror}; choose another"
+                f"cannot serve Foxglove on port {port}: {error.strerror}; choose another", code="network/port-in-use"
             ) from error
         self.port: int = self._listener.sockets[0].getsockname()[1]
         self._thread = threading.Thread(target=self._loop.run_forever, name="origin relay", daemon=True)

@@ -20,8 +20,7 @@ from snakesim_hal.wire.keys import find_row_key
 from snakesim_operator.recording.chunks import DamagedError, parse_chunk, parse_record, unpack_chunk
 from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, Losses
 from snakesim_operator.recording.mcap_file import PROFILE
-from snakesim_operator.recording.message import RecordedMessage
-from snakesim_operator.recording.record_search import (
+from snakesim_operator.recording.mcap_records import (
     CUT,
     READ_OPCODES,
     RawRecord,
@@ -29,7 +28,8 @@ from snakesim_operator.recording.record_search import (
     read_record,
     read_summary,
 )
-from snakesim_operator.recording.recording import ABOUT, COPIED
+from snakesim_operator.recording.message import RecordedMessage
+from snakesim_operator.recording.writer import ABOUT, COPIED
 
 LATEST_NS = 2**62  # 146 years: no robot time is later
 NO_SCHEMA = 0  # MCAP's number for a channel without a schema
@@ -100,13 +100,16 @@ class RecordingReader:
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                    raise ConfigError(f"{self.path} is not a recording: it does not begin as an MCAP file")
+                    raise ConfigError(
+                        f"{self.path} is not a recording: it does not begin as an MCAP file",
+                        code="recording/not-readable",
+                    )
                 self._file = file
                 size = os.fstat(file.fileno()).st_size
                 yield from self._read_file(file, size)
                 self._count_losses_at_end()
         except OSError as error:
-            raise ConfigError(f"{self.path} cannot be read: {error.strerror}") from None
+            raise ConfigError(f"{self.path} cannot be read: {error.strerror}", code="file/not-readable") from None
 
     # --- reading
 
@@ -154,7 +157,8 @@ class RecordingReader:
             raise ConfigError(
                 f"{self.path} is not a recording: its first {read_bytes / 1e6:.2f} MB unpack to "
                 f"{self._unpacked_bytes / 1e6:.0f} MB or more, which no messages of a robot do; the most is "
-                f"{FREE_BYTES / 1e6:.0f} MB and {MAX_UNPACKING_RATIO} times the file"
+                f"{FREE_BYTES / 1e6:.0f} MB and {MAX_UNPACKING_RATIO} times the file",
+                code="recording/not-readable",
             )
 
     def _process(self, record: McapRecord) -> Iterator[McapRecord]:

@@ -9,7 +9,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import ABOUT, COPIED
+from snakesim_operator.recording.writer import ABOUT, COPIED
 
 FLUSH_BYTES = 4 * 1024 * 1024  # bounds the memory that waiting messages take
 
@@ -22,7 +22,7 @@ def recover_recording(path: Path, out: Path) -> tuple[int, list[str]]:
         out: The new file.
 
     Returns:
-        The number of messages, and what the recording lacks in words; the copy states that too.
+        The number of messages, and sentences about what is missing in it; the copy states that too.
 
     Raises:
         ConfigError: The recording cannot be read, or the new file exists or cannot be created.
@@ -30,7 +30,7 @@ def recover_recording(path: Path, out: Path) -> tuple[int, list[str]]:
     try:
         file = GrowingFile(out)
     except OSError as error:
-        raise ConfigError(f"{out}: {error.strerror}; choose another file") from error
+        raise ConfigError(f"{out}: {error.strerror}; choose another file", code="file/not-writable") from error
     try:
         reader = RecordingReader(path)
         copy = _Copy(file)
@@ -80,7 +80,7 @@ class _Copy:
             self._mcap.flush()
 
     def finish(self, about: dict[str, object], missing: list[str]) -> None:
-        """Write the metadata, with what the original lacks, and the index. Raises OSError."""
+        """Write the metadata, with what is missing in the original, and the index. Raises OSError."""
         if missing:
             about = {**about, COPIED: missing}
         self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})

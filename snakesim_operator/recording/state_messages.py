@@ -21,7 +21,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     """`/ROBOT/state`. Unknown texts are empty, unknown numbers are left out."""
 
     lifecycle: str
-    why: str
+    lifecycle_reason: str
     locomotion: str
     reason: str
     propulsion_joint: str
@@ -59,7 +59,7 @@ class _StatusFields(msgspec.Struct, frozen=True):
     """The fields of `hal/status` that are shown."""
 
     lifecycle: q.Name = ""
-    why: q.Reason = ""
+    reason: q.Reason = ""
     faults: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=64)] = []
 
 
@@ -108,7 +108,7 @@ class StateMessages:
         control_state = _decode_control(control)
         state = State(
             lifecycle=host_state.lifecycle,
-            why=host_state.why,
+            lifecycle_reason=host_state.reason,
             locomotion=control_state.state,
             reason=control_state.reason,
             propulsion_joint=control_state.propulsion_joint or "",
@@ -127,7 +127,7 @@ class StateMessages:
         host_level = Log.INFO
         if state.lifecycle in ("fault", "estop"):
             host_level = Log.ERROR
-        host_reason, _, _ = state.why.partition("; ")
+        host_reason, _, _ = state.lifecycle_reason.partition("; ")
         control_level = Log.INFO
         if state.jammed or state.saturated:
             control_level = Log.WARNING

@@ -1,4 +1,4 @@
-"""Folder of the last run on this computer, so that `snakesim status` can report a finished run."""
+"""Stores the folder of the user's last run, so that `snakesim status` can report a finished run."""
 
 import contextlib
 import threading
@@ -10,35 +10,37 @@ from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.network.local_registry import state_folder
 from snakesim_hal.wire.codec import UNDECODABLE
 
-LIMIT_S = 1.0  # for a disk that hangs
+MAX_WRITE_S = 1.0  # a hanging disk must not keep the run from ending
 
 
 class LastRun(msgspec.Struct, frozen=True, kw_only=True):
-    """Which run it was, and how it ended."""
+    """The last run of this user on this computer."""
 
     folder: str
-    ended: str
+    ended: str  # "complete", or a sentence
 
 
-def _file() -> Path:
+def save_last_run(folder: str, ended: str) -> None:
+    """Store which run has finished. Ignores write errors, and waits at most MAX_WRITE_S for the disk."""
+    last_run = LastRun(folder=folder, ended=ended)
+    thread = threading.Thread(target=_write, args=(last_run,), daemon=True)
+    thread.start()
+    thread.join(MAX_WRITE_S)
+
+
+def read_last_run() -> LastRun | None:
+    """Return the last run, or None if none is stored."""
+    with contextlib.suppress(OSError, *UNDECODABLE):
+        return msgspec.json.decode(_find_file().read_bytes(), type=LastRun)
+    return None
+
+
+def _find_file() -> Path:
     return state_folder() / "last-run.json"
 
 
-def remember(folder: str, ended: str) -> None:
-    """Note a finished run. Ignores write errors, and waits only briefly."""
-    thread = threading.Thread(target=_write, args=(LastRun(folder=folder, ended=ended),), daemon=True)
-    thread.start()
-    thread.join(LIMIT_S)
-
-
-def _write(noted: LastRun) -> None:
-    with contextlib.suppress(OSError, ValueError):  # the latter: a folder whose name is not text
-        _file().parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(_file(), msgspec.json.encode(noted))
-
-
-def recall() -> LastRun | None:
-    """The last run; None when there is none."""
-    with contextlib.suppress(OSError, *UNDECODABLE):
-        return msgspec.json.decode(_file().read_bytes(), type=LastRun)
-    return None
+def _write(last_run: LastRun) -> None:
+    with contextlib.suppress(OSError, ValueError):  # ValueError: the folder's name is no text
+        file = _find_file()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, msgspec.json.encode(last_run))

@@ -18,6 +18,7 @@ from snakesim_hal.wire.messages import Description
 
 INCOMPLETE = 3
 """Exit code of a command that succeeded, but whose record is incomplete."""
+INCOMPLETE_CODE = "recording/incomplete"
 
 MAX_MAGNITUDE = 1e9  # no signal is larger, in its SI unit; a larger number counts as infinite
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
@@ -25,20 +26,20 @@ POSE = ("position_w", "orientation_wxyz")
 CONTACTS = ("contact_peak_n", "contact_count")
 
 
-def exit_code(given: Path, lacks: Sequence[str], code: int = 0) -> int:
+def exit_code(given: Path, missing: Sequence[str], code: int = 0) -> int:
     """Return the exit code of a command, and print on stderr what its record does not hold.
 
     Args:
         given: The run or recording, as the user named it.
-        lacks: Sentences about missing data.
+        missing: Sentences about missing data.
         code: Exit code that the command has for other reasons.
 
     Returns:
         `code`, unless that is 0 and the record is incomplete: then INCOMPLETE.
     """
-    if not lacks:
+    if not missing:
         return code
-    print_stderr(f"snakesim: incomplete: {given} lacks {'; '.join(lacks)}")
+    print_stderr(f"snakesim: {given} is incomplete: {'; '.join(missing)} [{INCOMPLETE_CODE}]")
     return code or INCOMPLETE
 
 

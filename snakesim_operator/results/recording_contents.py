@@ -5,7 +5,7 @@ The rows have the columns of the black box, made of the messages: joints of `sen
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.run_log.black_box import compute_digest, summarize_contacts
 from snakesim_hal.run_log.host_record import HostRecord
@@ -51,8 +52,22 @@ ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.OWN_ALL, keys.DESCRIPTI
 _decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
 
 
+@dataclass(frozen=True)
+class RunOutputs:
+    """What services and custom sensors published in a run, and what of it is missing."""
+
+    control: list[ControlState] = field(default_factory=list[ControlState])  # in time order
+    worlds: list[World] = field(default_factory=list[World])  # in time order, at most MAX_WORLDS_PER_S
+    trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
+    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns of custom sensors, (n,)
+    replay_of: str = ""  # the recording whose sensors the services were given; empty: a run
+    missing: list[str] = field(default_factory=list[str])  # sentences about missing data
+    unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
+
+
 @dataclass
-class Contents:
+class RecordingContents:
     """What was read of one recording."""
 
     path: Path
@@ -64,27 +79,26 @@ class Contents:
 
     # Messages of the run.
     streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_STREAMS})
-    at: dict[str, dict[int, Any]] = field(
+    messages_by_tick: dict[str, dict[int, Any]] = field(  # key -> tick -> message
         default_factory=lambda: {key: {} for key in _TICKED}
-    )  # key -> tick -> message
-    own: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
+    )
+    custom: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     replay_of: str = ""  # the recording whose sensors these are
 
     # Missing data.
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
-    lacks: list[str] = field(default_factory=list[str])
-    unreached: list[str] = field(default_factory=list[str])  # what did not reach the recorder
+    missing: list[str] = field(default_factory=list[str])
     ticks: int = 0  # with setpoints as applied
     ticks_lost: int | None = 0  # of these, as the file itself reports; None: it does not report that
     last_tick_ns: int | None = None  # robot time of the last of them
-    whole: bool = True  # the file has an end
+    finished: bool = True  # the file has an end
 
     def add(self, recorded: RecordedMessage) -> None:
         """Add one message at a key of ALL, in the order of the file."""
         if keys.find_row_key(recorded.key) == keys.OWN_ALL:
-            self.own.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
+            self.custom.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
             return
         message_type = keys.find_message(recorded.key)
         if message_type is None:
@@ -109,14 +123,14 @@ class Contents:
                 if isinstance(message, Trajectory):
                     self.searched_nodes[message.tick] = message.searched_nodes
                 kept = self.streams[key]
-                if not kept or _is_news(kept[-1], message):
+                if not kept or _is_kept(kept[-1], message):
                     kept.append(message)
             case _:
-                self.at[key][message.tick] = message
+                self.messages_by_tick[key][message.tick] = message
                 if isinstance(message, Clock) and message.arm_session:
                     self.armed_wall_ns.append(wall_ns)
 
-    def missing(self, ticks: int) -> list[str]:
+    def describe_unreached(self, ticks: int) -> list[str]:
         """Describe the ticks that did not reach the recorder: nothing in the file itself shows them.
 
         Args:
@@ -133,7 +147,32 @@ class Contents:
             last = f"the last that came is of {self.last_tick_ns * 1e-9:.2f} s"
         return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
-    def columns(self, robot: Description) -> dict[str, NDArray[Any]]:
+    def collect_outputs(self, robot: Description, time_s: Floats, unreached: Sequence[str] = ()) -> RunOutputs:
+        """Return what services and custom sensors published.
+
+        Args:
+            robot: The robot that has the custom sensors.
+            time_s: (n,) robot time of each row, for the columns of custom sensors.
+            unreached: Sentences about data that did not reach the recorder.
+        """
+        control = self.streams[keys.CONTROL_STATE].copy()
+        while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
+            control.pop()
+        refused_before = self.refused.copy()
+        custom = self.make_custom_columns(robot, time_s)
+        undecodable = describe_undecodable(self.refused - refused_before)
+        return RunOutputs(
+            control=control,
+            worlds=self.streams[keys.WORLD],
+            trajectories=self.streams[keys.TRAJECTORY],
+            searched_nodes=self.searched_nodes,
+            custom=custom,
+            replay_of=self.replay_of,
+            missing=[*undecodable, *unreached, *self.missing],
+            unreached=list(unreached),
+        )
+
+    def make_columns(self, robot: Description) -> dict[str, NDArray[Any]]:
         """Return a row for each tick since the first arming, in columns that are named as in the black box."""
         rows = self._rows(len(robot.joints))
         row_count = len(rows)
@@ -157,11 +196,11 @@ class Contents:
 
     def _rows(self, joint_count: int) -> list["_Row"]:
         """Return the armed ticks of which joints, setpoints and clock are all known."""
-        joints = self.at[keys.JOINTS]
-        applied = self.at[keys.APPLIED]
-        clocks = self.at[keys.CLOCK]
-        poses = self.at[keys.POSE]
-        contacts = self.at[keys.CONTACTS]
+        joints = self.messages_by_tick[keys.JOINTS]
+        applied = self.messages_by_tick[keys.APPLIED]
+        clocks = self.messages_by_tick[keys.CLOCK]
+        poses = self.messages_by_tick[keys.POSE]
+        contacts = self.messages_by_tick[keys.CONTACTS]
         rows: list[_Row] = []
         pose = [np.nan] * 7
         peak_n = 0.0
@@ -178,7 +217,7 @@ class Contents:
                 rows.append(_Row(tick, state, applied[tick], pose, peak_n, touched))
         return rows
 
-    def own_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def make_custom_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return columns of the custom sensors: at each row the newest sample, and its age.
 
         They are called `bend_rad.left` and `age_s.left`. NaN: no sample came yet. Counts samples that cannot be
@@ -191,7 +230,7 @@ class Contents:
         columns: dict[str, NDArray[np.float64]] = {}
         for key, kind in find_custom_messages(robot).items():
             sensor = key.rpartition("/")[2]
-            samples = self._own_samples(key, kind)
+            samples = self._custom_samples(key, kind)
             ticks = np.array(sorted(samples), dtype=np.int64)
             row = np.searchsorted(ticks * (robot.period_ns * 1e-9), time_s + 1e-9, side="right") - 1
             in_order = [samples[tick] for tick in ticks.tolist()]
@@ -204,11 +243,11 @@ class Contents:
             columns[f"age_s.{sensor}"] = time_s - sampled_at_s
         return columns
 
-    def _own_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
+    def _custom_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
         """Return the samples of a custom sensor: tick -> timestamp in ns, and numbers by name."""
         decoder = Decoder(kind.message)
         samples: dict[int, tuple[int, dict[str, float]]] = {}
-        for recorded in self.own.get(key, ()):
+        for recorded in self.custom.get(key, ()):
             try:
                 sample = decoder.decode(recorded.payload, recorded.encoding)
             except WireError as error:
@@ -217,7 +256,7 @@ class Contents:
             samples[sample.tick] = (sample.timestamp_ns, kind.numbers(sample))
         return samples
 
-    def host(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
+    def make_host_record(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
         """Return the host's statistics, as far as the recording shows them.
 
         Raises:
@@ -225,9 +264,12 @@ class Contents:
         """
         status = self.status
         if status is None:
-            why = "; ".join(["", *self.lacks])
-            raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run{why}")
-        armed = {tick for tick, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
+            why = "; ".join(["", *self.missing])
+            raise ConfigError(
+                f"{self.path}: holds no hal/status, so it is not known what became of the run{why}",
+                code="recording/missing-data",
+            )
+        armed = {tick for tick, clock in self.messages_by_tick[keys.CLOCK].items() if clock.lifecycle == "armed"}
         wall_s = 0.0
         if self.armed_wall_ns:
             wall_s = (self.armed_wall_ns[-1] - self.armed_wall_ns[0]) * 1e-9
@@ -235,7 +277,7 @@ class Contents:
             ticks=len(columns["tick"]),
             wall_s=wall_s,
             overruns=status.overruns,
-            answered_ticks=len(armed & self.at[keys.JOINT_COMMAND].keys()),
+            answered_ticks=len(armed & self.messages_by_tick[keys.JOINT_COMMAND].keys()),
             armed_ticks=len(armed),
             command_digest=compute_digest(columns),
             state_to_command_us={"p50": None, "p99": None},
@@ -245,7 +287,7 @@ class Contents:
             faults=status.faults,
             faults_left_out=status.faults_left_out,
             lifecycle=status.lifecycle,
-            why=status.why,
+            reason=status.reason,
             ended="finished",
             ended_why="as far as it was recorded",
             isolated=status.isolated,
@@ -273,34 +315,34 @@ def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def read_recording(
-    path: Path, wanted: Collection[str] = ALL, hear: Callable[[RecordedMessage], None] | None = None
-) -> Contents:
+    path: Path, wanted: Collection[str] = ALL, on_message: Callable[[RecordedMessage], None] | None = None
+) -> RecordingContents:
     """Read a recording's messages at some keys.
 
     Args:
         path: The recording.
         wanted: The keys.
-        hear: Called with every message, at any key, so that the file need not be read again.
+        on_message: Called with every message, at any key, so that the file need not be read again.
 
     Raises:
         ConfigError: The file is no recording.
     """
     from snakesim_operator.recording.reader import RecordingReader  # needs the extra `record`
 
-    contents = Contents(path)
+    contents = RecordingContents(path)
     reader = RecordingReader(path)
-    read_keys = {*wanted, keys.APPLIED} if hear is None else None
+    read_keys = {*wanted, keys.APPLIED} if on_message is None else None
     for recorded in reader.read_messages(read_keys):
         if recorded.key == keys.APPLIED:
             contents.ticks += 1
             contents.last_tick_ns = recorded.time_ns
-        if hear is not None:
-            hear(recorded)
+        if on_message is not None:
+            on_message(recorded)
         if recorded.key in wanted or keys.find_row_key(recorded.key) in wanted:
             contents.add(recorded)
-    contents.lacks += describe_undecodable(contents.refused)
-    contents.lacks += [f"recording: {lack}" for lack in reader.missing]
-    contents.whole = reader.finished
+    contents.missing += describe_undecodable(contents.refused)
+    contents.missing += [f"recording: {sentence}" for sentence in reader.missing]
+    contents.finished = reader.finished
     contents.ticks_lost = _count_lost_ticks(reader)
     contents.replay_of = str(reader.metadata.get("replay_of", ""))[:500]
     if reader.losses.misplaced:
@@ -319,7 +361,7 @@ def _count_lost_ticks(reader: "RecordingReader") -> int | None:
     return losses.lost_by_key[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
 
 
-def _is_news(before: Any, message: Any) -> bool:
+def _is_kept(before: Any, message: Any) -> bool:
     """Return whether a message is kept: worlds are thinned, and a path is kept once."""
     match message:
         case World():

@@ -1,38 +1,15 @@
-"""How a run ended, of its record: `complete`, or a sentence."""
+"""How a run ended: `complete`, or a sentence."""
 
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.run_log.host_record import HostRecord
-from snakesim_operator.results.record import RunRecord
 
 COMPLETE = "complete"
 AT_GOAL = "snakesim run, at the goal"  # the requester that finishes a run which lasts until its goal
 UNKNOWN = "unknown: "  # how a sentence begins that explains why the ending is not known
 
 
-def ended(record: RunRecord) -> str:
-    """Return COMPLETE, or a sentence that describes how the run ended, as far as the record shows it."""
-    host = record.host
-    config = record.config
-    if not record.alone:
-        return ended_early(host, config) or COMPLETE
-    for fault in host.faults:
-        if fault.reach == "robot":
-            return fault.cause
-    recorded_s = 0.0
-    if len(record.time_s):
-        recorded_s = float(record.time_s[-1] - record.time_s[0]) + 1 / config.rate_hz
-    done = f"after {recorded_s:.2f} of {config.duration_s:g} s"
-    if recorded_s > config.duration_s - 0.5 / config.rate_hz:
-        return COMPLETE
-    if not record.whole:
-        return f"{UNKNOWN}the recording breaks off {done}"
-    if host.lifecycle == "armed":
-        return f"{UNKNOWN}the recording was ended {done}, with the robot armed"
-    return f"{host.lifecycle} ({host.why}) {done}"
-
-
-def ended_early(host: HostRecord, config: RunConfig) -> str:
-    """Return how a run ended that was not complete, by the host's own record; empty if it was complete."""
+def describe_early_end(host: HostRecord, config: RunConfig) -> str:
+    """Return how a run ended that was not complete, by the host's statistics; empty if it was complete."""
     done = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
     match host.ended:
         case "complete":
@@ -45,3 +22,26 @@ def ended_early(host: HostRecord, config: RunConfig) -> str:
             return f"the host was {host.ended} {host.ended_why} {done}"
         case _:
             return f"the run ended {done}: {host.ended_why}"
+
+
+def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float, *, finished: bool) -> str:
+    """Return COMPLETE, or how a run ended, as far as a recording alone shows it.
+
+    Args:
+        host: The host's statistics, as the recording shows them.
+        config: The configuration of the run.
+        recorded_s: Robot time from the first recorded tick to the end of the last, in s.
+        finished: Whether the recording has an end.
+    """
+    for fault in host.faults:
+        if fault.reach == "robot":
+            return fault.cause
+    done = f"after {recorded_s:.2f} of {config.duration_s:g} s"
+    half_tick_s = 0.5 / config.rate_hz
+    if recorded_s > config.duration_s - half_tick_s:
+        return COMPLETE
+    if not finished:
+        return f"{UNKNOWN}the recording breaks off {done}"
+    if host.lifecycle == "armed":
+        return f"{UNKNOWN}the recording was ended {done}, with the robot armed"
+    return f"{host.lifecycle} ({host.reason}) {done}"

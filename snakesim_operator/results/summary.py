@@ -14,9 +14,9 @@ from snakesim_operator.results.metrics.advance import Advance, body_center_w, en
 from snakesim_operator.results.metrics.effort import Directions, Effort
 from snakesim_operator.results.metrics.estimates import Estimates
 from snakesim_operator.results.metrics.force_tracking import force_tracking
-from snakesim_operator.results.metrics.motion import Motion, motion_of
-from snakesim_operator.results.metrics.propulsion import count_hand_overs, propulsion_periods
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.motion import Motion, measure_motion
+from snakesim_operator.results.metrics.propulsion import count_hand_overs, find_propulsion_periods
+from snakesim_operator.results.run_log import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
 
@@ -174,7 +174,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
     restarts: Annotated[list[Restart], Meta(description="processes that ended and were restarted")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
-    lacks: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
+    missing: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
     own_arithmetic: Annotated[
         list[str],
         Meta(description="what rounds otherwise than on most computers with NumPy 2.2 to 2.4: then the digest differs"),
@@ -208,7 +208,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     duration_s = host.ticks * config.period_ns * 1e-9
     path_m, net_m, known_s = _distances(record)
     moved_m = path_m if path_m is not None else net_m
-    motion = motion_of(record)
+    motion = measure_motion(record)
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
     advance = Advance.of(record)
     last_report = record.control[-1] if record.control else None
@@ -258,7 +258,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         hosts=hosts,
         restarts=list(restarts),
         ended=ended,
-        lacks=record.lacks,
+        missing=record.missing,
         own_arithmetic=find_differing_parts(record.description.arithmetic),
         config=msgspec.to_builtins(config),
     )
@@ -269,7 +269,7 @@ def _reported_numbers(record: RunRecord, motion: Motion | None, last_report: Con
     propulsion_joints = None
     hand_overs = None
     if record.control:
-        periods = propulsion_periods(record)
+        periods = find_propulsion_periods(record)
         propulsion_joints = [record.description.joints[period.joint].name for period in periods]
         hand_overs = count_hand_overs(periods)
     last_state, last_reason = last_state_of(motion, last_report)

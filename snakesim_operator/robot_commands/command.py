@@ -1,4 +1,4 @@
-"""Commands to a robot: `snakesim arm`, `disarm`, `clear`, `sim`.
+"""Commands to a robot: `snakesim robot arm`, `disarm`, `reset`, `sim`.
 
 A name is not an identity: any client on the network can answer in a robot's name. So all hosts are queried, two answers
 are an error, and an answer is accepted once the robot's host publishes the new state itself.
@@ -39,7 +39,7 @@ def arm(
     Raises:
         RefusedError: another robot or backend is there, or the host refuses.
     """
-    link = only_robot(where, f"arm {robot} {backend}")
+    link = only_robot(where, f"robot arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _read_description(session, link)
         mismatches: list[str] = []
@@ -50,7 +50,8 @@ def arm(
         if mismatches:
             raise RefusedError(
                 f"not armed: {'; '.join(mismatches)}. To arm, name robot and backend: "
-                f"`snakesim arm {description.robot} {description.backend}`"
+                f"`snakesim robot arm {description.robot} {description.backend}`",
+                code="robot/wrong-robot",
             )
         request = make_arm_request(description, get_user_name(), unchecked=unchecked)
         return request_from_host(session, keys.LIFECYCLE, request, "armed", link, say)
@@ -58,36 +59,36 @@ def arm(
 
 def disarm(where: RobotSelection, say: PrintLine = print_line) -> int:
     """Make the joints passive; later commands do not move them."""
-    request = LifecycleRequest(action="disarm", who=get_user_name())
-    return _request_from_robot(only_robot(where, "disarm"), keys.LIFECYCLE, request, "disarmed", say)
+    request = LifecycleRequest(action="disarm", requester=get_user_name())
+    return _request_from_robot(only_robot(where, "robot disarm"), keys.LIFECYCLE, request, "disarmed", say)
 
 
-def clear(where: RobotSelection, say: PrintLine = print_line) -> int:
-    """Clear a fault or an emergency stop. The robot is disarmed then.
+def reset(where: RobotSelection, say: PrintLine = print_line) -> int:
+    """Reset a fault or an emergency stop. The robot is disarmed then.
 
     If no robot runs, an emergency stop stored by the last run is removed.
     """
     try:
-        link = only_robot(where, "clear")
+        link = only_robot(where, "robot reset")
     except NotConnectedError:
         kept = [path for path in find_latched_stops() if where.namespace in (None, path.parent.name)]
         if not kept or where.endpoint is not None:
             raise
         for path in kept:
             say(
-                f"{path.parent.name}: {remove_latched_stop(path)}; cleared by {get_user_name()}. No robot of "
+                f"{path.parent.name}: {remove_latched_stop(path)}; reset by {get_user_name()}. No robot of "
                 "that name runs here"
             )
         return 0
     return _request_from_robot(
-        link, keys.LIFECYCLE, LifecycleRequest(action="clear", who=get_user_name()), "cleared", say
+        link, keys.LIFECYCLE, LifecycleRequest(action="reset", requester=get_user_name()), "reset", say
     )
 
 
 def simulator(order: SimulatorOrder, where: RobotSelection, say: PrintLine = print_line) -> int:
     """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses."""
     request = SimulatorRequest(
-        action=order.action, who=order.who or get_user_name(), ticks=order.ticks, speed=order.speed
+        action=order.action, requester=order.requester or get_user_name(), ticks=order.ticks, speed=order.speed
     )
     return _request_from_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
 
@@ -113,8 +114,10 @@ def request_from_host(
             "robot moves, `snakesim estop`"
         )
     if doubt is not None:
-        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
-        raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
+        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.reason}"
+        raise RefusedError(
+            f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}", code="robot/not-confirmed"
+        )
     if not answers[0].ok:
         raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
     say(f"{name}: {done}: {answers[0].reason}")
@@ -177,9 +180,13 @@ def _read_description(session: Session, link: Link) -> Description:
         descriptions = reader.drain()
     if not descriptions:
         raise NotConnectedError(
-            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?"
+            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?",
+            code="network/no-robot",
         )
     if len({description.host for description in descriptions}) > 1:
         count = len(descriptions)
-        raise RefusedError(f"{link.namespace}: {count} hosts describe it; at least one is an impostor. Not armed")
+        raise RefusedError(
+            f"{link.namespace}: {count} hosts describe it; at least one is an impostor. Not armed",
+            code="robot/several-hosts",
+        )
     return descriptions[-1]

@@ -1,39 +1,27 @@
-"""Arguments of the commands to a running robot: `snakesim arm`, `disarm`, `clear`, `estop`, `param`, ..."""
+"""The commands to a running robot: `snakesim robot`, `estop`, `teleop`, `param`, `sim` and `fault`."""
 
 import argparse
 import contextlib
 import os
 from pathlib import Path
-from typing import Any
 
-from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.programs.arguments import add_network, add_unchecked
-from snakesim_operator.base.robot_selection import RobotSelection, select_robots
-from snakesim_operator.robot_commands.simulator_order import add_command as add_sim
-from snakesim_operator.robot_commands.simulator_order import order_of
+from snakesim_hal.programs.arguments import add_duration, add_json, add_network, add_unchecked
+from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_operator.base.robot_selection import select_robots
+from snakesim_operator.robot_commands.simulator_commands import SIMULATOR_COMMANDS
 
 URGENT = -10  # niceness of an emergency stop
 
 
-def add_commands(commands: Any) -> None:
-    """Add them to the parser of `snakesim`."""
-    arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
-    arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
-    arm.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
-    add_unchecked(arm)
-    add_network(arm)
-    arm.set_defaults(act=_arm)
-    for name, act, about in (
-        ("disarm", _disarm, "make a robot's joints passive"),
-        ("clear", _clear, "clear a fault or an emergency stop; the robot is disarmed then"),
-        ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
-    ):
-        command = commands.add_parser(name, help=about)
-        add_network(command)
-        command.set_defaults(act=act)
+def _add_arm(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
+    parser.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
+    add_unchecked(parser)
+    add_network(parser)
 
-    teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
-    teleop.add_argument(
+
+def _add_teleop(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
         "--joystick",
         nargs="?",
         type=Path,
@@ -41,44 +29,39 @@ def add_commands(commands: Any) -> None:
         metavar="DEVICE",
         help="such as /dev/input/event5; or the first",
     )
-    teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
-    add_network(teleop)
-    teleop.set_defaults(act=_teleop)
-
-    _add_param(commands)
-
-    sim = add_sim(commands)
-    add_network(sim)
-    sim.set_defaults(act=_sim)
-
-    fault = commands.add_parser(
-        "fault", help="inject a fault into a run that allows it", epilog="`snakesim fault list` explains every kind."
+    parser.add_argument(
+        "--max-speed", type=float, default=0.3, metavar="M/S", help="speed at full deflection (default: 0.3)"
     )
-    fault.add_argument("kind", metavar="KIND", help="such as mute; `list` prints all of them")
-    fault.add_argument("target", nargs="?", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
-    fault.add_argument("--for", dest="for_s", type=float, metavar="S", help="seconds of robot time until it ends")
-    fault.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
-    fault.add_argument("--end", action="store_true", help="end it")
-    add_network(fault)
-    fault.set_defaults(act=_fault)
+    add_network(parser)
 
 
-def _add_param(commands: Any) -> None:
-    param = commands.add_parser("param", help="list, get and set parameters of the running controller")
-    verbs = param.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for verb, act, about in (
-        ("list", _param_list, "all of them: value, unit, range, what each is"),
-        ("get", _param_get, "the value of one"),
-        ("set", _param_set, "change them, all or none; the controller goes on with them, and they are recorded"),
-    ):
-        command = verbs.add_parser(verb, help=about)
-        command.add_argument("robot", metavar="ROBOT", help="its namespace, as printed by `snakesim status`")
-        if verb == "get":
-            command.add_argument("name", metavar="NAME", help="such as control.speed_kp_s")
-        if verb == "set":
-            command.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.speed_kp_s=0.3")
-        add_network(command)
-        command.set_defaults(act=act)
+def _add_param_list(parser: argparse.ArgumentParser) -> None:
+    add_network(parser)
+    add_json(parser)
+
+
+def _add_param_get(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="such as control.speed_kp_s")
+    add_network(parser)
+    add_json(parser)
+
+
+def _add_param_set(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.speed_kp_s=0.3")
+    add_network(parser)
+
+
+def _add_fault_list(parser: argparse.ArgumentParser) -> None:
+    add_json(parser)
+
+
+def _add_fault_inject(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kind", metavar="KIND", help="such as mute; `snakesim fault list` explains all of them")
+    parser.add_argument("target", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
+    add_duration(parser, "seconds of robot time until it ends (default: until --end)")
+    parser.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
+    parser.add_argument("--end", action="store_true", help="end it")
+    add_network(parser)
 
 
 def _arm(arguments: argparse.Namespace) -> int:
@@ -93,10 +76,10 @@ def _disarm(arguments: argparse.Namespace) -> int:
     return disarm(select_robots(arguments))
 
 
-def _clear(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.command import clear
+def _reset(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.command import reset
 
-    return clear(select_robots(arguments))
+    return reset(select_robots(arguments))
 
 
 def _estop(arguments: argparse.Namespace) -> int:
@@ -114,44 +97,120 @@ def _estop(arguments: argparse.Namespace) -> int:
 def _teleop(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.teleop.command import teleop
 
-    return teleop(select_robots(arguments), arguments.fastest, arguments.joystick)
+    return teleop(select_robots(arguments), arguments.max_speed, arguments.joystick)
 
 
-def _sim(arguments: argparse.Namespace) -> int:
-    order = order_of(arguments)
-    from snakesim_operator.robot_commands.command import simulator
+def _list_faults(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.fault import list_faults
 
-    return simulator(order, select_robots(arguments))
+    return list_faults(as_json=arguments.json)
 
 
-def _fault(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.fault import FaultOrder, fault
+def _inject_fault(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.fault import FaultOrder, inject_fault
 
-    order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
-    return fault(order, select_robots(arguments))
+    order = FaultOrder(arguments.kind, arguments.target, arguments.duration, arguments.amount, arguments.end)
+    return inject_fault(order, select_robots(arguments))
 
 
 def _param_list(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.parameters import list_parameters
 
-    return list_parameters(_robot_of(arguments))
+    return list_parameters(select_robots(arguments), as_json=arguments.json)
 
 
 def _param_get(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.parameters import get_parameter
 
-    return get_parameter(arguments.name, _robot_of(arguments))
+    return get_parameter(arguments.name, select_robots(arguments), as_json=arguments.json)
 
 
 def _param_set(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.parameters import set_parameters
 
-    return set_parameters(arguments.values, _robot_of(arguments))
+    return set_parameters(arguments.values, select_robots(arguments))
 
 
-def _robot_of(arguments: argparse.Namespace) -> RobotSelection:
-    """The robot that is named, by its namespace."""
-    if arguments.namespace not in (None, arguments.robot):
-        raise ConfigError(f"{arguments.robot} and --namespace {arguments.namespace}: name one robot; leave one out")
-    arguments.namespace = arguments.robot
-    return select_robots(arguments)
+COMMANDS: Commands = (
+    Command(
+        name="teleop",
+        heading="daily work",
+        help="Drive a robot by keys or with a joystick; letting go stops it.",
+        add=_add_teleop,
+        run=_teleop,
+        examples=("teleop", "teleop --joystick --max-speed 0.2"),
+    ),
+    Command(
+        name="estop",
+        heading="daily work",
+        help="Stop a robot now, or all on the network without --namespace.",
+        add=add_network,
+        run=_estop,
+        details="The stop stays latched, also over a restart of the host, until `snakesim robot reset`.",
+        examples=("estop", "estop --namespace planar13"),
+    ),
+    Noun(
+        name="robot",
+        heading="robot",
+        help="Arm, disarm and reset a robot; calibrate and check its joints; convert robot files.",
+    ),
+    Command(
+        name="robot arm",
+        help="Allow a robot to move; names robot and backend, to avoid mix-ups.",
+        add=_add_arm,
+        run=_arm,
+        examples=("robot arm planar13 sim", "robot arm planar13 can --namespace lab/planar13"),
+    ),
+    Command(
+        name="robot disarm",
+        help="Make a robot's joints passive.",
+        add=add_network,
+        run=_disarm,
+        examples=("robot disarm", "robot disarm --namespace planar13"),
+    ),
+    Command(
+        name="robot reset",
+        help="Reset a fault or an emergency stop; the robot is disarmed then.",
+        add=add_network,
+        run=_reset,
+        examples=("robot reset", "robot reset --namespace planar13"),
+    ),
+    Noun(name="param", heading="robot", help="List, get and set parameters of the running controller."),
+    Command(
+        name="param list",
+        help="List all parameters of the controller: value, unit, range and description.",
+        add=_add_param_list,
+        run=_param_list,
+        examples=("param list", "param list --namespace planar13 --json"),
+    ),
+    Command(
+        name="param get",
+        help="Print the value of one parameter.",
+        add=_add_param_get,
+        run=_param_get,
+        examples=("param get control.speed_kp_s", "param get control.speed_kp_s --json"),
+    ),
+    Command(
+        name="param set",
+        help="Change parameters, all or none; the controller goes on with them, and they are recorded.",
+        add=_add_param_set,
+        run=_param_set,
+        examples=("param set control.speed_kp_s=0.3", "param set control.speed_kp_s=0.3 --namespace planar13"),
+    ),
+    Noun(name="fault", heading="robot", help="Inject faults into a run that allows it."),
+    Command(
+        name="fault inject",
+        help="Inject a fault into a run that allows it, or end it.",
+        add=_add_fault_inject,
+        run=_inject_fault,
+        examples=("fault inject mute joint_3 --duration 2", "fault inject mute joint_3 --end"),
+    ),
+    Command(
+        name="fault list",
+        help="Explain every kind of fault, and the targets that it has.",
+        add=_add_fault_list,
+        run=_list_faults,
+        examples=("fault list", "fault list --json"),
+    ),
+    *SIMULATOR_COMMANDS,
+)

@@ -1,4 +1,4 @@
-"""The settings of a running controller, one by one: `snakesim param`, and the same for programs and the console.
+"""The parameters of a running controller, one by one: `snakesim param`, and the same for programs and the console.
 
 Control publishes what is in force with a JSON Schema: range, unit and description of each. That comes from the network:
 it decides what is shown, and nothing else; control checks every value again.
@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import msgspec
@@ -22,11 +22,11 @@ from snakesim_hal.base.errors import (
     suggest_word,
 )
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.network.session import Reader, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlSettings, ControlState, SettingsRequest
+from snakesim_hal.wire.messages import ControlParameters, ControlState, ParametersRequest
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import CONNECT_S, only_robot
 from snakesim_operator.robot_commands.command import ANSWER_S, SHOWN_S
@@ -35,15 +35,15 @@ PREFIX = "control."
 MAX_PARAMETERS = 100
 MAX_NAME_CHARACTERS = 40
 MAX_DESCRIPTION_CHARACTERS = 200
-PUBLISHED_S = 3.0  # a controller publishes its settings within this time
-GONE_S = 1.0  # no settings for so long after a change mean that the controller has ended
+PUBLISHED_S = 3.0  # a controller publishes its parameters within this time
+GONE_S = 1.0  # no parameters for so long after a change mean that the controller has ended
 GOES_ON_S = 0.3  # real time until the next report of a controller that continues; robot time may be paused
 LOOK_S = 0.01
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One setting, with its unit and range from the JSON Schema."""
+    """One parameter, with its unit and range from the JSON Schema."""
 
     name: str
     value: Any
@@ -82,11 +82,11 @@ def format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def read_parameters(settings: ControlSettings) -> list[Parameter]:
+def read_parameters(in_force: ControlParameters) -> list[Parameter]:
     """Return the parameters in force; none if their schema cannot be read."""
     try:
-        schema = json.loads(settings.schema)
-        values = msgspec.json.decode(settings.settings, type=dict[str, Any])
+        schema = json.loads(in_force.schema)
+        values = msgspec.json.decode(in_force.parameters, type=dict[str, Any])
         properties = _resolve_reference(schema, schema)["properties"]
         parameters: list[Parameter] = []
         for name, value in values.items():
@@ -130,7 +130,7 @@ def _find_number(schema: dict[str, Any], *names: str) -> float | None:
     return None
 
 
-def find_changed_parameters(before: ControlSettings, now: ControlSettings) -> list[tuple[Parameter, Parameter]]:
+def find_changed_parameters(before: ControlParameters, now: ControlParameters) -> list[tuple[Parameter, Parameter]]:
     """Return the parameters whose values differ, each as it was before and as it is now."""
     old_parameters = {parameter.name: parameter for parameter in read_parameters(before)}
     pairs: list[tuple[Parameter, Parameter]] = []
@@ -141,45 +141,45 @@ def find_changed_parameters(before: ControlSettings, now: ControlSettings) -> li
     return pairs
 
 
-def read_settings(session: Session) -> ControlSettings:
-    """Return the settings of the running controller. Raises NotConnectedError when no controller publishes any."""
-    settings = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, PUBLISHED_S)
-    if settings is None:
+def read_parameters_in_force(session: Session) -> ControlParameters:
+    """Return the parameters of the running controller. Raises NotConnectedError when no controller publishes any."""
+    in_force = session.latest(keys.PARAMETERS_IN_FORCE, ControlParameters, PUBLISHED_S)
+    if in_force is None:
         raise NotConnectedError(
-            f"no controller publishes its settings within {PUBLISHED_S:g} s: control does not run here, or is a client "
-            "of another kind"
+            f"no controller publishes its parameters within {PUBLISHED_S:g} s: control does not run here, or is "
+            "a client of another kind"
         )
-    return settings
+    return in_force
 
 
 def change_parameters(
-    session: Session, changes: Mapping[str, Any], who: str
-) -> tuple[ControlSettings, ControlSettings]:
+    session: Session, changes: Mapping[str, Any], requester: str
+) -> tuple[ControlParameters, ControlParameters]:
     """Change parameters of the running controller, all of them or none.
 
     Args:
         session: A session on the robot's network.
         changes: Values by name, such as `control.speed_kp_s`.
-        who: The name of the requester.
+        requester: The name of the requester.
 
     Returns:
-        The settings in force before and after the change.
+        The parameters in force before and after the change.
 
     Raises:
         ConfigError: There is no such parameter.
         RefusedError: Control refuses a value, with its reason; or does not show what it has accepted.
         ControllerError: The controller cannot go on with what it has accepted, so control has ended.
-        NotConnectedError: No controller publishes its settings.
+        NotConnectedError: No controller publishes its parameters.
     """
-    before = read_settings(session)
-    values = msgspec.json.decode(before.settings, type=dict[str, Any])
+    before = read_parameters_in_force(session)
+    values = msgspec.json.decode(before.parameters, type=dict[str, Any])
     for name, value in changes.items():
         values[known_name(name, before)] = value
-    settings = msgspec.json.encode(values).decode()
-    request = SettingsRequest(who=who, controller=before.controller, settings=settings)
+    parameters = msgspec.json.encode(values).decode()
+    request = ParametersRequest(requester=requester, controller=before.controller, parameters=parameters)
     states = session.reader(keys.CONTROL_STATE, ControlState)
     try:
-        answer = session.request(keys.SETTINGS, request, ANSWER_S)
+        answer = session.request(keys.PARAMETERS, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)
         now = _wait_for_change(session, before)
@@ -187,22 +187,24 @@ def change_parameters(
     finally:
         session.stop_reading(states)
     if now is None:
-        raise RefusedError(f"NOT CONFIRMED: {answer.reason}; but no controller publishes them")
+        raise RefusedError(
+            f"NOT CONFIRMED: {answer.reason}; but no controller publishes them", code="robot/not-confirmed"
+        )
     return before, now
 
 
-def _wait_for_change(session: Session, before: ControlSettings) -> ControlSettings | None:
-    """Return the settings in force after a change; None when none are published in time."""
+def _wait_for_change(session: Session, before: ControlParameters) -> ControlParameters | None:
+    """Return the parameters in force after a change; None when none are published in time."""
     deadline = time.monotonic() + SHOWN_S
     while time.monotonic() < deadline:
-        now = session.latest(keys.SETTINGS_IN_FORCE, ControlSettings, GONE_S)
+        now = session.latest(keys.PARAMETERS_IN_FORCE, ControlParameters, GONE_S)
         if now is None or now.changes > before.changes:
             return now
     return None
 
 
 def _check_controller_continues(
-    states: Reader[ControlState], now: ControlSettings | None, changes: Mapping[str, Any]
+    states: Reader[ControlState], now: ControlParameters | None, changes: Mapping[str, Any]
 ) -> None:
     """Raise ControllerError if the controller cannot go on with these changes.
 
@@ -210,7 +212,7 @@ def _check_controller_continues(
 
     Args:
         states: Control's reports since the changes were asked for.
-        now: The settings in force with them; None: control publishes none any more.
+        now: The parameters in force with them; None: control publishes none any more.
         changes: Values by name.
     """
     deadline = time.monotonic() + GOES_ON_S
@@ -228,27 +230,32 @@ def _check_controller_continues(
         time.sleep(LOOK_S)
 
 
-def known_name(name: str, settings: ControlSettings) -> str:
+def known_name(name: str, in_force: ControlParameters) -> str:
     """Return the field that `control.NAME` refers to. Raises ConfigError if there is no such parameter."""
-    known = [PREFIX + parameter.name for parameter in read_parameters(settings)]
+    known = [PREFIX + parameter.name for parameter in read_parameters(in_force)]
     if name not in known:
         raise ConfigError(
-            f"controller {settings.controller} has no parameter {shorten(name)!r}; {suggest_word(name, known)}it has "
-            f"{', '.join(known) or 'none'}"
+            f"controller {in_force.controller} has no parameter {shorten(name)!r}; {suggest_word(name, known)}it has "
+            f"{', '.join(known) or 'none'}",
+            code="controller/unknown-parameter",
         )
     return name.removeprefix(PREFIX)
 
 
-def list_parameters(where: RobotSelection) -> int:
+def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
     """Print all parameters for `snakesim param list`."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
-        settings = read_settings(session)
-    parameters = read_parameters(settings)
-    if settings.who is None:
+        in_force = read_parameters_in_force(session)
+    parameters = read_parameters(in_force)
+    if as_json:
+        content = [{**asdict(parameter), "name": PREFIX + parameter.name} for parameter in parameters]
+        print_json({"controller": in_force.controller, "set_by": in_force.requester, "parameters": content})
+        return 0
+    if in_force.requester is None:
         origin = "from its configuration"
     else:
-        origin = f"set by {settings.who} at {settings.timestamp_ns * 1e-9:g} s"
-    print_line(f"controller {settings.controller}, {len(parameters)} parameters, {origin}")
+        origin = f"set by {in_force.requester} at {in_force.timestamp_ns * 1e-9:g} s"
+    print_line(f"controller {in_force.controller}, {len(parameters)} parameters, {origin}")
     rows = [(PREFIX + parameter.name, parameter.value_with_unit, parameter.range) for parameter in parameters]
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row, parameter in zip(rows, parameters, strict=True):
@@ -258,13 +265,16 @@ def list_parameters(where: RobotSelection) -> int:
     return 0
 
 
-def get_parameter(name: str, where: RobotSelection) -> int:
-    """Print one value alone, for scripts that use `snakesim param get`."""
+def get_parameter(name: str, where: RobotSelection, *, as_json: bool) -> int:
+    """Print one value alone, for `snakesim param get`."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
-        settings = read_settings(session)
-    field = known_name(name, settings)
-    value = next(parameter.value for parameter in read_parameters(settings) if parameter.name == field)
-    print_line(format_value(value))
+        in_force = read_parameters_in_force(session)
+    field = known_name(name, in_force)
+    value = next(parameter.value for parameter in read_parameters(in_force) if parameter.name == field)
+    if as_json:
+        print_json({name: value})
+    else:
+        print_line(format_value(value))
     return 0
 
 
@@ -286,9 +296,8 @@ def set_parameters(texts: list[str], where: RobotSelection) -> int:
         before, now = change_parameters(session, changes, get_user_name())
     changed = find_changed_parameters(before, now)
     for old, new in changed:
-        print_line(
-            f"{PREFIX}{new.name}: {format_value(old.value)} -> {new.value_with_unit}, by {now.who}, tick {now.tick}"
-        )
+        change = f"{format_value(old.value)} -> {new.value_with_unit}"
+        print_line(f"{PREFIX}{new.name}: {change}, by {now.requester}, tick {now.tick}")
     if not changed:
         print_line(f"controller {now.controller} has these values already")
     return 0

@@ -215,7 +215,7 @@ class PreparedStop:
             self._began_s = None
         self._on_result(requesters, text)
         if not stopped:
-            raise RefusedError(text)
+            raise RefusedError(text, code="robot/not-confirmed")
         return text
 
     def _stop_by_all_ways(self) -> tuple[bool, str]:

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from queue import Empty
@@ -11,6 +11,7 @@ from typing import Any
 from snakesim_hal.base.errors import NotConnectedError, WireError
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
+from snakesim_hal.network.endpoint import is_exposed
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, find_differences
 from snakesim_hal.network.session import Arrival, Link, Session, open_session
@@ -21,6 +22,7 @@ from snakesim_operator.base.targets import CONNECT_S, RobotSelection, flags_of, 
 from snakesim_operator.results import last_run
 
 STATUS_WAIT_S = 1.0  # for the messages of a network
+ONE_ATTEMPT_S = 0.0  # as a time to connect: Zenoh tries once, and reports a refused connection at once
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,10 @@ class _Robot:
 def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
     robots: list[_Robot] = []
+    running_here = {robot.endpoint for robot in where.local()}
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            robots += _find_robots(link)
+            robots += _find_robots(link, _choose_connect_time(link, running_here))
     reachable = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
     silent = [robot for robot in where.local() if (robot.endpoint, robot.namespace) not in reachable]
     without_faults = bool(robots) and all(robot.status.lifecycle in ("armed", "disarmed") for robot in robots)
@@ -67,10 +70,10 @@ def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
 
 def _print_no_robot(where: RobotSelection) -> None:
     """Print how the last run on this computer ended, and how to start another."""
-    last = last_run.recall()
+    last = last_run.read_last_run()
     ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
     print_line(f"no robot answers on {', '.join(where.endpoints())}{ending}")
-    print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
+    print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenario list`")
 
 
 def _print_robot(robot: _Robot) -> None:
@@ -130,10 +133,21 @@ class _NetworkMessages:
                     self.processes.setdefault(name, []).append(message)
 
 
-def _find_robots(link: Link) -> list[_Robot]:
+def _choose_connect_time(link: Link, running_here: Collection[str]) -> float:
+    """Return how long to try to connect to a network, in s.
+
+    On loopback Zenoh reports at once whether a process listens, so one attempt is enough. It is repeated where a run of
+    this computer is about to listen, and where packets may be lost on the way.
+    """
+    if link.session is None and link.endpoint not in running_here and not is_exposed(link.endpoint):
+        return ONE_ATTEMPT_S
+    return CONNECT_S
+
+
+def _find_robots(link: Link, connect_s: float) -> list[_Robot]:
     """Return the robots on a network, sorted by name. Raises NotConnectedError."""
     messages = _NetworkMessages(link)
-    with open_session(link, CONNECT_S) as session:
+    with open_session(link, connect_s) as session:
         messages.read(session)
     robots: list[_Robot] = []
     for name, status_by_host in sorted(messages.statuses.items()):
@@ -174,7 +188,7 @@ def _describe_robot(robot: _Robot) -> list[str]:
     link = robot.link
     status = robot.status
     return [
-        f"{link.namespace}: {status.lifecycle} - {status.why}",
+        f"{link.namespace}: {status.lifecycle} - {status.reason}",
         f"  {describe_what_moves(robot.description)}",
         f"  robot {status.robot}, backend {status.backend}, {status.clock_mode} at {status.rate_hz:g} Hz, "
         f"tick {status.tick}, on {link.endpoint}",
@@ -202,7 +216,7 @@ def _describe_limits(status: Status) -> list[str]:
     for joint, fraction in sorted(status.derated.items()):
         lines.append(f"  derated: {joint} has {100 * fraction:.0f} % of its torque left")
     if status.isolated:
-        lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
+        lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a reset")
     lines += [f"  real time: {warning}" for warning in status.realtime_warnings]
     if status.unchecked:
         lines.append(f"  not checked: {status.unchecked}")
@@ -230,17 +244,19 @@ def _describe_faults(status: Status) -> list[str]:
 def _next_commands(link: Link, status: Status) -> list[str]:
     """Return the commands that the operator may type next."""
     where = flags_of(link, status.robot)
-    arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
+    arm = f"`snakesim robot arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
-        return [f"  next: `snakesim clear{where}`, then {arm}"]
+        return [f"  next: `snakesim robot reset{where}`, then {arm}"]
     if status.isolated and status.lifecycle == "disarmed":
-        lines = [f"  next: `snakesim clear{where}`, to end the isolation of {', '.join(status.isolated)}"]
+        lines = [f"  next: `snakesim robot reset{where}`, to end the isolation of {', '.join(status.isolated)}"]
         if status.ready_to_arm:
             lines.append(f"  or, without: {arm}")
         return lines
     if status.lifecycle == "armed":
-        return [f"  next: `snakesim console{where}` to watch, `snakesim disarm{where}` or `snakesim estop` to stop it"]
+        return [
+            f"  next: `snakesim console{where}` to watch, `snakesim robot disarm{where}` or `snakesim estop` to stop it"
+        ]
     if status.ready_to_arm:
         return [f"  next: {arm}"]
-    missing = ", ".join(f"`snakesim service {name} SCENARIO{where}`" for name in status.waiting_for)
+    missing = ", ".join(f"`snakesim start service {name} SCENARIO{where}`" for name in status.waiting_for)
     return [f"  next: {missing or '`snakesim status` again: what prevents arming is named above'}"]

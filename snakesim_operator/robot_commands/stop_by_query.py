@@ -71,7 +71,7 @@ def _query_hosts(session: Session, link: Link, limit_s: float, *, repeat: bool) 
     answers: dict[str, list[Answer]] = {}
     deadline = time.monotonic() + limit_s
     while not answers and time.monotonic() < deadline:
-        for answer_key, answer in session.request_all(key, EstopRequest(who=get_user_name()), ASK_S):
+        for answer_key, answer in session.request_all(key, EstopRequest(requester=get_user_name()), ASK_S):
             name = link.namespace or namespace_of(answer_key)
             answers.setdefault(name, []).append(answer)
         if not repeat:

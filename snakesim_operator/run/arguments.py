@@ -1,8 +1,7 @@
-"""Arguments of `snakesim run`, `host` and `service`."""
+"""The commands `snakesim run`, `snakesim start host` and `snakesim start service`."""
 
 import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import tolerate_failed_output
@@ -10,6 +9,7 @@ from snakesim_hal.programs.arguments import (
     add_host,
     add_insecure,
     add_network,
+    add_out,
     add_scenario,
     add_service,
     add_unchecked,
@@ -17,6 +17,7 @@ from snakesim_hal.programs.arguments import (
     load_scenario,
     read_session_option,
 )
+from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.recording.message import RAW_ONLY
 
 if TYPE_CHECKING:
@@ -24,61 +25,37 @@ if TYPE_CHECKING:
     from snakesim_hal.model.scenario import RunConfig
 
 
-def add_commands(commands: Any) -> None:
-    """Add the three to the parser of `snakesim`."""
-    run = commands.add_parser(
-        "run",
-        help="run a scenario: backend, guidance, navigation and control",
-        epilog="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
-        "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
-    )
-    add_scenario(run)
-    run.add_argument(
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    add_scenario(parser)
+    parser.add_argument(
         "--fault",
         action="append",
-        metavar="KIND:TARGET@START[-END][=AMOUNT]",
-        help="inject a fault, at seconds after arming; replaces the scenario's faults; may be repeated",
+        metavar="FAULT",
+        help="inject a fault, as KIND:TARGET@START[-END][=AMOUNT] in seconds after arming; replaces the scenario's "
+        "faults; may be repeated",
     )
-    run.add_argument(
-        "--stay", action="store_true", help="faults do not end the run: processes restart, you clear and arm"
+    parser.add_argument(
+        "--stay", action="store_true", help="faults do not end the run: processes restart, you reset and arm"
     )
-    add_unchecked(run)
-    run.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
-    run.add_argument(
+    add_unchecked(parser)
+    parser.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
+    parser.add_argument(
         "--in-process",
         action="store_true",
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
-    run.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
-    run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
-    run.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
-    run.add_argument(
+    parser.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
+    parser.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
+    parser.add_argument(
         "--console",
         action=argparse.BooleanOptionalAction,
         default=False,
         help="show the run in the browser, and print the address",
     )
-    run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
-    add_network(run, "")
-    add_insecure(run)
-    run.set_defaults(act=_run)
-
-    host = commands.add_parser(
-        "host",
-        help="run a robot's HAL host alone, for services on this or other machines",
-        epilog="It runs until Ctrl-C, and boots disarmed: `snakesim arm` arms it. Faults do not end it. Exit code: 0 "
-        "ended with --once and without a fault, 1 ended otherwise, 2 wrong input.",
-    )
-    add_host(host)
-    host.set_defaults(act=_host)
-
-    service = commands.add_parser(
-        "service",
-        help="run one service of a robot alone: guidance, navigation, control, ...",
-        epilog="It waits for the network and for the robot's host, and meets the next one after a restart.",
-    )
-    add_service(service)
-    service.set_defaults(act=_service)
+    add_out(parser, "folder for the run's record (default: runs/NAME-TIME)")
+    add_network(parser, "")
+    add_insecure(parser)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -114,7 +91,10 @@ def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int
     config = _config_of(arguments)
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
-            raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
+            raise ConfigError(
+                f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out",
+                code="command/conflicting-options",
+            )
 
     from snakesim_operator.run.in_process import run_in_process
 
@@ -142,3 +122,38 @@ def _service(arguments: argparse.Namespace) -> int:
     from snakesim_hal.programs import service_program as serve
 
     return serve.run(arguments)
+
+
+COMMANDS: Commands = (
+    Command(
+        name="run",
+        heading="daily work",
+        help="Run a scenario: backend, guidance, navigation and control.",
+        add=_add_run,
+        run=_run,
+        details="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
+        "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
+        examples=(
+            "run triplet --console",
+            "run peg_row --controller obstacle_aided --duration 10 --out runs/demo",
+        ),
+    ),
+    Noun(name="start", heading="robot", help="Start one process of a robot that is distributed over machines."),
+    Command(
+        name="start host",
+        help="Start the HAL host of a robot, which moves the drives or the simulator.",
+        add=add_host,
+        run=_host,
+        details="It runs until Ctrl-C, and boots disarmed: `snakesim robot arm` arms it. Faults do not end it. Exit "
+        "code: 0 ended with --end-after-duration and without a fault, 1 ended otherwise, 2 wrong input.",
+        examples=("start host triplet", "start host triplet --backend can --router tcp/10.0.0.1:7447 --out runs/host"),
+    ),
+    Command(
+        name="start service",
+        help="Start one service of a robot: guidance, navigation, control, or another one of the scenario.",
+        add=add_service,
+        run=_service,
+        details="It waits for the network and for the robot's host, and joins the next host after a restart.",
+        examples=("start service control triplet", "start service guidance triplet --router tcp/10.0.0.1:7447"),
+    ),
+)

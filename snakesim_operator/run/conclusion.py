@@ -19,8 +19,9 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.base import extras
 from snakesim_operator.results import last_run
 from snakesim_operator.results.missing_data import INCOMPLETE, describe_unwritten
-from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.results.run_ending import COMPLETE, ended_early
+from snakesim_operator.results.run_ending import COMPLETE, describe_early_end
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT, SUMMARY
 from snakesim_operator.results.summary import Restart, RunSummary, distance_m, estimates_of, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
@@ -50,7 +51,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
         files: the run's folder; closed by this function.
         ending: the reasons for the end that are known so far.
         outcome: what the host and the processes reported.
-        stay: whether faults that a person could clear are part of the run, not its end.
+        stay: whether faults that a person could reset are part of the run, not its end.
 
     Returns:
         The exit code: 0, or 1 on a fault or an early end, 3 when the record has gaps, 130 when interrupted.
@@ -66,7 +67,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
         if loss and loss not in missing:
             missing.append(loss)
     _print_end(files, ending, outcome, missing, verdict)
-    last_run.remember(str(files.folder or "no folder"), _describe_ending(ending))
+    last_run.save_last_run(str(files.folder or "no folder"), _describe_ending(ending))
     return _exit_code(ending, host, missing)
 
 
@@ -85,13 +86,13 @@ def note_reasons(ending: Ending, host: HostRecord, config: RunConfig, *, stay: b
         ending: gets the reasons.
         host: statistics of the host.
         config: configuration of the run.
-        stay: whether faults that a person could clear are part of the run, not its end.
+        stay: whether faults that a person could reset are part of the run, not its end.
     """
     if not stay:
         for fault in host.faults:
             if fault.reach == "robot":
                 ending.add_cause(fault.cause)
-    early_end = ended_early(host, config)
+    early_end = describe_early_end(host, config)
     if early_end and (host.ended == "running" or ending.reason is None):
         ending.add_cause(early_end)
 
@@ -118,7 +119,7 @@ def _write_and_print(files: RunFiles, ending: Ending, outcome: Outcome, host: Ho
         _print_host(host)
         return [*describe_unwritten(host), str(error)], ""
     missing = [*describe_unwritten(record.host), *record.unreached]
-    if not extras.is_installed("report"):
+    if not extras.is_installed("record"):
         return missing, ""
     from snakesim_operator.results.report.verdict import verdict
 
@@ -146,7 +147,7 @@ def write_results(
     if outcome.too_slow:
         summary = msgspec.structs.replace(summary, too_slow=list(outcome.too_slow))
     files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
-    if report and extras.is_installed("report"):
+    if report and extras.is_installed("record"):
         # Templates take a while to import, and the start of a run does not wait for them.
         from snakesim_operator.results.report import page
 
@@ -177,15 +178,15 @@ def _print_paths(folder: Path) -> None:
         path = folder / name
         if path.is_file():
             print_line(f"{title + ':':<9}{path}")
-    if (folder / SUMMARY).is_file() and not extras.is_installed("report"):
-        print_line(f"report:  not written; {pip_install('report')}, then `snakesim report {folder}`")
+    if (folder / SUMMARY).is_file() and not extras.is_installed("record"):
+        print_line(f"report:  not written; {pip_install('record')}, then `snakesim recording report {folder}`")
 
 
 def _print_kept_stop(robot: Description) -> None:
-    """Print how to clear an emergency stop, if one is stored."""
+    """Print how to reset an emergency stop, if one is stored."""
     stop = robot_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
     if stop.is_file():
-        print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` ends that")
+        print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim robot reset` ends that")
 
 
 def _print_host(host: HostRecord) -> None:
@@ -204,7 +205,7 @@ def print_summary(summary: RunSummary) -> None:
     """Print the numbers of a run, one line each."""
     for name, value in (*_motion_rows(summary), *_state_rows(summary), *_failure_rows(summary)):
         _print_row(name, value)
-    for missing in summary.lacks:
+    for missing in summary.missing:
         _print_row("not known", missing)
 
 

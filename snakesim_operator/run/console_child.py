@@ -18,7 +18,9 @@ LOG = "console.log"  # in the folder of the run
 def check_console() -> None:
     """Check that the console and the packages that it needs are installed. Raises ConfigError if they are not."""
     if importlib.util.find_spec(CONSOLE) is None:
-        raise ConfigError("--console: this installation is one without the console; leave it out")
+        raise ConfigError(
+            "--console: this installation is one without the console; leave it out", code="extra/not-installed"
+        )
     extras.require("console", "--console", "; or leave it out")
 
 

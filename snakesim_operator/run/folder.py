@@ -11,7 +11,7 @@ from snakesim_hal.base.atomic_write import PARTIAL
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY
+from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
 
 LOCK = "run.lock"  # holds the process id of the run that is writing here
 FILES_OF_OLDER_VERSIONS = ("telemetry.jsonl", "blackbox.npz")
@@ -99,7 +99,8 @@ def _try_to_lock(out: Path) -> int | None:
             os.close(lock_handle)
             raise ConfigError(
                 f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
-                "choose another folder, or end that run"
+                "choose another folder, or end that run",
+                code="file/in-use",
             ) from None
         if _is_same_file(lock_handle, out / LOCK):
             return lock_handle
@@ -124,7 +125,9 @@ def _open_folder(out: Path) -> int:
         except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
             was_just_renamed = isinstance(error, FileNotFoundError)
             if not attempts_left or not was_just_renamed:
-                raise ConfigError(f"--out {out}: {error.strerror}: {error.filename}; choose another folder") from error
+                raise ConfigError(
+                    f"--out {out}: {error.strerror}: {error.filename}; choose another folder", code="file/not-writable"
+                ) from error
 
 
 def _is_same_file(handle: int, path: Path) -> bool:
@@ -138,7 +141,9 @@ def _is_same_file(handle: int, path: Path) -> bool:
 def _rename_earlier_run(out: Path) -> Path:
     """Rename a folder to FOLDER.TIME, with the time of its earlier run, and return the new path. Raises ConfigError."""
     if Path.cwd().is_relative_to(out):
-        raise ConfigError(f"--out {out} holds an earlier run, and you are in it; choose another folder")
+        raise ConfigError(
+            f"--out {out} holds an earlier run, and you are in it; choose another folder", code="file/already-exists"
+        )
     began_s = min((out / name).stat().st_mtime for name in RUN_FILES if (out / name).exists())
     began = datetime.fromtimestamp(began_s).strftime(TIME_FORMAT)
     renamed = _find_free_path(out.with_name(f"{out.name}.{began}"))
@@ -147,7 +152,8 @@ def _rename_earlier_run(out: Path) -> Path:
     except OSError as error:
         raise ConfigError(
             f"--out {out} holds an earlier run that cannot be moved to {renamed}: {error.strerror}; "
-            "choose another folder"
+            "choose another folder",
+            code="file/already-exists",
         ) from error
     (renamed / LOCK).unlink(missing_ok=True)
     return renamed

@@ -22,7 +22,7 @@ INTERRUPT_LIMIT_S = 3.0  # for the present step, after Ctrl-C; Python code is in
 OVERDUE_LIMIT_S = 5.0  # for a step that is due; Python code is interrupted long before
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130  # as shells report a program that Ctrl-C has ended
-RECORD_HINT = "What was recorded until then is in the run's folder; `snakesim report FOLDER` shows it"
+RECORD_HINT = "What was recorded until then is in the run's folder; `snakesim recording report FOLDER` shows it"
 
 
 def run_guarded(act: Callable[[Pulse | None], int], *, owns_process: bool) -> int:

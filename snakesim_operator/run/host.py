@@ -1,4 +1,4 @@
-"""`snakesim host`: the HAL host of a robot alone. Services connect to it, from this or from other machines."""
+"""`snakesim start host`: the HAL host of a robot alone. Services connect to it, from this or from other machines."""
 
 import argparse
 import contextlib
@@ -8,7 +8,7 @@ from snakesim_hal.model.scenario import write_config
 from snakesim_hal.programs.host_program import host
 from snakesim_hal.programs.preflight import check_backend
 from snakesim_hal.programs.service_program import process_options
-from snakesim_operator.results.record import CONFIG
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.run.folder import locked_folder
 
 

@@ -37,8 +37,9 @@ from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.base import extras
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.metrics.advance import GoalWatch
-from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.recording_contents import SERVICE_STREAMS
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, note_reasons, write_results
 from snakesim_operator.run.ending import Ending, interruptible
@@ -48,7 +49,7 @@ from snakesim_operator.run.run import check_recorder, opened_files
 from snakesim_operator.run.run_files import RunFiles
 
 if TYPE_CHECKING:
-    from snakesim_operator.recording.recording import Recording
+    from snakesim_operator.recording.writer import RecordingWriter
 
 LOG_FILE = "run.log"  # gets what the parts of the run print to stderr
 POLL_TICKS = 50  # between two looks at the progress, the goal and the recording
@@ -106,7 +107,7 @@ def simulate(
     """Run a configuration in this process, and return what was recorded.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
-    the run is computed in a child process, so that its digest is the same. `snakesim_hal.base.arithmetic.pin()` before
+    the run is computed in a child process, so that its digest is the same. `snakesim.use_common_arithmetic()` before
     the first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest
     may be its computer's own (`summary.own_arithmetic`).
 
@@ -126,7 +127,8 @@ def simulate(
     """
     if not isinstance(config, RunConfig):
         raise ConfigError(
-            f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path"
+            f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path",
+            code="python/invalid-argument",
         )
     if not is_pinned() and not anything_offered():  # a child would not have the plugins that this program offers
         return call_pinned(
@@ -148,7 +150,7 @@ def simulate(
         else:
             files, _ = opened.enter_context(opened_files(config, out))
         if files.folder is None:
-            raise ConfigError(f"{out} cannot be written to; choose another folder")
+            raise ConfigError(f"{out} cannot be written to; choose another folder", code="file/not-writable")
         opened.callback(files.close)
         recorded_keys = SERVICE_STREAMS if out is None else _all_keys()
         run, outcome, gave_up = _run_to_end(
@@ -282,7 +284,7 @@ def _run_to_end(
 @contextlib.contextmanager
 def _recording(
     session: Session, files: RunFiles, recorded_keys: Iterable[str], shown_as: str | None
-) -> "Iterator[Recording | None]":
+) -> "Iterator[RecordingWriter | None]":
     """Record the messages at these keys for as long as the context lives.
 
     Yields None when there are no keys, or when no file can be created.
@@ -290,9 +292,9 @@ def _recording(
     recording = None
     try:
         if files.folder is not None and recorded_keys:
-            from snakesim_operator.recording.recording import Recording  # needs the extra `record`
+            from snakesim_operator.recording.writer import RecordingWriter  # needs the extra `record`
 
-            recording = Recording(files.folder / RECORDING, shown_as)
+            recording = RecordingWriter(files.folder / RECORDING, shown_as)
             for key in recorded_keys:
                 session.on_latched_arrival(key, recording.write_arrival)
     except OSError as error:

@@ -49,7 +49,7 @@ def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tup
         if _is_tcp_port_free(bound_port):
             return Link(f"tcp/{LOOPBACK}:{bound_port}", namespace), stop_port
         stop_port.close()
-    raise NotConnectedError("no free port on the loopback interface")
+    raise NotConnectedError("no free port on the loopback interface", code="network/port-in-use")
 
 
 def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
@@ -68,14 +68,16 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
             if session.present(keys.alive_key("hal")) or session.present(keys.HOST_ALL):
                 raise RefusedError(
                     f"{lab.namespace} is on {lab.endpoint} already; end that run first, or give this one another "
-                    f"--namespace"
+                    f"--namespace",
+                    code="robot/already-running",
                 )
     elif endpoint is not None:
         with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_S) as session:
             others = ", ".join(robots_on(session)) or "another host"
             raise RefusedError(
                 f"{others} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
-                f"--router {endpoint} with another --namespace"
+                f"--router {endpoint} with another --namespace",
+                code="robot/already-running",
             )
 
 

@@ -54,7 +54,7 @@ class RunMonitor:
             supervisor: of the run's processes, already started.
             ending: collects the reasons for which the run ends.
             say: prints a line for the operator.
-            stay: whether a fault does not end the run; a person clears it and arms again.
+            stay: whether a fault does not end the run; a person resets it and arms again.
             unchecked: whether to arm also without a check of the joints.
         """
         # Collaborators.
@@ -127,7 +127,7 @@ class RunMonitor:
     def _describe_timeout(self, give_up_s: float) -> str | None:
         """Return why the run stops waiting to arm the robot; None while it waits."""
         now = time.monotonic()
-        reason = self._status.why if self._status else "no status"
+        reason = self._status.reason if self._status else "no status"
         if self._startup_timeout.ends(self._status, now):
             limit_s = self._startup_timeout.limit_s
             return f"not ready to arm within {limit_s:g} s (start_limit_s) with every service there: {reason}"
@@ -182,7 +182,7 @@ class RunMonitor:
         if self._robot is not None and not self._armed:
             refusal = self._faults.refusal(self._robot)
             if refusal is not None:
-                raise RefusedError(refusal)
+                raise RefusedError(refusal, code="injection/not-allowed")
         self._faults.carry_out(self._robot, status.lifecycle if status is not None else "disarmed")
         if status is None:
             return
@@ -241,10 +241,10 @@ class RunMonitor:
         if status.lifecycle not in ("fault", "estop"):
             self._last_latched = None
             return
-        latched = f"{status.lifecycle}: {status.why}"
+        latched = f"{status.lifecycle}: {status.reason}"
         if latched != self._last_latched:
             self._say(latched)
-            self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
+            self._say(f"  go on with `snakesim robot reset`, then `snakesim robot arm {status.robot} {status.backend}`")
         self._last_latched = latched
 
     def _arm_once(self) -> None:
@@ -266,7 +266,7 @@ class RunMonitor:
         if self._trajectory is None or not self._armed or host is None:
             return
         if self._trajectory.newest(lambda trajectory: trajectory.finished) is not None:
-            host.send_request(LifecycleRequest(action="finish", who=AT_GOAL))
+            host.send_request(LifecycleRequest(action="finish", requester=AT_GOAL))
             self._trajectory = None
 
     def _waits_for_recorder(self) -> bool:
@@ -300,7 +300,7 @@ class RunMonitor:
             answer = host.answers.pop(0)
             self._arm_request_time_s = None
             if not answer.ok and answer.refusal != "not_ready":
-                raise RefusedError(answer.reason)
+                raise RefusedError(answer.reason, code="robot/not-ready")
             self._armed = answer.ok
         elif time.monotonic() - self._arm_request_time_s > ARM_LIMIT_S:
             raise NotConnectedError(f"the host does not answer within {ARM_LIMIT_S:.0f} s; see host.log")

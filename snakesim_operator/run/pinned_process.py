@@ -44,9 +44,11 @@ def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
             raise errors.SnakesimError(f"the process of the run ended with exit code {process.returncode}; see above")
         answer = pickle.loads((Path(folder) / ANSWER_FILE).read_bytes())
     if isinstance(answer, tuple):
-        error_name, lines = answer
+        error_name, lines, code = answer
         error_type = getattr(errors, error_name, errors.SnakesimError)
-        raise error_type(*lines)
+        error = error_type(*lines)
+        error.code = code
+        raise error
     return answer
 
 
@@ -60,7 +62,7 @@ def main() -> int:
     try:
         answer: Any = function(**arguments)
     except errors.SnakesimError as error:
-        answer = type(error).__name__, error.lines
+        answer = type(error).__name__, error.lines, error.code
     (folder / ANSWER_FILE).write_bytes(pickle.dumps(answer))
     return 0
 

@@ -146,15 +146,20 @@ class ProcessFaults:
     def _check(self, injection: Injection) -> None:
         """Raise ConfigError for a requested fault that this run cannot carry out, or could not end."""
         if injection.part != RUN:
-            raise ConfigError(f"{injection.kind}:{injection.target} is carried out at {keys.fault_key(injection.part)}")
+            raise ConfigError(
+                f"{injection.kind}:{injection.target} is carried out at {keys.fault_key(injection.part)}",
+                code="injection/not-supported",
+            )
         if injection.target_type == "process" and injection.target not in self._supervisor.names:
             raise ConfigError(
-                f"there is no process {injection.target!r}; this run has {', '.join(self._supervisor.names)}"
+                f"there is no process {injection.target!r}; this run has {', '.join(self._supervisor.names)}",
+                code="injection/unknown-target",
             )
         if injection.kind == "freeze" and injection.target in MEETING_POINTS and injection.end_s == inf:
             raise ConfigError(
                 f"freeze:{injection.target} needs an end, because a frozen {injection.target} cannot receive the "
-                f"request to end it: give --for SECONDS"
+                f"request to end it: give --for SECONDS",
+                code="injection/not-supported",
             )
 
     def _begin(self, injection: Injection) -> None:
@@ -170,7 +175,10 @@ class ProcessFaults:
 
     def _end(self, injection: Injection) -> None:
         if injection.target not in self._frozen:
-            raise ConfigError(f"{injection.kind}:{injection.target} is not active; only a freeze can be ended")
+            raise ConfigError(
+                f"{injection.kind}:{injection.target} is not active; only a freeze can be ended",
+                code="injection/not-supported",
+            )
         self._thaw(injection.target)
 
     def _thaw(self, name: str) -> None:

@@ -81,7 +81,7 @@ class Progress(OneLine):
             return  # armed since the last status: only the next status shows for how long
         self._armed = armed
         self._next = now + (TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S)
-        text = self._describe_run(status, control, now) if armed else f"starting: {status.why}"
+        text = self._describe_run(status, control, now) if armed else f"starting: {status.reason}"
         if self.terminal or text != self._last:
             self.show_text(text)
         self._last = text
@@ -100,7 +100,7 @@ class Progress(OneLine):
         if status.paused_by is not None:
             parts.append(f"PAUSED by {status.paused_by}")
         if status.lifecycle != "armed":
-            parts.append(f"{status.lifecycle}: {status.why}")
+            parts.append(f"{status.lifecycle}: {status.reason}")
         elif control is not None:
             parts += _describe_control(control)
         return "  ".join(parts)

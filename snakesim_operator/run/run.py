@@ -25,7 +25,7 @@ from snakesim_hal.programs.preflight import check_plugins
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
-from snakesim_operator.results.record import CONFIG
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import default_folder, locked_folder
@@ -55,7 +55,7 @@ class RunRequest:
 
     # Arming and faults.
     unchecked: bool = False  # arm also a robot whose joints have not been checked
-    stay: bool = False  # a fault does not end the run: processes are started again, a person clears and arms
+    stay: bool = False  # a fault does not end the run: processes are started again, a person resets and arms
 
     # Output.
     record: bool = True  # every message, in recording.mcap
@@ -182,12 +182,16 @@ def _check_router(request: RunRequest) -> None:
     if request.with_router:
         if request.lab is not None:
             raise ConfigError(
-                "--with-router starts a router of the run's own, --router and --session join another: give one of them"
+                "--with-router starts a router of the run's own, --router and --session join another: give one of them",
+                code="command/conflicting-options",
             )
         return
     router_faults = [injection for injection in parse_planned(request.config) if injection.target == ROUTER]
     if router_faults:
-        raise ConfigError(f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router")
+        raise ConfigError(
+            f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router",
+            code="injection/not-supported",
+        )
 
 
 class _RunProcesses:
@@ -227,7 +231,7 @@ class _RunProcesses:
 
     def _start_host(self) -> None:
         arguments = ["snakesim_hal.programs.host_program", *self._scenario, *self._listening]
-        arguments += ["--once", "--memory", self.supervisor.memory]
+        arguments += ["--end-after-duration", "--memory", self.supervisor.memory]
         if self.request.router is not None or self.request.with_router:
             arguments += ["--router", self.link.endpoint]
         else:
@@ -248,7 +252,7 @@ class _RunProcesses:
             self.supervisor.start(name, arguments, may_restart=service.restart)
 
     def _start_recorder(self, folder: Path) -> None:
-        arguments = ["snakesim_operator.recording.process", *self.common_arguments, "--out", str(folder)]
+        arguments = ["snakesim_operator.recording.recorder_process", *self.common_arguments, "--out", str(folder)]
         if self.request.raw_only:
             arguments.append("--raw-only")
         self.supervisor.start(RECORDER, arguments, vital=False)
@@ -297,7 +301,7 @@ def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Itera
             except NotConnectedError:
                 ended = supervisor.describe_first_end()
                 if ended is not None:
-                    raise NotConnectedError(ended) from None
+                    raise NotConnectedError(ended, code="run/failed") from None
                 now = time.monotonic()
                 if now > began_s + SERVICE_START_LIMIT_S or ending.interrupted:
                     raise

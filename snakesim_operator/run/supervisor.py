@@ -133,7 +133,7 @@ class Supervisor:
         supervisor_end, host_end = socket_pair()
         with host_end:
             inherits = (host_end.fileno(), self._stop_port.fileno())
-            private = ["--channel", str(inherits[0]), "--stop-port", str(inherits[1])]
+            private = ["--parent-socket", str(inherits[0]), "--stop-port", str(inherits[1])]
             child = children.start_child(HOST, [*arguments, *private], keep, inherits=inherits, more=self._secret)
         if self.host is not None:
             self.host.close()
@@ -165,7 +165,7 @@ class Supervisor:
         for _ in range(self.host.resets - resets_before):
             self._note_restart(HOST, "host was reset", delay_s=0.0)
             robot = self.host.description
-            command = f"snakesim arm {robot.robot} {robot.backend}" if robot is not None else "snakesim arm"
+            command = f"snakesim robot arm {robot.robot} {robot.backend}" if robot is not None else "snakesim robot arm"
             self._say(f"the simulator was reset: it is at the start, and disarmed; go on with `{command}`")
 
     def _note_restart(self, name: str, how: str, delay_s: float) -> None:

@@ -3,20 +3,17 @@
 source <(snakesim completion bash)        # in ~/.bashrc
 source <(snakesim completion zsh)         # in ~/.zshrc
 
-Not by shtab: the smallest installation completes, too, without one more dependency; commands of installed packages have
-parsers of their own; and each shell gets the same function.
+Not by shtab: it completes commands, options and choices, but names of scenarios, robots and keys would need a function
+in each shell's language. Here bash and zsh get the same function, and the smallest installation completes, too.
 """
 
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib import import_module
-from importlib.metadata import entry_points
 
-from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import KINDS
-from snakesim_hal.model.files import list_shipped
-from snakesim_hal.model.plugins import BACKENDS, COMMANDS, CONTROLLERS, list_installed
+from snakesim_hal.model.files import SHIPPED, list_shipped
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, list_installed
 from snakesim_hal.wire import keys
 
 KNOWN: dict[str, Callable[[], list[str]]] = {  # values of arguments, by the argument's name in any command
@@ -26,6 +23,7 @@ KNOWN: dict[str, Callable[[], list[str]]] = {  # values of arguments, by the arg
     "backend": lambda: list_installed(BACKENDS),
     "controller": lambda: list_installed(CONTROLLERS),
     "kind": lambda: sorted({kind for kinds in KINDS.values() for kind in kinds}),
+    "policy": lambda: sorted(path.stem for path in (SHIPPED / "policies").glob("*.onnx")),
     "key": lambda: [row.key for row in keys.SPACE if row.kind in ("stream", "latched")],
 }
 ZSH = "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }; autoload -Uz bashcompinit && bashcompinit"
@@ -54,8 +52,8 @@ complete -o bashdefault -o default -F _snakesim snakesim
 
 
 @dataclass
-class Command:
-    """What can follow a command: its path is empty, ` run`, ` can load` and so on."""
+class Completions:
+    """What can follow a command: its path is empty, ` run`, ` robot arm` and so on."""
 
     path: str
     options: list[str] = field(default_factory=list[str])
@@ -63,8 +61,8 @@ class Command:
     values: dict[str, list[str]] = field(default_factory=dict[str, list[str]])  # of options that take one; [] is any
 
 
-def completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
-    """The lines of a script for the shell."""
+def write_completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
+    """Yield the lines of a script for the shell."""
     commands = list(_walk(parser, ""))
     paths = "|".join(f'"{command.path}"' for command in commands if command.path)
     values: dict[str, list[str]] = {}
@@ -82,11 +80,13 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
     yield from text.replace("@WORDS@", "\n".join(words)).splitlines()
 
 
-def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Command]:
-    """A parser and those below it, and those of installed packages."""
-    here = Command(path)
-    below: list[Command] = []
+def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Completions]:
+    """Yield what can follow a parser, and each parser below it."""
+    here = Completions(path)
+    below: list[Completions] = []
     for action in parser._actions:
+        if action.help == argparse.SUPPRESS and action.option_strings:  # only other processes use it
+            continue
         choices = _choices(action)
         if isinstance(action, argparse._SubParsersAction):
             here.words += choices
@@ -99,25 +99,8 @@ def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Command]:
         else:
             here.options += action.option_strings
             here.values |= dict.fromkeys(action.option_strings, choices)
-    if not path:
-        for name in sorted({*list_installed(COMMANDS)} - {*here.words}):
-            here.words.append(name)
-            below += _of_package(name)
     yield here
     yield from below
-
-
-def _of_package(name: str) -> list[Command]:
-    """A command of an installed package, if it has a `parser` beside its `main`."""
-    entry = next(iter(entry_points(group=COMMANDS, name=name)))
-    try:
-        parser = getattr(import_module(entry.module), "parser", None)
-    except ImportError as error:
-        if entry.extras and isinstance(error, ModuleNotFoundError):  # left out on purpose
-            return [Command(f" {name}")]
-        print_stderr(f"snakesim {name} cannot be completed: {error}")
-        return []
-    return list(_walk(parser(), f" {name}")) if parser is not None else [Command(f" {name}")]
 
 
 def _choices(action: argparse.Action) -> list[str]:

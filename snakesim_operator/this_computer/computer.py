@@ -63,6 +63,7 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     state: Literal["ok", "warn", "fail"]
     detail: str
     fix: list[str] = []  # commands
+    code: str | None = None  # of the error that was found
 
 
 def check_python() -> Iterator[Finding]:

@@ -31,7 +31,7 @@ def _preemption(root: Path) -> Iterator[Finding]:
     if _read(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         yield Finding(what="kernel", state="ok", detail="PREEMPT_RT")
         return
-    detail = "not PREEMPT_RT: a tick may begin milliseconds late; `snakesim top` shows how late (docs/real-time.md)"
+    detail = "not PREEMPT_RT: a tick may begin milliseconds late; `snakesim topic rate` shows it (docs/real-time.md)"
     yield Finding(what="kernel", state="warn", detail=detail, fix=["sudo apt install linux-image-rt-amd64"])
 
 

@@ -52,8 +52,9 @@ def check_routers(where: RobotSelection) -> Iterator[Finding]:
                 duration_s = time.monotonic() - begin_s
                 robots = ", ".join(robots_on(session)) or "no robot"
         except SnakesimError as error:
-            fix = ["snakesim router    # there; and is a firewall between?"]
-            yield Finding(what="endpoint", state="fail", detail=f"{link.endpoint}: {error}", fix=fix)
+            fix = ["snakesim start router    # there; and is a firewall between?"]
+            detail = f"{link.endpoint}: {error}"
+            yield Finding(what="endpoint", state="fail", detail=detail, fix=fix, code=error.code)
             continue
         detail = f"{link.endpoint} answers in {duration_s * 1e3:.0f} ms: {robots}"
         yield Finding(what="endpoint", state="ok", detail=detail)

@@ -1,13 +1,14 @@
-"""`snakesim scenarios` lists the shipped files; `snakesim config` shows every value that a scenario results in."""
+"""`snakesim scenario list` lists the shipped files; `snakesim config` shows every value that a scenario results in."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.files import leaves, list_shipped, read_part
+from snakesim_hal.controller import decode_parameters, require_controller
+from snakesim_hal.model.files import Table, leaves, list_shipped, read_part
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_installed, in_file, plugin_settings
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.programs.preflight import check_plugins
@@ -38,7 +39,7 @@ def print_shipped_files(*, as_json: bool) -> int:
 def show_config(loaded: Loaded, *, as_json: bool) -> int:
     """Print every value of a scenario, and the file or flag that it came from. Raises ConfigError."""
     check_plugins(loaded.config, loaded.table, run_files=False)
-    rows = _find_values(loaded)
+    rows = list_values(loaded)
     if as_json:
         print_json({key: {"value": value, "origin": origin} for key, value, origin in rows})
         return 0
@@ -68,7 +69,7 @@ def _print_unchecked(config: RunConfig) -> None:
             print_line(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
 
 
-def _find_values(loaded: Loaded) -> list[Row]:
+def list_values(loaded: Loaded) -> list[Row]:
     """Return all values of the scenario, with every setting of the chosen controller and backend."""
     config = loaded.config
     table = loaded.table
@@ -76,14 +77,23 @@ def _find_values(loaded: Loaded) -> list[Row]:
     for key, value, origin in loaded.explain():
         if key not in ("controllers", "backends"):
             values[key] = (value, origin)
-    for group, name, section, given in (
-        (CONTROLLERS, config.controller, config.control_section, config.control_settings),
-        (BACKENDS, config.backend, config.backend_section, config.backend_settings),
-    ):
-        plugin = find_installed(group, name)
-        if plugin is None:
-            continue
-        checked = plugin_settings(plugin, given, table.source, section, table.origin)
+    for section, checked in _check_plugin_sections(config, table):
         for key, value in leaves(msgspec.to_builtins(checked), section):
             values[key] = (value, table.origin_of(key))
     return [(key, value, origin) for key, (value, origin) in values.items()]
+
+
+def _check_plugin_sections(config: RunConfig, table: Table) -> Iterator[tuple[str, Any]]:
+    """Yield the dotted key and the checked values of the controller's and the backend's section; files are left out."""
+    plugin = find_installed(CONTROLLERS, config.controller)
+    if plugin is not None:
+        controller = require_controller(plugin, config.controller)
+        section = config.control_section
+        yield (
+            section,
+            decode_parameters(controller, config.controller_parameters, table.source, section, table.origin),
+        )
+    backend = find_installed(BACKENDS, config.backend)
+    if backend is not None:
+        section = config.backend_section
+        yield section, plugin_settings(backend, config.backend_settings, table.source, section, table.origin)

@@ -2,15 +2,16 @@
 
 import json
 from collections.abc import Iterator
-from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.controller import load_controller
 from snakesim_hal.model.files import SCHEMAS
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_plugin, list_installed
+from snakesim_hal.model.json_schema import make_schema
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS, find_plugin, list_installed
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scene import SceneFile
@@ -61,25 +62,32 @@ def contract() -> Iterator[tuple[str, str]]:
     yield "files/scene.json", _schema(SceneFile)
     yield "files/run.json", _schema(RunConfig)
     yield "files/summary.json", _schema(RunSummary)
-    for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control")):
-        for name in list_installed(group):
-            plugin = find_plugin(group, name)
-            if plugin.__module__.startswith("snakesim_"):
-                yield f"files/{section}.{name}.json", _schema(plugin.Settings)
+    for name, struct in _shipped_plugins(FILES):
+        yield f"files/{name}.json", _schema(struct)
+    for group, section in ((BACKENDS, "backends"), (PHYSICS_MODELS, "physics_models")):
+        for name, plugin in _shipped_plugins(group):
+            yield f"files/{section}.{name}.json", _schema(plugin.Settings)
+    for name in list_installed(CONTROLLERS):
+        controller = load_controller(name)
+        if _is_shipped(controller):
+            yield f"files/control.{name}.json", _schema(controller.Parameters)
+
+
+def _shipped_plugins(group: str) -> Iterator[tuple[str, Any]]:
+    """Yield name and object of the plugins of this project."""
+    for name in list_installed(group):
+        plugin = find_plugin(group, name)
+        if _is_shipped(plugin):
+            yield name, plugin
+
+
+def _is_shipped(plugin: Any) -> bool:
+    return plugin.__module__.startswith("snakesim_")
 
 
 def _schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -> str:
-    schema = {"$schema": DIALECT, **(extra or {}), **schema_of(struct)}
+    schema = {"$schema": DIALECT, **(extra or {}), **make_schema(struct)}
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
-
-
-def schema_of(struct: type[msgspec.Struct]) -> dict[str, Any]:
-    """The JSON Schema of a Struct. Docstrings lose their indentation, as Python itself takes it from 3.13 on."""
-    schema = msgspec.json.schema(struct)
-    for part in schema["$defs"].values():
-        if "description" in part:
-            part["description"] = cleandoc(part["description"])
-    return schema
 
 
 def _key_space() -> str:

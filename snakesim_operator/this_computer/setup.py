@@ -1,41 +1,42 @@
-"""Arguments of the commands that need no robot: `snakesim doctor`, `router`, `schemas`, `scenarios`, `config`."""
+"""The commands that need no robot: `snakesim doctor`, `start router`, `scenario`, `config` and `schema`."""
 
 import argparse
 import threading
 from pathlib import Path
-from typing import Any
 
-from snakesim_hal.base.terminal import print_line
-from snakesim_hal.programs.arguments import add_insecure, add_json, add_network, add_scenario, load_scenario
-
-
-def add_files(commands: Any) -> None:
-    """Add those for scenarios and what they name to the parser of `snakesim`."""
-    scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
-    add_json(scenarios)
-    scenarios.set_defaults(act=_scenarios)
-
-    config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
-    add_scenario(config)
-    add_json(config)
-    config.set_defaults(act=_config)
+from snakesim_hal.base.terminal import print_json, print_line
+from snakesim_hal.programs.arguments import (
+    add_insecure,
+    add_json,
+    add_network,
+    add_out,
+    add_scenario,
+    load_scenario,
+)
+from snakesim_hal.programs.commands import Command, Commands, Noun
 
 
-def add_commands(commands: Any) -> None:
-    """Add the others."""
-    doctor = commands.add_parser("doctor", help="check this computer, and print the commands that add what it lacks")
-    add_network(doctor)
-    add_json(doctor)
-    doctor.set_defaults(act=_doctor)
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    add_scenario(parser)
+    parser.add_argument("--explain", metavar="KEY", help="show what one key or table means, and what it may be")
+    add_json(parser)
 
-    router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
-    router.add_argument("config", type=Path, nargs="?", help="JSON5 file (default: the shipped one, for this computer)")
-    add_insecure(router)
-    router.set_defaults(act=_router)
 
-    schemas = commands.add_parser("schemas", help="print where the JSON Schemas, the key space and the DBC file are")
-    schemas.add_argument("--write", type=Path, metavar="FOLDER", help="write schemas and key space, from the code")
-    schemas.set_defaults(act=_schemas)
+def _add_doctor(parser: argparse.ArgumentParser) -> None:
+    add_network(parser)
+    add_json(parser)
+
+
+def _add_router(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "config", type=Path, nargs="?", metavar="FILE", help="JSON5 file (default: the shipped one, for this computer)"
+    )
+    add_insecure(parser)
+
+
+def _add_schema(parser: argparse.ArgumentParser) -> None:
+    add_out(parser, "folder into which to write schemas and key space, from the code")
+    add_json(parser)
 
 
 def _scenarios(arguments: argparse.Namespace) -> int:
@@ -45,6 +46,11 @@ def _scenarios(arguments: argparse.Namespace) -> int:
 
 
 def _config(arguments: argparse.Namespace) -> int:
+    if arguments.explain is not None:
+        from snakesim_operator.this_computer.explain import explain_key
+
+        return explain_key(load_scenario(arguments), arguments.explain, as_json=arguments.json)
+
     from snakesim_operator.this_computer.scenario_files import show_config
 
     return show_config(load_scenario(arguments), as_json=arguments.json)
@@ -68,9 +74,56 @@ def _router(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _schemas(arguments: argparse.Namespace) -> int:
+def _schema(arguments: argparse.Namespace) -> int:
     from snakesim_operator.this_computer.schemas import published, write_schemas
 
-    for path in published() if arguments.write is None else write_schemas(arguments.write):
-        print_line(str(path))
+    paths = [str(path) for path in (published() if arguments.out is None else write_schemas(arguments.out))]
+    if arguments.json:
+        print_json({"files": paths})
+        return 0
+    for path in paths:
+        print_line(path)
     return 0
+
+
+COMMANDS: Commands = (
+    Command(
+        name="doctor",
+        heading="daily work",
+        help="Check this computer, and print the commands that add what is missing.",
+        add=_add_doctor,
+        run=_doctor,
+        examples=("doctor", "doctor --json"),
+    ),
+    Command(
+        name="start router",
+        help="Start a Zenoh router, which connects the processes of robots on several machines.",
+        add=_add_router,
+        run=_router,
+        examples=("start router", "start router lab/hub/router.main.json5"),
+    ),
+    Noun(name="scenario", heading="files and computers", help="List what is shipped to be run."),
+    Command(
+        name="scenario list",
+        help="List the shipped scenarios, robots, scenes and suites.",
+        add=add_json,
+        run=_scenarios,
+        examples=("scenario list", "scenario list --json"),
+    ),
+    Command(
+        name="config",
+        heading="files and computers",
+        help="Show every effective value of a scenario, and the file or option that it came from.",
+        add=_add_config,
+        run=_config,
+        examples=("config triplet", "config peg_row --explain robot.motor.stiffness_nm_per_rad"),
+    ),
+    Command(
+        name="schema",
+        heading="files and computers",
+        help="Print where the JSON Schemas, the key space and the DBC file are.",
+        add=_add_schema,
+        run=_schema,
+        examples=("schema", "schema --out schemas"),
+    ),
+)

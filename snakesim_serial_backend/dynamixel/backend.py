@@ -1,6 +1,6 @@
 """The backend `dynamixel`: checks, and the ports that it opens."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -8,7 +8,7 @@ from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, joint_label, make_body
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
@@ -18,7 +18,7 @@ from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
-from snakesim_serial_backend.dynamixel.servos import Servos
+from snakesim_serial_backend.dynamixel.servos import Servos, ServosContext
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
 from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
 
@@ -28,18 +28,18 @@ GAP_PER_PERIOD = 0.2
 
 
 class DynamixelBackend(DriverTypeBackend):
-    """A `snakesim_hal.backend.Backend` on Dynamixel X servos, real or emulated."""
+    """The backend on Dynamixel X servos, real or emulated."""
 
     Settings = DynamixelSettings
     name = NAME
-    MODES = ("position", "torque")  # servos have no other mode, even if the robot file lists one
+    supported_modes = ("position", "torque")  # servos have no other mode, even if the robot file lists one
 
     @classmethod
-    def ports(cls, settings: DynamixelSettings) -> Sequence[str]:
+    def list_ports(cls, settings: DynamixelSettings) -> Sequence[str]:
         return settings.ports
 
     @classmethod
-    def bus_faults(cls, settings: DynamixelSettings) -> Collection[str]:
+    def list_bus_faults(cls, settings: DynamixelSettings) -> Collection[str]:
         if settings.ports:
             return set()
         return {"cut"}
@@ -50,14 +50,12 @@ class DynamixelBackend(DriverTypeBackend):
         check_load(config.rate_hz / settings.decimation, settings, joints)
 
     @classmethod
-    def buses(
-        cls,
-        config: RunConfig,
-        settings: DynamixelSettings,
-        joints: Mapping[int, Joint],
-        clock: DriverClock,
-        body: EmulatedBody | None,
-    ) -> list[BusSpec]:
+    def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
+        config = context.config
+        settings: DynamixelSettings = context.settings
+        joints = context.joints
+        clock = context.clock
+        body = context.body
         gap_s = max(MIN_GAP_S, GAP_PER_PERIOD * config.period_ns * 1e-9)
         log = _open_log(settings.log)
 
@@ -71,9 +69,16 @@ class DynamixelBackend(DriverTypeBackend):
                 emulator = emulator_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
             port = Port(wire, gap_s)
-            servos = [servo_of(joints[number], port) for number in numbers]
-            answer_s = answer_limit_s(config, settings.decimation)
-            return Servos(servos, port, readings, settings, clock.now_ns, answer_s, emulator)
+            servos_context = ServosContext(
+                servos=[servo_of(joints[number], port) for number in numbers],
+                port=port,
+                readings=readings,
+                settings=settings,
+                emulator=emulator,
+                answer_s=answer_limit_s(config, settings.decimation),
+                clock_ns=clock.now_ns,
+            )
+            return Servos(servos_context)
 
         ports = settings.ports
         if body is not None:
@@ -118,18 +123,21 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}"
+                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}",
+                code="drive/unsupported-setting",
             )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
                 f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when "
                 f"it is off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
-                f"{TURN - 2 * SLACK_RAD:.2f} rad"
+                f"{TURN - 2 * SLACK_RAD:.2f} rad",
+                code="drive/unsupported-setting",
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
                 f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
-                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)"
+                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)",
+                code="drive/unsupported-setting",
             )
 
 
@@ -143,7 +151,8 @@ def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joi
             f"{fullest} servos at {rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
             f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
             f"most {MAX_LOAD:.0%}: use rate_hz = {fits_hz(fullest, settings.baud)}, a higher "
-            f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`"
+            f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`",
+            code="bus/overloaded",
         )
 
 
@@ -180,4 +189,6 @@ def _open_log(path: str) -> TextIO | None:
     try:
         return Path(path).open("w", encoding="utf-8")
     except OSError as error:
-        raise BackendError(f"`backends.dynamixel.log` = {path!r}: {error.strerror}") from error
+        raise BackendError(
+            f"`backends.dynamixel.log` = {path!r}: {error.strerror}", code="file/not-writable"
+        ) from error

@@ -52,7 +52,7 @@ def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -
     if flaws:
         if len(pings) < len(servos):
             flaws += _describe_unknown_servos(servos, port)
-        raise BackendError("the robot is not complete; nothing was enabled:", *flaws)
+        raise BackendError("the robot is not complete; nothing was enabled:", *flaws, code="drive/not-complete")
     for servo in servos:
         _write_registers(servo)
     ids = [servo.id for servo in servos]
@@ -210,7 +210,10 @@ def _write_registers(servo: Servo) -> None:
             reason = f"says error {status.error}"
         else:
             continue
-        raise BackendError(f"{servo.label}: register {address} cannot be set to {value}: it {reason}; nothing enabled")
+        raise BackendError(
+            f"{servo.label}: register {address} cannot be set to {value}: it {reason}; nothing enabled",
+            code="drive/parameter-refused",
+        )
 
 
 def _read_present(servo: Servo) -> Packet:
@@ -222,7 +225,8 @@ def _read_present(servo: Servo) -> Packet:
         raise BackendError(
             f"{servo.label}: woke up at {angle_rad:.2f} rad, which no number of whole turns, or more than one, brings "
             f"into its travel of {servo.lower_rad:.2f} to {servo.upper_rad:.2f} rad; nothing was enabled. Turn it "
-            f"there by hand, or correct `zero_rad`"
+            f"there by hand, or correct `zero_rad`",
+            code="drive/unsupported-setting",
         )
     return status
 
@@ -231,5 +235,5 @@ def _read_registers(servo: Servo, address: int, size: int) -> Packet:
     """Read registers of a servo. Raises BackendError without an answer."""
     status = servo.port.read(servo.id, address, size)
     if status is None:
-        raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled")
+        raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent")
     return status

@@ -1,20 +1,19 @@
-"""`snakesim dynamixels`: the servos of a robot, emulated, as a process at the other end of pseudo terminals."""
+"""What `snakesim drive emulate dynamixel` and `drive load dynamixel` do: servos at the end of pseudo terminals."""
 
 import argparse
 import contextlib
 import select
-import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 import msgspec
 
-from snakesim_drivers.emulation.emulated_body import serve_until_stopped
+from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
-from snakesim_hal.base.terminal import print_line, run_tool
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_hal.programs.preflight import backend_settings
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, emulator_on
@@ -26,37 +25,14 @@ from snakesim_serial_backend.wire import Pty
 TABLE_SERVOS = (1, 4, 8, 13, 18, 24)  # numbers of servos on a port in the load table
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command, and return its exit code: 0 when stopped, 1 for a fault, 2 for wrong input."""
-    arguments = parser().parse_args(argv)
+def emulate(arguments: argparse.Namespace) -> int:
+    """Emulate the servos until a stop signal. Returns 0; raises SnakesimError."""
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    if not arguments.load:
-        return run_tool("snakesim dynamixels", lambda: serve(arguments))
-    for line in table():
-        print_line(line)
-    return 0
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command's arguments."""
-    parser = argparse.ArgumentParser(prog="snakesim dynamixels", description=__doc__)
-    add = parser.add_argument
-    add("scenario", help="name of a shipped scenario, or path of a scenario file")
-    add("--link", action="append", type=Path, metavar="FILE", help="a name for the port (./servos); repeat: more ports")
-    add("--load", action="store_true", help="print bytes, time and rate of a cycle for every baud rate, and end")
-    add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value; may be repeated")
-    add("--pose", metavar="HOST:PORT", help="where to send poses of motion capture (default: nowhere)")
-    add("--parent", type=int, help="process id of the parent; this process dies with it")
-    return parser
-
-
-def serve(arguments: argparse.Namespace) -> int:
-    """Emulate the servos until a stop signal."""
-    overrides = [Override("backend", NAME, "snakesim dynamixels"), *map(parse_set, arguments.set)]
+    overrides = [Override("backend", NAME, "drive emulate dynamixel"), *map(parse_set, arguments.set)]
     loaded = load(arguments.scenario, overrides)
     config = msgspec.structs.replace(loaded.config, clock_mode="realtime")
-    links: list[Path] = arguments.link or [Path("servos")]
+    links = [Path(channel) for channel in arguments.channel or ["servos"]]
     settings: DynamixelSettings = backend_settings(config, DynamixelBackend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
     with named(links) as ptys:
@@ -64,6 +40,27 @@ def serve(arguments: argparse.Namespace) -> int:
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
         ready = f"servos ready: {len(emulator.servos)} on {ends}"
         serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []))
+    return 0
+
+
+def print_load(arguments: argparse.Namespace) -> int:
+    """Print bytes, time and rate of a cycle for every baud rate. Returns 0."""
+    if arguments.json:
+        loads = [
+            {
+                "servos": servos,
+                "baud": baud,
+                "bytes": cycle_bytes(servos),
+                "cycle_s": cycle_s(servos, baud),
+                "max_rate_hz": fits_hz(servos, baud),
+            }
+            for servos in TABLE_SERVOS
+            for baud in RATE
+        ]
+        print_json({"loads": loads})
+        return 0
+    for line in table():
+        print_line(line)
     return 0
 
 
@@ -95,7 +92,7 @@ def _make_link(link: Path, target: str) -> None:
             link.unlink()
         link.symlink_to(target)
     except OSError as error:
-        raise ConfigError(f"--link {link}: {error.strerror}; give another name") from error
+        raise ConfigError(f"--channel {link}: {error.strerror}; give another name", code="file/not-writable") from error
 
 
 def table() -> Iterator[str]:
@@ -115,7 +112,3 @@ def _baud(baud: int) -> str:
     if baud >= 1_000_000:
         return f"{baud / 1e6:g} Mbit/s"
     return f"{baud} bit/s"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,8 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from snakesim_drivers.emulation.emulated_body import DriveEmulator, EmulatedBody
+from snakesim_drivers.emulation.drive_emulator import DriveEmulator
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import (
@@ -77,7 +78,7 @@ class EmulatedServo:
         return self.table[at.TORQUE_ENABLE] == 1
 
 
-class EmulatedDynamixel(DriveEmulator):
+class EmulatedDynamixel(DriveEmulator[Pty]):
     """All servos of a robot, at the other end of their ports."""
 
     def __init__(
@@ -104,7 +105,7 @@ class EmulatedDynamixel(DriveEmulator):
             servo.write_register("H", at.MIN_VOLTAGE, round(joint.limits.min_voltage_v / at.VOLTS))
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
-        self._decoders = [Decoder() for _ in self._ends]
+        self._decoders = [Decoder() for _ in self._bus_ends]
         self._delay_of_second = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
         for i in range(len(self.servos)):
             self.restart(i)
@@ -127,10 +128,10 @@ class EmulatedDynamixel(DriveEmulator):
 
     def __call__(self) -> None:
         """Handle what has arrived, and let time pass up to now."""
-        received = [port.receive() for port in self._ends]  # may wait for the kernel, so it comes before the lock
+        received = [port.receive() for port in self._bus_ends]  # may wait for the kernel, so it comes before the lock
         with self.body.lock:
             self.catch_up()
-            for port, decoder, data in zip(self._ends, self._decoders, received, strict=True):
+            for port, decoder, data in zip(self._bus_ends, self._decoders, received, strict=True):
                 for packet in decoder.feed(data):
                     if packet.instruction != Instruction.STATUS:
                         self._handle_packet(port, packet)
@@ -221,7 +222,7 @@ class EmulatedDynamixel(DriveEmulator):
         servo = self.servos[i]
         error = bytes([refusal | self._alert(i)])
         status = encoded(servo.id, Instruction.STATUS, error + data)
-        if not self.body.is_doubled(i):
+        if not self.body.is_duplicated(i):
             servo.port.send(status)
             return
         if second_data is None:
@@ -250,7 +251,7 @@ class EmulatedDynamixel(DriveEmulator):
         """Return the same registers of a second servo with the id of this one; without one, of the servo itself."""
         address, size = struct.unpack("<HH", registers)
         table = self.servos[i].table[:]
-        if self.body.is_doubled(i):
+        if self.body.is_duplicated(i):
             (counts,) = struct.unpack_from("<i", table, at.PRESENT_POSITION)
             struct.pack_into("<i", table, at.PRESENT_POSITION, counts + SECOND_SERVO_COUNTS)
         return bytes(table[address : address + size])
@@ -282,7 +283,7 @@ class EmulatedDynamixel(DriveEmulator):
         if refusal:
             return refusal
         servo.table = table
-        if address <= at.DELAY < end and self.body.is_doubled(i):
+        if address <= at.DELAY < end and self.body.is_duplicated(i):
             self._delay_of_second[i] = table[at.DELAY]
         if address <= at.WATCHDOG < end and table[at.WATCHDOG] == 0:
             servo.held_counts = None

@@ -12,11 +12,12 @@ its travel.
 import struct
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from snakesim_drivers.emulation.emulated_body import FAULTS
+from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
@@ -34,39 +35,33 @@ MAX_BAD_ANSWERS = 2  # in a row, doubled or garbled, until that is a fault: befo
 BUS_CUT = "nothing gets through; check the adapter, its cable and its power"
 
 
-class Servos:
+@dataclass(frozen=True)
+class ServosContext:
+    """What the driver type gets to operate the servos of one port."""
+
+    servos: Sequence[Servo]  # of this port, from tail to head
+    port: Port  # sends and receives packets
+    readings: DriveReadings
+    settings: DynamixelSettings
+    emulator: EmulatedDynamixel | None  # the servos, if they are emulated in this process
+    answer_s: float  # time that a reading waits for answers
+    clock_ns: Callable[[], int]
+
+
+class Servos(Drives):
     """All servos of a port, tail to head."""
 
-    def __init__(
-        self,
-        servos: Sequence[Servo],
-        port: Port,
-        readings: DriveReadings,
-        settings: DynamixelSettings,
-        clock_ns: Callable[[], int],
-        answer_s: float,
-        emulator: EmulatedDynamixel | None,
-    ) -> None:
-        """Take over the servos of a port that is open.
-
-        Args:
-            servos: the servos of this port, tail to head.
-            port: sends and receives packets.
-            readings: gets what the servos measure.
-            settings: the scenario's section of this driver type.
-            clock_ns: the time of the driver.
-            answer_s: how long a tick waits for answers.
-            emulator: the servos, if they are emulated in this process.
-        """
-        self._emulator = emulator
-        self.servos = list(servos)
-        self.emulated = is_emulated(port.wire.port)
-        self._port = port
-        self._readings = readings
-        self._settings = settings
-        self._clock_ns = clock_ns
-        self._answer_s = answer_s
-        self._watchdog = bytes([round(settings.watchdog_s / at.WATCHDOG_S)])
+    def __init__(self, context: ServosContext) -> None:
+        """Take over the servos of a port that is open; nothing is sent."""
+        self._emulator = context.emulator
+        self.servos = list(context.servos)
+        self.emulated = is_emulated(context.port.wire.port)
+        self._port = context.port
+        self._readings = context.readings
+        self._settings = context.settings
+        self._clock_ns = context.clock_ns
+        self._answer_s = context.answer_s
+        self._watchdog = bytes([round(context.settings.watchdog_s / at.WATCHDOG_S)])
         self._silent: set[int] = set()  # read one by one, as they would silence others in a sync read
         self._cycle = 0
         self._read_deadline_s = 0.0
@@ -193,25 +188,19 @@ class Servos:
 
     # --- commands ---------------------------------------------------------------------------------------------
 
-    def command(
-        self,
-        following: frozenset[int],
-        modes: list[Mode],
-        targets: Floats,
-        limits_nm: Floats,
-        *,
-        may_enable: bool,
-        emergency: bool,
-    ) -> None:
-        """Send setpoints, and switch torque on and off as `Drives.command` declares.
+    def send_setpoints(self, command: BusCommand) -> None:
+        """Send setpoints, and switch torque on and off as `Drives.send_setpoints` declares.
 
         An emergency stop switches the torque off, too: servos have no other stop.
         """
-        everybody = range(len(self.servos))
-        if not may_enable:
-            following &= {i for i in everybody if self.servos[i].follows}
-        to_disable = [i for i in everybody if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
-        to_enable = [i for i in everybody if i in following and not self.servos[i].follows]
+        all_servos = range(len(self.servos))
+        following = command.following
+        if not command.may_enable:
+            following &= {i for i in all_servos if self.servos[i].follows}
+        to_disable = [
+            i for i in all_servos if i not in following and (self.servos[i].follows or self.servos[i].enabled)
+        ]
+        to_enable = [i for i in all_servos if i in following and not self.servos[i].follows]
 
         # A servo gets its gains, its watchdog and its goal before its torque is switched on.
         self._write_same(at.TORQUE_ENABLE, to_disable, b"\0")
@@ -220,8 +209,11 @@ class Servos:
         self._write_same(at.WATCHDOG, to_enable, b"\0")  # 0 clears a watchdog that has expired
         self._write_same(at.WATCHDOG, to_enable, self._watchdog)
         goals = [
-            (self.servos[i].id, self._goal_registers(i, modes[i], targets[i], limits_nm[i]))
-            for i in everybody
+            (
+                self.servos[i].id,
+                self._goal_registers(i, command.modes[i], command.targets[i], command.limits_nm[i]),
+            )
+            for i in all_servos
             if i in following
         ]
         self._port.write_all(at.GOALS, goals)

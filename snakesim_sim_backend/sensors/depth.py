@@ -3,23 +3,24 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.rays import Rays
-from snakesim_sim_backend.sensors.scope import Floats, NoSettings, Scope
+from snakesim_sim_backend.sensors.scope import Floats, Scope
 
 SCALE_M = 0.001  # of one count
 MAX_COUNT = 2**16 - 1
 
 
-class RayCamera:
+class RayCamera(SensorModel):
     """Distances along the optical axis."""
 
-    Settings = NoSettings
     message = DepthImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, _settings: NoSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: Scope, settings: NoSettings) -> None:
+        del settings
         self._camera = camera
         self._noise = scope.noise
         self._mount = Mount(camera, scope)

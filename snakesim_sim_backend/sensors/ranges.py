@@ -2,20 +2,21 @@
 
 import numpy as np
 
+from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import RangeSensor
 from snakesim_hal.wire.messages import Ranges
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.rays import Rays
-from snakesim_sim_backend.sensors.scope import NoSettings, Scope
+from snakesim_sim_backend.sensors.scope import Scope
 
 
-class RayBeams:
+class RayBeams(SensorModel):
     """Distances along beams without width, all measured at once."""
 
-    Settings = NoSettings
     message = Ranges
 
-    def __init__(self, sensor: RangeSensor, scope: Scope, _settings: NoSettings) -> None:
+    def __init__(self, sensor: RangeSensor, scope: Scope, settings: NoSettings) -> None:
+        del settings
         self._sensor = sensor
         self._noise = scope.noise
         self._mount = Mount(sensor, scope)

@@ -1,4 +1,4 @@
-"""Replays depth images from a file, whose lines are as `snakesim echo sensor/depth/head > head.jsonl` prints them."""
+"""Replays depth images from a file, made by `snakesim topic echo sensor/depth/head > head.jsonl`."""
 
 import bisect
 from itertools import pairwise
@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, expand_home
+from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.scope import Scope
@@ -22,13 +23,14 @@ class Line(msgspec.Struct, frozen=True):
     message: DepthImage
 
 
-class RecordedDepth:
+class RecordedDepth(SensorModel):
     """Plays a recording by the robot's time, and begins again at its end."""
 
     class Settings(FileStruct, frozen=True):
         """The recording."""
 
         file: Annotated[str, Meta(min_length=1)]
+        """File of the recording, with lines as `snakesim topic echo sensor/depth/NAME` prints them."""
 
     message = DepthImage
 
@@ -60,16 +62,21 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise ConfigError(f"{file}: {size} bytes, at most {MAX_BYTES}; record for a shorter time")
+            raise ConfigError(
+                f"{file}: {size} bytes, at most {MAX_BYTES}; record for a shorter time", code="file/too-large"
+            )
         images = [decoder.decode(line).message for line in path.read_bytes().splitlines()]
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
             f"the recording of camera {camera.name!r}, {file}, cannot be read: {error}; "
-            f"make one with `snakesim echo sensor/depth/{camera.name} > {file}`"
+            f"make one with `snakesim topic echo sensor/depth/{camera.name} > {file}`",
+            code="recording/not-readable",
         ) from error
     flaw = _find_flaw(images)
     if flaw is not None:
-        raise ConfigError(f"the recording of camera {camera.name!r}, {file}, cannot be used: {flaw}")
+        raise ConfigError(
+            f"the recording of camera {camera.name!r}, {file}, cannot be used: {flaw}", code="recording/not-readable"
+        )
     return images
 
 

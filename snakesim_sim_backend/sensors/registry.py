@@ -8,14 +8,16 @@ from collections.abc import Callable
 from typing import Any
 from zlib import crc32
 
+import msgspec
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings, require_base_class
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.sensors import AnyMounted
+from snakesim_hal.model.sensor_model import SensorModel
+from snakesim_hal.model.sensors import AnyMounted, BodySensor, ContactSensor, ImuSensor, PoseSensor, PowerSensor
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColorImage, Contacts, Imu, Message, OwnSample, Pose, Power
+from snakesim_hal.wire.messages import ColorImage, Message, OwnSample
 from snakesim_sim_backend.sensors.contacts import ContactReader
 from snakesim_sim_backend.sensors.depth import RayCamera
 from snakesim_sim_backend.sensors.imu import ImuReader
@@ -27,37 +29,31 @@ from snakesim_sim_backend.sensors.rendered import RenderedColor, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
 # Sensors that look around: the model's name in the robot file -> its classes, each with a message of its own.
-MODELS = {
+MODELS: dict[str, tuple[type[SensorModel], ...]] = {
     "rays": (RayCamera, RayBeams),
     "rendered": (RenderedDepth,),
     "recorded": (RecordedDepth,),
 }
 
 
-def _contact_reader(sensor: Any, scope: BodyScope) -> Reader:
-    return ContactReader(scope.sim, scope.data, sensor, scope.noise.standard_normal, scope.physics)
+def make_body_reader(sensor: BodySensor, scope: BodyScope) -> Reader:
+    """Make the reader of a sensor of the body.
 
-
-def _imu_reader(sensor: Any, scope: BodyScope) -> Reader:
-    links = scope.config.robot.chain.modules + 1
-    return ImuReader(scope.data, sensor, links, scope.noise.standard_normal)
-
-
-def _pose_reader(sensor: Any, scope: BodyScope) -> Reader:
-    return PoseReader(scope.data, sensor, scope.noise.standard_normal)
-
-
-def _power_reader(_sensor: Any, scope: BodyScope) -> Reader:
-    return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
-
-
-# Sensors of the body: message -> function that makes the reader.
-SYNCHRONOUS: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
-    Contacts: _contact_reader,
-    Imu: _imu_reader,
-    Pose: _pose_reader,
-    Power: _power_reader,
-}
+    Args:
+        sensor: The entry of the robot file.
+        scope: What the reader may use.
+    """
+    draw_normal = scope.noise.standard_normal
+    match sensor:
+        case ContactSensor():
+            return ContactReader(scope.sim, scope.data, sensor, draw_normal, scope.physics)
+        case ImuSensor():
+            link_count = scope.config.robot.chain.modules + 1
+            return ImuReader(scope.data, sensor, link_count, draw_normal)
+        case PoseSensor():
+            return PoseReader(scope.data, sensor, draw_normal)
+        case PowerSensor():
+            return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
 
 
 def own_noise(key: str, seed: int) -> np.random.Generator:
@@ -81,29 +77,37 @@ def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
     Raises:
         ConfigError: its model is unknown, makes another message, or has wrong settings.
     """
-    model, settings = _find_model(key, sensor, find_plugin)
+    found = _find_model(key, sensor, find_plugin)
+    assert found is not None
+    model, settings = found
     return model(sensor, scope, settings)
 
 
-def _find_model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, Any]:
-    """Return a sensor's class and its checked settings; None for both if `find` does not know the model."""
+def _find_model(
+    key: str, sensor: AnyMounted, find: Callable[[str, str], Any]
+) -> tuple[type[SensorModel], msgspec.Struct] | None:
+    """Return a sensor's class and its checked settings; None if `find` does not load the model."""
     message = keys.find_message(key)
     if message is ColorImage:
         return RenderedColor, RenderedColor.Settings()
     assert message is not None
-    model = _find_shipped_model(message, sensor.model) or find(SENSORS, sensor.model)
+    model = _find_shipped_model(message, sensor.model)
     if model is None:
-        return None, None
+        model = find(SENSORS, sensor.model)
+        if model is None:
+            return None
+        require_base_class(model, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
     # A sensor with a message of its own has a schema, which is checked instead.
-    if message is not OwnSample and getattr(model, "message", None) is not message:
+    if message is not OwnSample and model.message is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
-            f"carries; its class says in `message` what it makes"
+            f"carries; its class says in `message` what it makes",
+            code="plugin/not-loadable",
         )
     return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
 
 
-def _find_shipped_model(message: type[Message], name: str) -> Any:
+def _find_shipped_model(message: type[Message], name: str) -> type[SensorModel] | None:
     """Return the class of this package that makes a message by the model of this name; None without one."""
     for model in MODELS.get(name, ()):
         if model.message is message:

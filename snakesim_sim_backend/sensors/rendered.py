@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_sim_backend.ground import PLANE_GROUP
 from snakesim_sim_backend.sensors.depth import depth_image
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.rays import SEEN
-from snakesim_sim_backend.sensors.scope import NoSettings, Scope
+from snakesim_sim_backend.sensors.scope import Scope
 
 PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}  # of Debian
 NEAR_M = 0.01  # distances between which things are drawn
@@ -24,13 +25,13 @@ SAMPLES_PER_PIXEL = 4  # of a smooth picture
 SPARE_GEOMS = 50  # lights and the like
 
 
-class RenderedDepth:
+class RenderedDepth(SensorModel):
     """Depth from the renderer's buffer, with its resolution."""
 
-    Settings = NoSettings
     message = DepthImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, _settings: NoSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: Scope, settings: NoSettings) -> None:
+        del settings
         self._camera = camera
         self._noise = scope.noise
         self._renderer = CameraRenderer(camera, scope, smooth=False)
@@ -42,13 +43,13 @@ class RenderedDepth:
         return depth_image(self._camera, self._renderer.mount, tick, timestamp_ns, flat_depth_m, self._noise)
 
 
-class RenderedColor:
+class RenderedColor(SensorModel):
     """A color image, without noise, dropouts and range."""
 
-    Settings = NoSettings
     message = ColorImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, _settings: NoSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: Scope, settings: NoSettings) -> None:
+        del settings
         self._camera = camera
         self._renderer = CameraRenderer(camera, scope, smooth=True)
 
@@ -164,5 +165,6 @@ def opened_context(width: int, height: int, what: str) -> Any:
         raise ConfigError(
             f"{what} is rendered, which needs OpenGL by {kind.upper()}, and that does not work here: "
             f"{type(error).__name__}: {error}. Install the Debian packages {PACKAGES[kind]} and libgl1-mesa-dri; or "
-            f'leave out `color` and take `model = "rays"`, which need no OpenGL'
+            f'leave out `color` and take `model = "rays"`, which need no OpenGL',
+            code="simulator/no-opengl",
         ) from error

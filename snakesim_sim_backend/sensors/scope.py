@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Message
@@ -44,7 +43,3 @@ class Reader(Protocol):
     def read(self, tick: int, timestamp_ns: int) -> Message:
         """Return the sample of this tick; rate and delay are applied by the caller."""
         ...
-
-
-class NoSettings(FileStruct, frozen=True):
-    """The settings of a sensor model that has none."""

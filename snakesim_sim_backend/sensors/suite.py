@@ -11,13 +11,12 @@ from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import AnyMounted, AnySensor, Mounted
 from snakesim_hal.physics.thermal import Thermal
-from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.joints import JointReader
-from snakesim_sim_backend.sensors.registry import SYNCHRONOUS, mounted_reader, own_noise
+from snakesim_sim_backend.sensors.registry import make_body_reader, mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
 from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, round_to_ticks
@@ -60,9 +59,7 @@ class Sensors:
             if isinstance(sensor, Mounted):
                 channel = self._make_threaded(key, sensor, scope)
             else:
-                message = keys.find_message(key)
-                assert message is not None, key
-                channel = SynchronousSensor(SYNCHRONOUS[message](sensor, scope), sensor, config)
+                channel = SynchronousSensor(make_body_reader(sensor, scope), sensor, config)
             self._channels.append((key, channel))
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:

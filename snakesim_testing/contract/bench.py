@@ -7,10 +7,9 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_hal.backend import Backend, BackendFactory
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
-from snakesim_hal.model.scenario import Override, RunConfig, Service, load, parse_set
-from snakesim_hal.programs.preflight import backend_settings, with_backend_modes
+from snakesim_hal.backend import Backend
+from snakesim_hal.model.scenario import Override, RunConfig, ServiceSchedule, load, parse_set
+from snakesim_hal.programs.preflight import backend_settings, find_backend, with_backend_modes
 from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.contract.loopback import Hosted
 from snakesim_testing.contract.rig import HOLDER, Rig
@@ -43,7 +42,7 @@ class Bench:
     def __init__(
         self,
         name: str,
-        backend: str | BackendFactory,
+        backend: str | type[Backend],
         *,
         scenario: str = SCENARIO,
         sets: tuple[str, ...] = (),
@@ -77,10 +76,10 @@ class Bench:
     # --- what it is ----------------------------------------------------------------------------------------
 
     @cached_property
-    def factory(self) -> BackendFactory:
-        """The backend's factory. Raises ConfigError when there is no such backend."""
+    def backend_type(self) -> type[Backend]:
+        """The backend's class. Raises ConfigError when there is no such backend."""
         if isinstance(self._backend, str):
-            return find_plugin(BACKENDS, self._backend)
+            return find_backend(self._backend)
         return self._backend
 
     @cached_property
@@ -88,12 +87,12 @@ class Bench:
         """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
         overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
-        config = with_backend_modes(load(self._scenario, overrides).config, self.factory)
+        config = with_backend_modes(load(self._scenario, overrides).config, self.backend_type)
         # The tests' own controller is the only service.
-        clock_modes = self.factory.check(config, backend_settings(config, self.factory))
+        clock_modes = self.backend_type.check(config, backend_settings(config, self.backend_type))
         # Lockstep is preferred: it is quick, and the same on every machine.
         clock_mode = "lockstep" if "lockstep" in clock_modes else "realtime"
-        return msgspec.structs.replace(config, clock_mode=clock_mode, services={HOLDER: Service()})
+        return msgspec.structs.replace(config, clock_mode=clock_mode, services={HOLDER: ServiceSchedule()})
 
     @property
     def clock_mode(self) -> ClockMode:
@@ -106,7 +105,7 @@ class Bench:
         """Open the backend, and return it. The one that is open is closed first."""
         self.close()
         self.was_opened = True
-        return self.factory(self.config, backend_settings(self.config, self.factory))
+        return self.backend_type(self.config, backend_settings(self.config, self.backend_type))
 
     def open_rig(self) -> Rig:
         """Open the backend, and return a rig with it."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from snakesim_hal.backend import Backend, Samples
+from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
@@ -19,6 +19,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
+    Description,
     Fault,
     JointCommand,
     JointState,
@@ -46,25 +47,32 @@ def wait_until(happened: Callable[[], Any], what: str) -> None:
         time.sleep(0.002)
 
 
-class RecordingBackend:
+class RecordingBackend(Backend):
     """Forwards all calls to a backend, records the joint states, and can report a planted fault."""
 
     def __init__(self, inner: Backend) -> None:
         self._inner = inner
-        self.describe = inner.describe
-        self.enact = inner.enact
-        self.advance = inner.advance
-        self.close = inner.close
         self.joint_states: list[JointState] = []
-        self.planted_fault: Callable[[int], Fault | None] | None = (
-            None  # tick -> a fault to report besides the backend's own
-        )
+        # For each tick, a fault to report besides those of the backend.
+        self.planted_fault: Callable[[int], Fault | None] | None = None
+
+    def describe(self) -> Description:
+        return self._inner.describe()
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Sample the backend, and record the joint states."""
         samples = self._inner.sample(tick, timestamp_ns)
         self.joint_states.append(samples.joints)
         return samples
+
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
+        self._inner.enact(setpoints, lifecycle)
+
+    def advance(self) -> None:
+        self._inner.advance()
+
+    def close(self) -> None:
+        self._inner.close()
 
     def faults(self) -> list[Fault]:
         """Return the faults of the backend, and the planted one."""
@@ -185,7 +193,7 @@ class Hosted:
         if self.host.authority.state == "armed":
             self.lifecycle("disarm")
         elif self.host.authority.state != "disarmed":
-            self.lifecycle("clear")
+            self.lifecycle("reset")
         self.controller.plan = plan
         deadline = time.monotonic() + LIMIT_S
         while not (answer := self.lifecycle("arm")).ok and time.monotonic() < deadline:

@@ -279,11 +279,11 @@ class Rig:
 
     def reset(self) -> None:
         """Reset a stop, and end isolations."""
-        self.authority.on_lifecycle(LifecycleRequest(action="clear"), self._now_ns)
+        self.authority.on_lifecycle(LifecycleRequest(action="reset"), self._now_ns)
 
     def estop(self) -> None:
         """Trigger an emergency stop."""
-        self.authority.on_estop(EstopRequest(who="bench"), self.tick)
+        self.authority.on_estop(EstopRequest(requester="bench"), self.tick)
 
     def fault(self) -> None:
         """Report a fault to the authority which the backend has not reported."""

@@ -16,13 +16,13 @@ def do_nothing(_rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("then", [do_nothing, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
-def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an_arming(
+def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an_arming(
     rig: Rig, drives: EmulatedDrives, then: Callable[[Rig], None]
 ) -> None:
     """A host that does nothing for 1 s while a joint moves: every drive stops by its own watchdog.
 
     Once the host goes on, the backend reports each of those stops as a fault of its joint, whatever the operator asks
-    for first. No drive is enabled again before the fault is cleared and the robot armed.
+    for first. No drive is enabled again before the fault is reset and the robot armed.
     """
     rig.cruise()
     rig.spoiled = True
@@ -39,10 +39,10 @@ def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_clear_and_an
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
     assert_drives_stay_off(rig, drives, t.ARMING_PERIODS)
-    cleared = rig.tick
+    reset_tick = rig.tick
     rig.cruise()
-    assert all(drives.enabled()), f"cleared and armed, and enabled are {drives.enabled()}"
-    assert not rig.record_since(cleared).faults, rig.record_since(cleared).faults
+    assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
+    assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
 
 
 def assert_drives_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:

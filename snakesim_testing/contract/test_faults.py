@@ -22,7 +22,7 @@ def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
 
 
 def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> None:
-    """While it is in `isolated`, a joint has no torque, whatever is commanded; a clear ends that."""
+    """While it is in `isolated`, a joint has no torque, whatever is commanded; a reset ends that."""
     with rig.with_isolation_allowed():
         began = rig.tick
         rig.cruise()
@@ -41,7 +41,7 @@ def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> N
         rig.arm()
         record = rig.drive({LOST: asked[LOST]}, rig.count_periods(t.SETTLE_S))
         away = record.angle_rad[-1, LOST] - asked[LOST][1]
-        assert abs(away) < t.REACHED_RAD, f"after the clear it stops {away:.3f} rad from its target"
+        assert abs(away) < t.REACHED_RAD, f"after the reset it stops {away:.3f} rad from its target"
         assert not rig.record_since(began).faults, rig.record_since(began).faults
 
 

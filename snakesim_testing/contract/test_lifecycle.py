@@ -68,7 +68,7 @@ def test_disarmed_joints_have_no_torque(rig: Rig) -> None:
 
 
 def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
-    """Stopped on its way, cleared and armed again: no joint resumes an earlier setpoint."""
+    """Stopped on its way, reset and armed again: no joint resumes an earlier setpoint."""
     rig.cruise()
     rig.estop()
     rig.idle(rig.count_periods(t.SETTLE_S))
@@ -82,8 +82,8 @@ def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
     assert np.abs(np.diff(record.torque_nm, axis=0)).max() < t.BUMP_SHARE * rig.full_torque_nm[0]
 
 
-def test_after_clear_and_arm_it_moves_again(rig: Rig) -> None:
-    """After a stop, cleared and armed, the robot works as before."""
+def test_after_reset_and_arm_it_moves_again(rig: Rig) -> None:
+    """After a stop, reset and armed, the robot works as before."""
     rig.cruise()
     rig.fault()
     rig.idle(rig.count_periods(t.SETTLE_S))

@@ -13,7 +13,6 @@ LAPSE_PERIODS = 3  # without commands, when setpoints have to hold; less than a 
 SENSOR_PERIODS = 3  # a sensor with its own rate may start late by this much, besides its delay and one interval
 HELD_PERIODS = 5  # how long setpoints have to hold without being handed over again: a lease
 CLOSING_PERIODS = 5  # for how long a closed backend is observed
-ATTEMPTS = 3  # with host and controller in real time in one process, a busy machine may miss a lease of 100 ms
 
 # --- mechanics, in seconds -------------------------------------------------------------------------------------
 

@@ -8,10 +8,11 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import Frame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
+from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily, DrivesOfModules
 from snakesim_testing.contract.bench import Bench
-from tests.contract.drives import DrivesOfAnyFamily, DrivesOfModules
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
 IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs the other clauses, too
@@ -23,6 +24,7 @@ IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs
     "a_closed_backend",
 )
 WHISKER = Path(__file__).parents[2] / "examples" / "whisker.py"
+MINIMAL_DRIVER = Path(__file__).parents[2] / "examples" / "minimal_driver.py"
 OF_SENSORS = ("sensor", "sample", "contradicts_itself", "listed")  # clauses that a camera may concern
 LOOKS_AHEAD = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
@@ -30,7 +32,8 @@ LOOKS_AHEAD = (
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
-WITHOUT_THE_DRIVER = "test_drives_"  # moteus does it otherwise; for buses in threads see tests/unit/hal/drivers
+# moteus does it otherwise; for buses in threads see tests/system/drives/test_buses.py
+WITHOUT_THE_DRIVER = "test_drives_"
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 HEAD_OF_SERVOS = (
     'robot.drive.driver="odrive"',
@@ -61,7 +64,7 @@ IN_REAL_TIME: Any = InRealTime
 @pytest.hookimpl(optionalhook=True)
 def pytest_snakesim_benches() -> list[Bench]:
     """Simulator, also with a camera; CAN on a bus inside the process, or on the kernel's with modules as processes."""
-    if os.environ.get(VCAN):  # `make test-vcan`
+    if os.environ.get(VCAN):  # `make test-can`
         return [Bench("can-vcan", "can", sets=ON_VCAN, mute=cut_off)]
     return [
         Bench("sim", "sim"),
@@ -71,13 +74,14 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("odrive", "odrive", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_emulated_drive),
         Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("threads", IN_REAL_TIME, sets=ALL_FAMILIES, mute=cut_drive_off, drives=DrivesOfAnyFamily),
     ]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make test-all`."""
+    """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make verify`."""
     for item in items:
         is_special = WITHOUT_THE_DRIVER in item.name and "[moteus" in item.name
         if any(f"[{bench}" in item.name for bench in AS_ANOTHER) and not is_special:
@@ -100,6 +104,11 @@ def cut_off(backend: Any, joint: int) -> None:
             process_frame(frame)
 
     backend.modules.reading.process_frame = receive
+
+
+def mute_emulated_drive(backend: Any, joint: int) -> None:
+    """Let an emulated drive send nothing from now on."""
+    assert backend.inject(parse_injection(f"mute:joint_{joint + 1}@0"), begins=True)
 
 
 def cut_drive_off(backend: Any, joint: int) -> None:

@@ -4,7 +4,7 @@
 `contacts`    where the path passes obstacles, and which of these places the body covers
 `selection`   the choice of three contacts and a joint
 `stall`       detects that the body stands still, and explains why
-`settings`    the controller's parameters
+`parameters`  the controller's parameters
 `telemetry`   what it reports
 `controller`  combines these; the entry point `obstacle_triplet`
 
@@ -12,7 +12,7 @@ It shares localization on the path and bumpless mode changes with other controll
 """
 
 from snakesim_gnc.control.obstacle_triplet.controller import ObstacleTriplet
-from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
+from snakesim_gnc.control.obstacle_triplet.parameters import TripletParameters
 from snakesim_gnc.control.obstacle_triplet.statics import TripletSolution, compute_bending_torque_nm, solve_triplet
 
-__all__ = ["ObstacleTriplet", "TripletSettings", "TripletSolution", "compute_bending_torque_nm", "solve_triplet"]
+__all__ = ["ObstacleTriplet", "TripletParameters", "TripletSolution", "compute_bending_torque_nm", "solve_triplet"]

@@ -26,16 +26,16 @@ import numpy as np
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.climb import Climb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
-from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, find_push_points, plan_contact
+from snakesim_gnc.control.obstacle_triplet.parameters import TripletParameters
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose_triplet
-from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
 from snakesim_gnc.control.obstacle_triplet.telemetry import compute_bending_nm, make_contact_messages
 from snakesim_gnc.control.progress import Located, PathProgress
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
@@ -56,23 +56,22 @@ class PropulsionDemand:
     swung: bool  # the joint is so far from its reference that the force is reduced
 
 
-class ObstacleTriplet:
+class ObstacleTriplet(Controller[TripletParameters]):
     """Obstacle-aided locomotion with three contacts and one propulsion joint.
 
     Source: section IV of the SnakeSIM paper, with the correction that `statics` describes.
     """
 
-    MODES = (Mode.POSITION, Mode.TORQUE)
-    MEASURES = ("torque",)
-    Settings = TripletSettings
+    Parameters = TripletParameters
+    required_modes = (Mode.POSITION, Mode.TORQUE)
+    required_measurements = ("torque",)
 
-    def __init__(self, robot: Description, settings: TripletSettings) -> None:
-        self._robot = robot
-        self._set = settings
+    def __init__(self, robot: Description, parameters: TripletParameters) -> None:
+        super().__init__(robot, parameters)
         # Models and estimators.
         self._body = PlanarBody(robot)
         self._climb = Climb(robot)
-        self._progress = PathProgress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._progress = PathProgress(self._body, speed_filter_s=parameters.speed_filter_s)
         self._contacts = MeasuredContacts()
         # Joints in position mode.
         self._hand_over = HandOver(robot)
@@ -84,9 +83,9 @@ class ObstacleTriplet:
         self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}  # by the obstacle's name
         self._points: list[PushPoint] = []
         self._triplets = Triplets(
-            condition_max=settings.condition_max,
-            authority_min=settings.authority_min,
-            hold_on_m=settings.hold_on_m,
+            condition_max=parameters.condition_max,
+            authority_min=parameters.authority_min,
+            hold_on_m=parameters.hold_on_m,
         )
         self._choice: Choice | None = None
         self._refused: list[str] = []  # why triplets cannot be used
@@ -95,47 +94,52 @@ class ObstacleTriplet:
         self._force_n = 0.0
         # Supervision.
         self._stall_watch = StallWatch(
-            stall_m=settings.stall_m, stall_s=settings.stall_s, propulsion_n=settings.propulsion_n
+            stall_m=parameters.stall_m, stall_s=parameters.stall_s, propulsion_n=parameters.propulsion_n
         )
         self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
         self._banned: dict[Names, float] = {}  # triplet -> arc length at which it stood still
         self._barred: tuple[int, float] | None = None  # joint among those that bend, time until which
         self._position_until_s = 0.0
 
-    def update(self, view: View) -> Action:
+    def update(self, observation: Observation) -> ControllerCommand:
         """Return the setpoints for the next period."""
-        located = self._progress.update(view)
+        located = self._progress.update(observation)
         if isinstance(located, str):
-            return self._wait(view, located)
+            return self._wait(observation, located)
         self._contacts.add_world(located.world)
-        body_pose = self._follow_path(view, located)
+        body_pose = self._follow_path(observation, located)
         last_choice = self._choice
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_watch.forget()
         if located.fresh or located.restarted:
             self._update_push_points(located, body_pose)
-            self._update_choice(view, located, body_pose)
-        self._release_swung_joint(view, body_pose)
-        reference = self._reference + self._compensate_load(view, body_pose)
-        self._hand_over_propulsion(view, located, reference, last_choice)
-        return self._command(view, located, body_pose, reference)
+            self._update_choice(observation, located, body_pose)
+        self._release_swung_joint(observation, body_pose)
+        reference = self._reference + self._compensate_load(observation, body_pose)
+        self._hand_over_propulsion(observation, located, reference, last_choice)
+        return self._command(observation, located, body_pose, reference)
 
     def _hand_over_propulsion(
-        self, view: View, located: Located, reference: Floats, last_choice: Choice | None
+        self, observation: Observation, located: Located, reference: Floats, last_choice: Choice | None
     ) -> None:
         """Pass the propulsion to the joint of the present choice, and fade by time and by travel."""
-        config = self._set
+        parameters = self.parameters
         choice = self._choice
         joint = None
         is_other_triplet = False
         if choice is not None:
             joint = self._body.bends[choice.joint]
             is_other_triplet = last_choice is not None and choice.triplet.names != last_choice.triplet.names
-        self._hand_over.pass_to(joint, view.joints, reference, anew=is_other_triplet)
-        self._hand_over.fade(view.period_s / config.blend_s + abs(located.speed_m_s) * view.period_s / config.blend_m)
+        self._hand_over.pass_to(joint, observation.joints, reference, anew=is_other_triplet)
+        self._hand_over.fade(
+            observation.period_s / parameters.blend_s
+            + abs(located.speed_m_s) * observation.period_s / parameters.blend_m
+        )
 
-    def _command(self, view: View, located: Located, body_pose: BodyPose, reference: Floats) -> Action:
+    def _command(
+        self, observation: Observation, located: Located, body_pose: BodyPose, reference: Floats
+    ) -> ControllerCommand:
         """Command all joints to the reference, and the propulsion joint, if there is one, to its torque."""
         targets: list[float] = self._hand_over.positions_rad(reference).tolist()
         modes = [Mode.POSITION] * len(targets)
@@ -144,59 +148,59 @@ class ObstacleTriplet:
         if choice is None:
             self._asked_n = 0.0
             self._force_n = 0.0
-            return Action(setpoints, self._report_rest(located))
-        demand = self._compute_propulsion(view, located, choice)
+            return ControllerCommand(setpoints, self._report_rest(located))
+        demand = self._compute_propulsion(observation, located, choice)
         self._force_n = demand.force_n
         modes[demand.joint] = Mode.TORQUE
         targets[demand.joint] = demand.torque_nm
-        self._watch_stall(view, located, choice, demand)
-        return Action(setpoints, self._report_push(located, body_pose, choice, demand))
+        self._watch_stall(observation, located, choice, demand)
+        return ControllerCommand(setpoints, self._report_push(located, body_pose, choice, demand))
 
     # --- control law ---------------------------------------------------------------------------------------------
 
-    def _follow_path(self, view: View, located: Located) -> BodyPose:
+    def _follow_path(self, observation: Observation, located: Located) -> BodyPose:
         """Update the pose on the path that the joints in position mode follow, without a jump of their targets.
 
         Its arc length follows the measured one with slack, no faster than `overspeed_ratio` times the mission's speed,
         and at most `brake_m` behind.
         """
-        config = self._set
+        parameters = self.parameters
         s = located.tail_s_m
         last_pose = self._body_pose
         if last_pose is None or located.restarted:
             body_pose = located.on_path.pose_at(s)
         else:
             last_s = last_pose.tail_s_m
-            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * config.overspeed_ratio * view.period_s
-            followed_s = min(max(last_s, s - config.slack_m), s + config.slack_m, last_s + max_advance_m)
-            body_pose = located.on_path.pose_at(max(followed_s, s - config.brake_m))
+            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * parameters.overspeed_ratio * observation.period_s
+            followed_s = min(max(last_s, s - parameters.slack_m), s + parameters.slack_m, last_s + max_advance_m)
+            body_pose = located.on_path.pose_at(max(followed_s, s - parameters.brake_m))
         lift_rad = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
         reference = self._body.all_angles(body_pose) + lift_rad
         if not len(self._reference):
-            self._hand_over.start(view.joints, reference)
+            self._hand_over.start(observation.joints, reference)
         elif located.restarted:
             self._hand_over.shift(reference - self._reference)
         self._body_pose = body_pose
         self._reference = reference
         return body_pose
 
-    def _compensate_load(self, view: View, body_pose: BodyPose) -> Floats:
+    def _compensate_load(self, observation: Observation, body_pose: BodyPose) -> Floats:
         """Return how far targets lead the path's angles, (n_joints,) rad: filtered load / stiffness.
 
         The load of a joint is `load_ratio` times its torque for the planned contact forces. A servo gives way under a
         load; with this lead, its joint stays on the path.
         """
-        load_ratio = self._set.load_ratio
+        load_ratio = self.parameters.load_ratio
         if load_ratio == 0.0:
             return np.zeros(len(self._load_nm))
         load_nm = np.zeros(len(self._load_nm))
         if self._choice is not None and self._force_n > 0.0:
             load_nm = load_ratio * compute_bending_nm(self._body, body_pose, self._choice, self._force_n)
-        keep = np.exp(-view.period_s / self._set.load_filter_s)
+        keep = np.exp(-observation.period_s / self.parameters.load_filter_s)
         self._load_nm = keep * self._load_nm + (1.0 - keep) * load_nm
         return self._load_nm / self._stiffness
 
-    def _compute_propulsion(self, view: View, located: Located, choice: Choice) -> PropulsionDemand:
+    def _compute_propulsion(self, observation: Observation, located: Located, choice: Choice) -> PropulsionDemand:
         """Compute the torque of the propulsion joint.
 
             f   = propulsion_n (1 - v / v_mission) * fade,   between 0 and propulsion_n, with a limited rate
@@ -204,25 +208,25 @@ class ObstacleTriplet:
 
         fade is 1 while the joint has swung out by less than `angle_fade_rad`, and falls to 0 at twice as much.
         """
-        config = self._set
+        parameters = self.parameters
         joint = self._body.bends[choice.joint]
         limit_nm = self._body.torque_limit_nm[joint]
         torque_per_n = choice.torque_per_n
 
         slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
-        wanted_n = config.propulsion_n * min(max(slow, 0.0), 1.0)
+        wanted_n = parameters.propulsion_n * min(max(slow, 0.0), 1.0)
 
-        swing_rad = view.joints.angle_rad[joint] - float(self._reference[joint])
+        swing_rad = observation.joints.angle_rad[joint] - float(self._reference[joint])
         if torque_per_n <= 0:
             swing_rad = -swing_rad  # positive: in the direction of the torque
-        fade = 2.0 - swing_rad / config.angle_fade_rad
+        fade = 2.0 - swing_rad / parameters.angle_fade_rad
         asked_n = wanted_n * min(max(fade, 0.0), 1.0)
-        max_change_n = config.propulsion_rate_n_s * view.period_s
+        max_change_n = parameters.propulsion_rate_n_s * observation.period_s
         asked_n = min(max(asked_n, self._asked_n - max_change_n), self._asked_n + max_change_n)
         self._asked_n = asked_n
 
         force_n = min(asked_n, limit_nm / max(abs(torque_per_n), MIN_TORQUE_PER_N))
-        torque_nm = force_n * torque_per_n - config.damping_nm_s_per_rad * view.joints.velocity_rad_s[joint]
+        torque_nm = force_n * torque_per_n - parameters.damping_nm_s_per_rad * observation.joints.velocity_rad_s[joint]
         torque_nm = min(max(self._hand_over.torque_nm(torque_nm), -limit_nm), limit_nm)
         return PropulsionDemand(
             joint=joint,
@@ -249,9 +253,9 @@ class ObstacleTriplet:
             body_pose,
             located.nodes_w,
             self._body.node_s_m,
-            gap_m=self._set.gap_m,
-            give_up_gap_m=self._set.give_up_gap_m,
-            end_m=self._set.end_m,
+            gap_m=self.parameters.gap_m,
+            give_up_gap_m=self.parameters.give_up_gap_m,
+            end_m=self.parameters.end_m,
         )
 
     def _update_planned(self, located: Located) -> None:
@@ -275,22 +279,22 @@ class ObstacleTriplet:
             window_m=half_length_m + PLAN_WINDOW_M,
         )
 
-    def _update_choice(self, view: View, located: Located, body_pose: BodyPose) -> None:
+    def _update_choice(self, observation: Observation, located: Located, body_pose: BodyPose) -> None:
         """Choose a triplet for the present push-points, or none."""
-        self._expire_restrictions(view.time_s, located.tail_s_m)
+        self._expire_restrictions(observation.time_s, located.tail_s_m)
         barred_joint = None
         if self._barred is not None:
             barred_joint, _ = self._barred
         choices, self._refused = self._triplets.find_choices(
             self._points, body_pose.nodes_w, self._body.node_s_m, self._choice, barred_joint
         )
-        if located.trajectory.speed_m_s <= 0 or view.time_s < self._position_until_s:
+        if located.trajectory.speed_m_s <= 0 or observation.time_s < self._position_until_s:
             self._choice = None
             return
         present = None
         if self._choice is not None:
             present = self._choice.triplet
-        switch_fraction = self._set.switch_fraction
+        switch_fraction = self.parameters.switch_fraction
         choice = choose_triplet(choices, present, switch_fraction=switch_fraction, banned=self._banned)
         if choice is None:  # a banned triplet is better than none
             choice = choose_triplet(choices, present, switch_fraction=switch_fraction)
@@ -298,7 +302,7 @@ class ObstacleTriplet:
 
     def _expire_restrictions(self, time_s: float, tail_s_m: float) -> None:
         """Forget stalls and bans that lie `blend_m` of travel back, and a barred joint whose time is over."""
-        blend_m = self._set.blend_m
+        blend_m = self.parameters.blend_m
         self._banned = {names: s_m for names, s_m in self._banned.items() if abs(tail_s_m - s_m) < blend_m}
         if self._stall is not None and abs(tail_s_m - self._stall[1]) > blend_m:
             self._stall = None
@@ -307,23 +311,25 @@ class ObstacleTriplet:
 
     # --- supervision ---------------------------------------------------------------------------------------------
 
-    def _release_swung_joint(self, view: View, body_pose: BodyPose) -> None:
+    def _release_swung_joint(self, observation: Observation, body_pose: BodyPose) -> None:
         """Return a propulsion joint to position mode if it has left its reference too far."""
         if self._choice is None:
             return
         joint = self._choice.joint
-        guard_s = self._set.guard_s
+        guard_s = self.parameters.guard_s
         robot_joint = self._body.bends[joint]
-        swing_rad = view.joints.angle_rad[robot_joint] - float(body_pose.angles_rad[joint])
-        if abs(swing_rad) > self._set.angle_guard_rad:
-            self._barred = (joint, view.time_s + guard_s)
+        swing_rad = observation.joints.angle_rad[robot_joint] - float(body_pose.angles_rad[joint])
+        if abs(swing_rad) > self.parameters.angle_guard_rad:
+            self._barred = (joint, observation.time_s + guard_s)
             name = self._body.names[robot_joint]
             self._refused = [f"{name} left its reference by {swing_rad:+.2f} rad; in position mode for {guard_s} s"]
             self._choice = None
 
-    def _watch_stall(self, view: View, located: Located, choice: Choice, demand: PropulsionDemand) -> None:
+    def _watch_stall(
+        self, observation: Observation, located: Located, choice: Choice, demand: PropulsionDemand
+    ) -> None:
         """Detect a standstill while pushing, and release a triplet that is strained but does not move the body."""
-        if not self._stall_watch.stands(view.time_s, located.tail_s_m, demand.wanted_n):
+        if not self._stall_watch.stands(observation.time_s, located.tail_s_m, demand.wanted_n):
             return
         self._stall_watch.forget()
         joint_name = self._body.names[demand.joint]
@@ -335,37 +341,39 @@ class ObstacleTriplet:
             weight_n=self._body.weight_n,
             saturated=joint_name if demand.saturated else None,
             swung=joint_name if demand.swung else None,
-            jam_force_n=self._set.jam_force_n,
-            drag_ratio=self._set.drag_ratio,
+            jam_force_n=self.parameters.jam_force_n,
+            drag_ratio=self.parameters.drag_ratio,
         )
         self._stall = (stall, located.tail_s_m)
         if stall.release_triplet:
             self._banned[choice.triplet.names] = located.tail_s_m
-            self._position_until_s = view.time_s + self._set.release_s
+            self._position_until_s = observation.time_s + self.parameters.release_s
 
-    def _wait(self, view: View, why: str) -> Action:
+    def _wait(self, observation: Observation, why: str) -> ControllerCommand:
         """Move every joint to its reference without a push, because the pose of the body is unknown."""
         self._choice = None
         self._asked_n = 0.0
         self._force_n = 0.0
         self._stall_watch.forget()
         if not len(self._reference):
-            self._reference = np.array(view.joints.angle_rad)
-            self._hand_over.start(view.joints, self._reference)
+            self._reference = np.array(observation.joints.angle_rad)
+            self._hand_over.start(observation.joints, self._reference)
         # The load compensation becomes part of the offset, which fades.
         self._hand_over.shift(-self._load_nm / self._stiffness)
         self._load_nm = np.zeros(len(self._load_nm))
-        self._hand_over.pass_to(None, view.joints, self._reference)
-        self._hand_over.fade(view.period_s / self._set.blend_s)
+        self._hand_over.pass_to(None, observation.joints, self._reference)
+        self._hand_over.fade(observation.period_s / self.parameters.blend_s)
         targets = self._hand_over.positions_rad(self._reference).tolist()
-        return Action(positions(self._robot, targets), Report(why=why, reference_rad=self._reference.tolist()))
+        return ControllerCommand(
+            positions(self.robot, targets), Telemetry(reason=why, reference_rad=self._reference.tolist())
+        )
 
     # --- reports -------------------------------------------------------------------------------------------------
 
-    def _report_rest(self, located: Located) -> Report:
+    def _report_rest(self, located: Located) -> Telemetry:
         """Report why no joint pushes."""
-        return Report(
-            why=self._explain_rest(located.trajectory.speed_m_s)[:MAX_REASON],
+        return Telemetry(
+            reason=self._explain_rest(located.trajectory.speed_m_s)[:MAX_REASON],
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
             reference_rad=self._reference.tolist(),
@@ -375,7 +383,7 @@ class ObstacleTriplet:
     def _explain_rest(self, wanted_m_s: float) -> str:
         if self._stall is not None:
             stall, _ = self._stall
-            return stall.why
+            return stall.reason
         if wanted_m_s > 0:
             return "; ".join(self._refused) or "no three push-points on alternating sides"
         if wanted_m_s == 0:
@@ -385,16 +393,18 @@ class ObstacleTriplet:
     def _is_jammed(self) -> bool:
         return self._stall is not None and self._stall[0].jammed
 
-    def _report_push(self, located: Located, body_pose: BodyPose, choice: Choice, demand: PropulsionDemand) -> Report:
+    def _report_push(
+        self, located: Located, body_pose: BodyPose, choice: Choice, demand: PropulsionDemand
+    ) -> Telemetry:
         """Report which joint pushes, at which contacts, and with which force."""
         why = ""
         if self._stall is not None:
             stall, _ = self._stall
-            why = stall.why
+            why = stall.reason
         forces_n: list[float] = (demand.force_n * choice.triplet.unit.forces).tolist()
-        full_torque_nm = abs(self._set.propulsion_n * choice.torque_per_n)
-        return Report(
-            why=why,
+        full_torque_nm = abs(self.parameters.propulsion_n * choice.torque_per_n)
+        return Telemetry(
+            reason=why,
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
             propulsion_joint=demand.joint,

@@ -16,7 +16,7 @@ class Stall:
 
     jammed: bool  # obstacles hold the body back, by its measured contact forces
     release_triplet: bool  # another triplet may do better
-    why: str
+    reason: str
 
 
 class StallWatch:
@@ -86,5 +86,5 @@ def explain(
     return Stall(
         jammed=jammed,
         release_triplet=touches_something and (joint_is_strained or contacts_are_strained),
-        why=why,
+        reason=why,
     )

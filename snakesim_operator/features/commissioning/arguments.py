@@ -1,104 +1,92 @@
-"""Arguments of `snakesim joints`."""
+"""The commands that calibrate, check and identify the joints of a robot: `snakesim robot calibrate`, `check`, ..."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from snakesim_hal.programs.arguments import add_network, number_type
+from snakesim_hal.programs.arguments import add_json, add_network, add_out, number_type
+from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
-TASK = "scenarios, robots, labs"  # the heading of `snakesim --help` that lists it
-JOG = (
-    "Move one joint slowly, while a key is held; the motors of the others stay off. It arms the robot, checked or not."
-)
 FILE = "the robot file that the host was started with; the values are written into it"
 
 
-def add_commands(commands: Any) -> None:
-    """Add `joints` to the parser of `snakesim`."""
-    joints = commands.add_parser("joints", help="find zeros, directions and limits of joints, and write them down")
-    verbs = joints.add_subparsers(dest="verb", required=True, metavar="VERB")
-    zero = _add_by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")
-    zero.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
-    direction_help = "turn joints by hand: which count the wrong way round, or have another's id"
-    _add_joint_names(_add_by_hand(verbs, "direction", _direction, direction_help))
-    limits_help = "move joints by hand from end to end: their limits"
-    _add_joint_names(_add_by_hand(verbs, "limits", _limits, limits_help))
-    gear_help = "turn joints by hand by a known angle: whether their gears are as the file says"
-    gear = _add_by_hand(verbs, "gear", _gear, gear_help)
-    _add_joint_names(gear)
-    gear.add_argument(
+def add_write(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add the robot file that a command changes. about: what is written, for the help."""
+    parser.add_argument("--write", type=Path, metavar="FILE", help=f"your robot file: {about}")
+
+
+def _add_robot_file(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of a command for which a person moves the robot by hand."""
+    parser.add_argument("file", type=Path, metavar="FILE", help=FILE)
+    add_network(parser)
+
+
+def _add_joint_names(parser: argparse.ArgumentParser) -> None:
+    _add_robot_file(parser)
+    parser.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+
+
+def _add_zero(parser: argparse.ArgumentParser) -> None:
+    _add_robot_file(parser)
+    parser.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
+
+
+def _add_gear(parser: argparse.ArgumentParser) -> None:
+    _add_joint_names(parser)
+    parser.add_argument(
         "--degrees",
         type=number_type(10.0, 180.0, "degrees"),
         default=45.0,
+        metavar="DEGREES",
         help="by which you turn each joint, along a template or a set square (default: 45)",
     )
-    _add_jog(verbs)
-    _add_check(verbs)
 
 
-def _add_joint_names(command: argparse.ArgumentParser) -> None:
-    command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
-
-
-def _add_check(verbs: Any) -> None:
-    check = verbs.add_parser(
-        "check",
-        help="judge a run of `snakesim run joint_check`: signs, gears, backlash, ids, zeros, dead joints",
-        epilog="Exit code: 0 sign, order, zero and gear of every joint were confirmed, 1 one is wrong or unknown, "
-        "2 wrong input.",
+def _add_jog(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE", help=FILE.partition(";")[0])
+    parser.add_argument("joint", metavar="JOINT", help="such as joint_3")
+    parser.add_argument(
+        "--joint-speed", type=float, default=0.1, metavar="RAD/S", help="at most 0.5 rad/s (default: 0.1)"
     )
-    check.add_argument("run", type=Path, help="folder of the run")
-    check.add_argument(
-        "file",
-        type=Path,
-        nargs="?",
-        metavar="FILE",
-        help="your robot file: write into it that it was checked, if all of it was confirmed",
+    parser.add_argument("--travel", type=float, default=0.2, metavar="RAD", help="to either side (default: 0.2 rad)")
+    parser.add_argument(
+        "--torque", type=float, default=0.3, metavar="FRACTION", help="of the joint's limit (default: 0.3)"
     )
-    check.add_argument(
+    add_network(parser)
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run")
+    add_write(parser, "that it was checked is written into it, if all of it was confirmed")
+    parser.add_argument(
         "--by-hand",
         action="store_true",
-        help="you turned the joints whose sign and order it cannot judge with `joints direction`, and they are right",
+        help="you turned the joints whose sign and order it cannot judge with `robot calibrate direction`, and they "
+        "are right",
     )
-    check.add_argument(
+    parser.add_argument(
         "--gear-by-hand",
         action="store_true",
-        help="you measured the gears that it cannot judge with `joints gear`, they are right, and have no backlash",
+        help="you measured the gears that it cannot judge with `robot calibrate gear`, they are right, and have no "
+        "backlash",
     )
-    check.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
-    check.add_argument(
+    parser.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
+    parser.add_argument(
         "--allow-backlash",
         type=number_type(0.0, 0.5, "rad"),
         default=ALLOWED_BACKLASH_RAD,
         metavar="RAD",
         help=f"as much may be lost in a gear when its load reverses (default: {ALLOWED_BACKLASH_RAD:g} rad)",
     )
-    check.set_defaults(act=_check)
+    add_json(parser)
 
 
-def _add_jog(verbs: Any) -> None:
-    jog = verbs.add_parser("jog", help="move one joint slowly, while a key is held", description=JOG)
-    jog.add_argument("file", type=Path, metavar="FILE", help=FILE.partition(";")[0])
-    jog.add_argument("joint", metavar="JOINT", help="such as joint_3")
-    jog.add_argument("--speed", type=float, default=0.1, metavar="RAD_S", help="at most 0.5 rad/s (default: 0.1)")
-    jog.add_argument("--travel", type=float, default=0.2, metavar="RAD", help="to either side (default: 0.2 rad)")
-    jog.add_argument("--torque", type=float, default=0.3, metavar="SHARE", help="of the joint's limit (default: 0.3)")
-    add_network(jog)
-    jog.set_defaults(act=_jog)
-
-
-def _add_by_hand(
-    verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], help_text: str
-) -> argparse.ArgumentParser:
-    """Add a verb for which a person moves the robot by hand."""
-    command = verbs.add_parser(verb, help=help_text, description=f"{help_text.capitalize()}. The motors stay off.")
-    command.add_argument("file", type=Path, metavar="FILE", help=FILE)
-    add_network(command)
-    command.set_defaults(act=act)
-    return command
+def _add_identify(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run, in which the robot hung by its tail")
+    add_write(parser, "the values are written into it")
+    add_out(parser, "the page, an HTML file (default: identified.html in the run)")
+    add_json(parser)
 
 
 def _zero(arguments: argparse.Namespace) -> int:
@@ -111,7 +99,7 @@ def _jog(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.jog import JogRequest, jog
 
     request = JogRequest(
-        joint=arguments.joint, speed_rad_s=arguments.speed, travel_rad=arguments.travel, torque=arguments.torque
+        joint=arguments.joint, speed_rad_s=arguments.joint_speed, travel_rad=arguments.travel, torque=arguments.torque
     )
     return jog(arguments.file, select_robots(arguments), request)
 
@@ -143,4 +131,71 @@ def _check(arguments: argparse.Namespace) -> int:
         gear_by_hand=arguments.gear_by_hand,
         allowed_backlash_rad=arguments.allow_backlash,
     )
-    return check(arguments.run, arguments.file, request)
+    return check(arguments.run, arguments.write, request, as_json=arguments.json)
+
+
+def _identify(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.features.commissioning.identify import identify
+
+    return identify(arguments.run, arguments.write, arguments.out, as_json=arguments.json)
+
+
+COMMANDS: Commands = (
+    Noun(
+        name="robot calibrate",
+        help="Find zeros, directions, limits and gears of joints by hand, and write them down; the motors stay off.",
+    ),
+    Command(
+        name="robot calibrate zero",
+        help="Take the present pose, which must be straight, as zero of every joint.",
+        add=_add_zero,
+        run=_zero,
+        examples=("robot calibrate zero snake.toml", "robot calibrate zero snake.toml --now"),
+    ),
+    Command(
+        name="robot calibrate direction",
+        help="Find joints that count the wrong way round or have another's id, while you turn them by hand.",
+        add=_add_joint_names,
+        run=_direction,
+        examples=("robot calibrate direction snake.toml", "robot calibrate direction snake.toml joint_3 joint_4"),
+    ),
+    Command(
+        name="robot calibrate limits",
+        help="Find the limits of joints, while you move them by hand from end to end.",
+        add=_add_joint_names,
+        run=_limits,
+        examples=("robot calibrate limits snake.toml", "robot calibrate limits snake.toml joint_3"),
+    ),
+    Command(
+        name="robot calibrate gear",
+        help="Find whether gears are as the file says, while you turn joints by hand by a known angle.",
+        add=_add_gear,
+        run=_gear,
+        examples=("robot calibrate gear snake.toml", "robot calibrate gear snake.toml joint_3 --degrees 90"),
+    ),
+    Command(
+        name="robot jog",
+        help="Move one joint slowly, while a key is held.",
+        add=_add_jog,
+        run=_jog,
+        details="The motors of the other joints stay off. It arms the robot, checked or not.",
+        examples=("robot jog snake.toml joint_3", "robot jog snake.toml joint_3 --joint-speed 0.05 --travel 0.1"),
+    ),
+    Command(
+        name="robot check",
+        help="Judge a run of `snakesim run joint_check`: signs, gears, backlash, ids, zeros, dead joints.",
+        add=_add_check,
+        run=_check,
+        details="Exit code: 0 sign, order, zero and gear of every joint were confirmed, 1 one is wrong or unknown, "
+        "2 wrong input.",
+        examples=("robot check runs/check --straight", "robot check runs/check --straight --write snake.toml"),
+    ),
+    Command(
+        name="robot identify",
+        help="Identify friction, rotor inertia, torque constant and response of joints from `snakesim run identify`.",
+        add=_add_identify,
+        run=_identify,
+        details="Exit code: 0 every joint was identified, 1 one was not, or does not move as it should, 2 wrong input.",
+        examples=("robot identify runs/identify", "robot identify runs/identify --write snake.toml"),
+    ),
+)

@@ -1,4 +1,4 @@
-"""`snakesim joints zero|direction|gear|limits`: a person moves the robot by hand, and the encoders are read.
+"""`snakesim robot calibrate zero|direction|gear|limits`: a person moves the robot by hand, and the encoders are read.
 
 This module commands no joint. The robot's host must run, and be disarmed all the time.
 """
@@ -46,13 +46,14 @@ def running_joints(session: Session, path: Path) -> Sequence[Joint]:
     """
     configuration = session.latest(keys.CONFIG, Configuration, HOST_TIMEOUT_S)
     if configuration is None:
-        raise RefusedError(NO_ANSWER)
+        raise RefusedError(NO_ANSWER, code="network/no-answer")
     running = msgspec.json.decode(configuration.content, type=RunConfig).robot.joint_table
     joints = joints_on_drives(path, running)
     if [_identity(joint) for joint in running] != [_identity(joint) for joint in joints]:
         raise ConfigError(
             f"{path}: its joints are not those that the host was started with, so what is measured would be "
-            f"reckoned wrongly; restart the host with this file"
+            f"reckoned wrongly; restart the host with this file",
+            code="commissioning/not-possible",
         )
     return joints
 
@@ -76,7 +77,7 @@ class HandMovedRobot:
         self.joints = running_joints(session, path)
         status = session.latest(keys.STATUS, Status, HOST_TIMEOUT_S)
         if status is None:
-            raise RefusedError(NO_ANSWER)
+            raise RefusedError(NO_ANSWER, code="network/no-answer")
         self._status = status
 
     def read_angles_rad(self, is_over: Callable[[], bool]) -> Iterator[Floats]:
@@ -99,7 +100,10 @@ class HandMovedRobot:
             if states:
                 last_arrival_s = time.monotonic()
             elif time.monotonic() - last_arrival_s > MAX_SILENCE_S:
-                raise RefusedError(f"the robot has sent no joint angles for {MAX_SILENCE_S:g} s; see `snakesim status`")
+                raise RefusedError(
+                    f"the robot has sent no joint angles for {MAX_SILENCE_S:g} s; see `snakesim status`",
+                    code="network/no-answer",
+                )
             for state in states:
                 self._refuse_unknown_angles(state)
                 yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
@@ -112,17 +116,23 @@ class HandMovedRobot:
             case "disarmed" | "fault" | "estop":
                 return
             case _:
-                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim disarm` first")
+                raise RefusedError(
+                    "the robot is armed: its motors hold the joints; type `snakesim robot disarm` first",
+                    code="robot/not-disarmed",
+                )
 
     def _refuse_unknown_angles(self, state: JointState) -> None:
         unknown = [joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid]
         if unknown:
-            raise RefusedError(f"{', '.join(unknown)}: the angle is not known; see `snakesim status`")
+            raise RefusedError(
+                f"{', '.join(unknown)}: the angle is not known; see `snakesim status`",
+                code="commissioning/not-possible",
+            )
 
 
 @contextmanager
 def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[HandMovedRobot]:
-    """Connect to the selected robot. Raises SnakesimError. command: for messages, such as `joints zero`."""
+    """Connect to the selected robot. Raises SnakesimError. command: for messages, such as `robot calibrate zero`."""
     must_be_own(path)
     with open_session(only_robot(selection, command), CONNECT_S) as session:
         yield HandMovedRobot(session, path)
@@ -130,7 +140,7 @@ def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[Ha
 
 def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
     """Write the present pose as the straight pose into a robot file. Return 0. Raises SnakesimError."""
-    with _connect(path, selection, "joints zero") as robot:
+    with _connect(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
             print_line("Lay the robot straight on a flat floor, let go of it, then press Enter.")
             list(robot.read_angles_rad(_line_was_typed))
@@ -139,7 +149,10 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
         try:
             zeros_rad = find_zeros(robot.joints, np.array(samples))
         except NotStillError as error:
-            raise RefusedError(f"{error} within {ZERO_SAMPLING_S:g} s; let go of the robot, and try again") from None
+            raise RefusedError(
+                f"{error} within {ZERO_SAMPLING_S:g} s; let go of the robot, and try again",
+                code="commissioning/not-possible",
+            ) from None
     values: dict[str, dict[str, Any]] = {}
     for joint, zero_rad in zip(robot.joints, zeros_rad, strict=True):
         print_line(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
@@ -164,7 +177,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
     """
     values: dict[str, dict[str, Any]] = {}
     unknown: list[str] = []
-    with _connect(path, selection, "joints direction") as robot:
+    with _connect(path, selection, "robot calibrate direction") as robot:
         for joint in choose_joints(robot.joints, names, path):
             instruction = f"turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more, and hold it still"
             turn = _wait_for_turn(robot, joint, instruction)
@@ -176,7 +189,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
                 print_line(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
                 values[joint.name] = {"sign": -joint.drive.sign}
     _write_values(path, values, "turned by hand")
-    return _report_unknown(unknown, f"snakesim joints direction {path}")
+    return _report_unknown(unknown, f"snakesim robot calibrate direction {path}")
 
 
 def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: float) -> int:
@@ -193,7 +206,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
     """
     unknown: list[str] = []
     wrong: list[str] = []
-    with _connect(path, selection, "joints gear") as robot:
+    with _connect(path, selection, "robot calibrate gear") as robot:
         for joint in choose_joints(robot.joints, names, path):
             instruction = f"turn what is ahead of it {DIRECTIONS[joint.axis]} by {degrees:g} degrees, and hold it still"
             turn = _wait_for_turn(robot, joint, instruction)
@@ -210,7 +223,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
                 wrong.append(joint.name)
     if wrong:
         print_line(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")
-    exit_code_of_unknown = _report_unknown(unknown, f"snakesim joints gear {path}")
+    exit_code_of_unknown = _report_unknown(unknown, f"snakesim robot calibrate gear {path}")
     return 1 if wrong else exit_code_of_unknown
 
 
@@ -264,7 +277,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
     Returns:
         0; 1 if one of them was not moved from end to end.
     """
-    with _connect(path, selection, "joints limits") as robot:
+    with _connect(path, selection, "robot calibrate limits") as robot:
         watched = choose_joints(robot.joints, names, path)
         print_line("Move each joint by hand from end to end, slowly; then press Enter.")
         travel = _watch_travel(robot)
@@ -284,7 +297,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
             values[joint.name] = {"angle_min_rad": lower, "angle_max_rad": upper}
             print_line(f"{joint.name:<10} {lower:+.3f} to {upper:+.3f} rad")
     _write_values(path, values, "end to end by hand")
-    return _report_unknown(unknown, f"snakesim joints limits {path}")
+    return _report_unknown(unknown, f"snakesim robot calibrate limits {path}")
 
 
 def _watch_travel(robot: HandMovedRobot) -> Travel | None:
@@ -312,7 +325,10 @@ def choose_joints(joints: Sequence[Joint], names: Sequence[str], path: Path) -> 
     known = {joint.name: joint for joint in joints}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ConfigError(f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}")
+        raise ConfigError(
+            f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}",
+            code="config/unknown-name",
+        )
     if not names:
         return joints
     return [known[name] for name in names]
@@ -323,7 +339,7 @@ def _line_was_typed() -> bool:
     if not select.select([sys.stdin], [], [], 0.0)[0]:
         return False
     if not sys.stdin.readline():
-        raise RefusedError("the terminal is gone; nothing was written")
+        raise RefusedError("the terminal is gone; nothing was written", code="commissioning/not-possible")
     return True
 
 

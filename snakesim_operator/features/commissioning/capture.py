@@ -40,7 +40,7 @@ def find_zeros(joints: Sequence[Joint], angles_rad: Floats) -> list[float]:
     most_moved = int(np.argmax(range_rad))
     if range_rad[most_moved] > MAX_UNTOUCHED_RAD:
         raise NotStillError(f"{joints[most_moved].name} moved by {range_rad[most_moved]:.3f} rad")
-    return Mounting(joints).drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
+    return Mounting(joints).to_drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`snakesim joints check`: judges a run of the joint check, prints the verdicts, and marks the robot as checked."""
+"""`snakesim robot check`: judges a run of the joint check, prints the verdicts, and marks the robot as checked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ from pathlib import Path
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.checked import CHECK, PROPERTIES, JointProperty, StartCheckRecord, mounting_digest
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import COLUMNS, collect_measurements, read_imus, tick_numbers
 from snakesim_operator.features.commissioning.robot_edit import joints_on_drives, must_be_own, write_checked
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +38,14 @@ class CheckRequest:
         return properties
 
 
-def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
+def check(run: Path, robot_file: Path | None, request: CheckRequest, *, as_json: bool = False) -> int:
     """Judge a run of the joint check, and print a line a joint.
 
     Args:
         run: folder of the run.
         robot_file: file into which to write that the robot was checked; None: nothing is written.
         request: what a person states.
+        as_json: whether to print one JSON object instead of a line a joint.
 
     Returns:
         0 if every property of every joint was confirmed, otherwise 1.
@@ -56,7 +57,8 @@ def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
     if record.config.controller != CHECK:
         raise ConfigError(
             f"{run}: its controller was {record.config.controller!r}; make a run with `snakesim run joint_check`, or "
-            "any other scenario with --controller joint_check"
+            "any other scenario with --controller joint_check",
+            code="commissioning/not-possible",
         )
     columns: dict[str, Floats] = {name: getattr(record, name) for name in COLUMNS}
     measurements = collect_measurements(
@@ -64,8 +66,11 @@ def check(run: Path, robot_file: Path | None, request: CheckRequest) -> int:
     )
     rows = judge_joints(measurements, straight=request.straight, allowed_backlash_rad=request.allowed_backlash_rad)
     rows = [row.confirmed_by_hand(request.by_hand) for row in rows]
-    for line in report_lines(rows):
-        print_line(line)
+    if as_json:
+        print_json({"joints": rows})
+    else:
+        for line in report_lines(rows):
+            print_line(line)
     if robot_file is not None:
         _write_result(robot_file, record, rows, request)
     return 0 if all(row.all_confirmed for row in rows) else 1
@@ -137,9 +142,15 @@ def _write_result(path: Path, record: RunRecord, rows: Sequence[JointVerdict], r
     joints = record.config.robot.joint_table
     must_be_own(path)
     if robot.emulated:
-        raise ConfigError(f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written")
+        raise ConfigError(
+            f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written",
+            code="commissioning/not-possible",
+        )
     if mounting_digest(joints_on_drives(path, joints)) != mounting_digest(joints):
-        raise ConfigError(f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again")
+        raise ConfigError(
+            f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again",
+            code="commissioning/not-possible",
+        )
     unconfirmed = [row.joint for row in rows if not row.all_confirmed]
     if unconfirmed:
         print_line(f"{path}: nothing was written: {', '.join(unconfirmed)} are wrong or unknown")

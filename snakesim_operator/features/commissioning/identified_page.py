@@ -10,7 +10,7 @@ from snakesim_operator.features.commissioning.least_squares import Estimate
 from snakesim_operator.features.commissioning.smoothing import HALF_WINDOW
 from snakesim_operator.results.page.charts import Figure, Line, lines
 from snakesim_operator.results.page.html import render, shown
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 MEASURED_COLOR = "--measured"
 MODEL_COLOR = "--reference"

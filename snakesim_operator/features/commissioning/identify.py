@@ -1,4 +1,4 @@
-"""`snakesim identify`: identifies the joints from a run of the controller `identify`, prints, draws and writes them."""
+"""`snakesim robot identify`: identifies the joints from a run of the controller `identify`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.files import find_file
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.wire.messages import Mode
@@ -19,7 +19,7 @@ from snakesim_operator.features.commissioning.identification import (
 from snakesim_operator.features.commissioning.identified_page import render_page
 from snakesim_operator.features.commissioning.least_squares import Estimate
 from snakesim_operator.features.commissioning.measured import arrange_by_tick, read_imus, tick_numbers
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 PAGE = "identified.html"
 CONTROLLER = "identify"
@@ -35,13 +35,14 @@ LABELS = {  # fields of the robot file -> name and unit
 }
 
 
-def identify(run: Path, robot_file: Path | None, out: Path | None) -> int:
+def identify(run: Path, robot_file: Path | None, out: Path | None, *, as_json: bool = False) -> int:
     """Identify the joints of a run, print them, and write a page.
 
     Args:
         run: folder of the run, or its recording.
         robot_file: the user's robot file to write the values into; None: no robot file is written.
         out: the page; None: a file in the folder of the run.
+        as_json: whether to print one JSON object instead of text.
 
     Returns:
         0 if every value of every joint was identified, otherwise 1.
@@ -51,21 +52,22 @@ def identify(run: Path, robot_file: Path | None, out: Path | None) -> int:
     """
     if robot_file is not None and find_file(str(robot_file), "robots") != robot_file:
         raise ConfigError(
-            f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay"
+            f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay",
+            code="commissioning/not-possible",
         )
     record = RunRecord.load(run)
     judged_ticks = _find_judged_ticks(record)
     columns: dict[str, Any] = {name: getattr(record, name)[judged_ticks] for name in COLUMNS}
     link_rates, _ = arrange_by_tick(read_imus(record), tick_numbers(record), len(record.description.links))
     rows = identify_joints(record.config, columns, link_rates[judged_ticks])
-    for row in rows:
-        _print_joint(row)
-    if np.isnan(link_rates).all():
-        print_line("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
     run_folder = run if run.is_dir() else run.parent
     page_path = out or run_folder / PAGE
     write_text(page_path, render_page(record, rows))
-    print_line(f"page: {page_path}")
+    if as_json:
+        print_json({"joints": rows, "page": str(page_path)})
+    else:
+        _print_joints(rows, judges_links=not np.isnan(link_rates).all())
+        print_line(f"page: {page_path}")
     if robot_file is not None:
         _write_robot_file(robot_file, record, rows)
     everything_identified = all(row.complete and not row.fails for row in rows)
@@ -77,7 +79,8 @@ def _find_judged_ticks(record: RunRecord) -> slice:
     if record.config.controller != CONTROLLER:
         raise ConfigError(
             f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
-            f"run with `snakesim run identify`"
+            f"run with `snakesim run identify`",
+            code="commissioning/not-possible",
         )
     columns = [getattr(record, name) for name in COLUMNS]
     usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
@@ -88,9 +91,20 @@ def _find_judged_ticks(record: RunRecord) -> slice:
     edges = np.flatnonzero(np.diff(padded))
     parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
     if not parts:
-        raise ConfigError(f"{record.folder}: the joints were never moved by position targets; run it again")
+        raise ConfigError(
+            f"{record.folder}: the joints were never moved by position targets; run it again",
+            code="commissioning/not-possible",
+        )
     start, end = max(parts, key=lambda part: part[1] - part[0])
     return slice(start, end)
+
+
+def _print_joints(rows: Sequence[JointIdentification], *, judges_links: bool) -> None:
+    """Print what is known of each joint. judges_links: whether links have IMUs, which show backlash."""
+    for row in rows:
+        _print_joint(row)
+    if not judges_links:
+        print_line("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
 
 
 def _print_joint(row: JointIdentification) -> None:

@@ -1,4 +1,4 @@
-"""`snakesim joints jog`: one joint moves slowly while a key is held; the other motors stay off.
+"""`snakesim robot jog`: one joint moves slowly while a key is held; the other motors stay off.
 
 A terminal reports that a key repeats, not that it was released: the joint moves on for `KEY_HOLD_S` after each repeat.
 So a single key makes a small step, and a held key moves the joint on once it repeats. Keys that arrive late, as over a
@@ -62,7 +62,9 @@ class JogRequest:
 
 def _check_bound(option: str, value: float, maximum: float, unit: str) -> None:
     if not 0 < value <= maximum:
-        raise ConfigError(f"{option} {value:g}: give more than 0, and at most {maximum:g} {unit}")
+        raise ConfigError(
+            f"{option} {value:g}: give more than 0, and at most {maximum:g} {unit}", code="command/invalid-option"
+        )
 
 
 class JogTarget:
@@ -110,8 +112,8 @@ def jog(path: Path, selection: RobotSelection, request: JogRequest) -> int:
         selection: the robot.
         request: the joint and its bounds.
     """
-    keyboard = Keyboard("joints jog reads keys, and stdin is no terminal; start it in one")
-    link = only_robot(selection, "joints jog")
+    keyboard = Keyboard("robot jog reads keys, and stdin is no terminal; start it in one")
+    link = only_robot(selection, "robot jog")
     set_realtime_priority(SERVICE_PRIORITY)  # where it is allowed: a late command ends the lease
     with open_session(link, CONNECT_S) as session:
         joints = running_joints(session, path)
@@ -119,9 +121,14 @@ def jog(path: Path, selection: RobotSelection, request: JogRequest) -> int:
         robot = session.latest(keys.DESCRIPTION, Description, CONNECT_S)
         status = session.latest(keys.STATUS, Status, CONNECT_S)
         if robot is None or status is None:
-            raise RefusedError("the robot's host has not said what it is; see `snakesim status`")
+            raise RefusedError(
+                "the robot's host has not said what it is; see `snakesim status`", code="network/no-answer"
+            )
         if status.lifecycle != "disarmed":
-            raise RefusedError(f"the robot is {status.lifecycle}; it must be disarmed to jog: see `snakesim status`")
+            raise RefusedError(
+                f"the robot is {status.lifecycle}; it must be disarmed to jog: see `snakesim status`",
+                code="robot/not-disarmed",
+            )
         with keyboard:
             _JogSession(session, link, robot, status, request, joints.index(joint)).run(keyboard)
     return 0
@@ -153,7 +160,7 @@ class _JogSession:
         signal.signal(signal.SIGHUP, lambda *_: self._request_stop())
         self._cycle_until(self._is_ready_to_arm)
         arm_session_before = self._cycle().arm_session
-        requester = f"{get_user_name()[:40]}, joints jog"
+        requester = f"{get_user_name()[:40]}, robot jog"
         # Unchecked is allowed, because jogging is how a user finds out how the joints are mounted.
         self._send_request(make_arm_request(self._robot, requester, unchecked=True), "armed")
         try:
@@ -161,7 +168,7 @@ class _JogSession:
             self._follow_keys(keyboard)
         finally:
             if self._cycle().lifecycle == "armed":
-                disarm = LifecycleRequest(action="disarm", who=requester, host=self._robot.host)
+                disarm = LifecycleRequest(action="disarm", requester=requester, host=self._robot.host)
                 self._send_request(disarm, "disarmed")
 
     def _follow_keys(self, keyboard: Keyboard) -> None:
@@ -182,7 +189,7 @@ class _JogSession:
             clock = self._cycle()
             if clock.lifecycle != "armed":
                 self._read_status()
-                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.why}")
+                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.reason}", code="robot/not-armed")
             if moved and not target.moves:
                 print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
             moved = target.moves
@@ -213,7 +220,10 @@ class _JogSession:
     def _read_angle_rad(self) -> float:
         joints = self._commanding.read(keys.JOINTS)
         if not isinstance(joints, JointState) or not joints.valid[self._joint]:
-            raise RefusedError(f"{self._request.joint}: the angle is not known; see `snakesim status`")
+            raise RefusedError(
+                f"{self._request.joint}: the angle is not known; see `snakesim status`",
+                code="commissioning/not-possible",
+            )
         return joints.angle_rad[self._joint]
 
     def _read_status(self) -> None:
@@ -230,7 +240,7 @@ class _JogSession:
         while not condition():
             self._cycle()
             if time.monotonic() > deadline_s or self._stop_requested:
-                raise RefusedError(f"not armed: {self._status.why}")
+                raise RefusedError(f"not armed: {self._status.reason}", code="robot/not-armed")
 
     def _send_request(self, request: LifecycleRequest, outcome: str) -> None:
         """Send a lifecycle request, and run cycles until it is answered. outcome: such as `armed`."""

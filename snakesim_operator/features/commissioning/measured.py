@@ -13,9 +13,8 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description, Imu
-from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
 MIN_TARGET_MOTION_RAD = 1e-6  # a target that is further from its rest moves its joint
@@ -69,9 +68,10 @@ class CheckMeasurements:
 
 def read_imus(record: RunRecord) -> Iterable[Imu]:
     """Yield every IMU message of a run. Raises ConfigError."""
-    path = record.folder if record.alone else record.folder / RECORDING
+    if record.recording_path is None:
+        return
     decoder = Decoder(Imu)
-    for message in RecordingReader(path).read_messages([keys.IMU]):
+    for message in RecordingReader(record.recording_path).read_messages([keys.IMU]):
         yield decoder.decode(message.payload, message.encoding)
 
 

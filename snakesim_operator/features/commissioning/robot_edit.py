@@ -23,7 +23,10 @@ from snakesim_hal.model.textfiles import read_text
 def must_be_own(path: Path) -> None:
     """Raise ConfigError for a robot file that is shipped."""
     if find_file(str(path), "robots") != path:
-        raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
+        raise ConfigError(
+            f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay",
+            code="commissioning/not-possible",
+        )
 
 
 def joints_on_drives(path: Path, running: Sequence[Joint]) -> list[Joint]:
@@ -66,7 +69,7 @@ def write_checked(path: Path, checked: StartCheckRecord) -> None:
     """Write the section `[checked]` of a robot file. Raises ConfigError; then nothing changed."""
     document = tomlkit.parse(read_text(path))
     section = tomlkit.table()
-    section.comment("written by `snakesim joints check`; it counts until the joints above or their drives change")
+    section.comment("written by `snakesim robot check`; it counts until the joints above or their drives change")
     for name, value in msgspec.to_builtins(checked).items():
         if value:
             section[name] = value
@@ -85,7 +88,8 @@ def _replace_file(path: Path, document: tomlkit.TOMLDocument) -> None:
         write_through(path, content, durable=True)
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot be written: {error.strerror}; it is as it was. Correct that, and repeat the command"
+            f"{path}: cannot be written: {error.strerror}; it is as it was. Correct that, and repeat the command",
+            code="file/not-writable",
         ) from None
     finally:
         candidate.unlink(missing_ok=True)

@@ -2,7 +2,7 @@
 
 `command` has the entry points, and `display_loop` the loop that takes one snapshot a frame and hands it to the page.
 
-- `robot_data`: snapshots of a robot, from the network (`live_robot`) or from a recording (`recorded_run`), and every
+- `robot_data`: snapshots of a robot, from the network (`live_robot`) or from a recording (`run_playback`), and every
   number over time (`signals`).
 - `scene`: what is drawn of a snapshot (`drawing`, without any I/O), and the nodes of viser that show it.
 - `page`: the panel beside the scene, with texts and charts for all viewers and the controls of each viewer.

@@ -39,7 +39,7 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
     """
     _prepare_process()
     if commission is not None:
-        extras.require("commission", "commissioning")
+        extras.require("lab", "commissioning")
         robot_text = read_part(str(commission), "robots")
         decode(robot_text, RobotFile)  # an invalid file is an error now, rather than when a page writes it
     from snakesim_operator.features.console.display_loop import show_live

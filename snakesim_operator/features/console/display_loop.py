@@ -71,7 +71,7 @@ def show_live(
                 if snapshot is not None:
                     changes.note(snapshot.status)
                     changes.note(snapshot.control)
-                    changes.note(snapshot.settings)
+                    changes.note(snapshot.parameters)
                     signals.add_snapshot(snapshot)
                 page.show_snapshot(snapshot)
 
@@ -92,18 +92,18 @@ def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: 
         ConfigError: The folder has no record.
     """
     # Imported here, because modules that only recordings need would delay the page of a run that starts.
-    from snakesim_operator.features.console.robot_data.recorded_run import RecordedRun
-    from snakesim_operator.features.console.robot_data.recorded_signals import RecordedSignals
+    from snakesim_operator.features.console.robot_data.playback_signals import PlaybackSignals
+    from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
     from snakesim_operator.results.missing_data import exit_code
 
-    run = RecordedRun(folder)
+    run = RunPlayback(folder)
     log = PageLog()
-    for missing in run.record.lacks:
-        log.write(f"the record lacks {missing}")
+    for missing in run.record.missing:
+        log.write(f"the record is incomplete: {missing}")
     if run.history.image_decimation > 1:
         log.write(f"of {run.history.image_decimation} camera images one is kept")
-    code = exit_code(folder, run.record.lacks)
-    signals_page = SignalsPage(RecordedSignals(run))
+    code = exit_code(folder, run.record.missing)
+    signals_page = SignalsPage(PlaybackSignals(run))
     with serve_pages(listening, print_line, answer_first=signals_page.answer) as (server, address):
         page = Page(server, Surroundings(run.record.config), None, log, recorded=folder.name)
         player = Player(server, run.span_s, start_s)

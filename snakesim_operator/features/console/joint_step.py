@@ -1,4 +1,4 @@
-"""A `snakesim joints` command that runs beside the console, in a pseudo-terminal of its own.
+"""A command that calibrates or jogs joints, which runs beside the console, in a pseudo-terminal of its own.
 
 So the page has the texts, the checks and the dead-man's switch of the command. If the console ends, the terminal is
 closed, and the command ends as in any terminal that is closed. If the console hangs, it sends no keys, and a joint that
@@ -26,11 +26,16 @@ FORWARDS = b"+"
 BACKWARDS = b"-"
 
 
+def name_command(verb: str) -> str:
+    """Return the command of a verb, without the word `snakesim`."""
+    return "robot jog" if verb == "jog" else f"robot calibrate {verb}"
+
+
 class JointStep:
     """One run of the command. A thread of its own reads the output; every method may be called from any thread."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        """Start the command. words: what follows `snakesim joints`, its verb first."""
+        """Start the command. words: its verb, such as `zero` or `jog`, and its arguments."""
         self.verb = words[0]
         self._lines: deque[str] = deque(maxlen=MAX_LINES)
         self._lock = threading.Lock()  # of `_lines` and `_terminal`
@@ -101,7 +106,7 @@ def _switch_echo_off(terminal: int) -> None:
 
 def _start_command(words: Sequence[str], terminal: int) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        python_command("-m", "snakesim_operator", "joints", *words),
+        python_command("-m", "snakesim_operator", *name_command(words[0]).split(), *words[1:]),
         env=child_environment(),
         stdin=terminal,
         stdout=subprocess.PIPE,

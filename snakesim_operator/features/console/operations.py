@@ -13,10 +13,10 @@ from datetime import datetime
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
 from snakesim_hal.network.session import Link, Publisher, Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Intent, Message, SettingsRequest
+from snakesim_hal.wire.messages import Description, Intent, Message, ParametersRequest
 from snakesim_operator.base.targets import RobotSelection
-from snakesim_operator.robot_commands.command import ANSWER_S, arm, clear, disarm, simulator
-from snakesim_operator.robot_commands.fault import FaultOrder, fault
+from snakesim_operator.robot_commands.command import ANSWER_S, arm, disarm, reset, simulator
+from snakesim_operator.robot_commands.fault import FaultOrder, inject_fault
 from snakesim_operator.robot_commands.prepared_stop import PreparedStop
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -52,7 +52,7 @@ class PageLog:
 class Operations:
     """Sends the commands of viewers to the robot at a link, and logs each of them with its outcome.
 
-    `who` is the name of the viewer. Each method that returns a text waits for the robot's answer, and raises a
+    `requester` is the name of the viewer. Each method that returns a text waits for the robot's answer, and raises a
     SnakesimError when the robot refuses, or does not answer.
     """
 
@@ -69,47 +69,51 @@ class Operations:
         self._log.write(f"{requester}: EMERGENCY STOP: {outcome}")
 
     def connect(self, session: Session) -> None:
-        """Use this session for intents, settings and the stop."""
+        """Use this session for intents, parameters and the stop."""
         self._session = session
         self._intents = session.publisher(keys.INTENT, Intent)
         self.stop.connect(session)
 
-    def arm(self, who: str, robot: Description, *, unchecked: bool = False) -> str:
+    def arm(self, requester: str, robot: Description, *, unchecked: bool = False) -> str:
         """Arm the robot that the page shows. unchecked: also if its joints were not checked."""
-        title = f"{who}: arm"
+        title = f"{requester}: arm"
         if unchecked:
             title += ", unchecked"
         return self._run_command(
             title, lambda print_: arm(robot.robot, robot.backend, self._selection, print_, unchecked=unchecked)
         )
 
-    def disarm(self, who: str) -> str:
+    def disarm(self, requester: str) -> str:
         """Make the joints passive."""
-        return self._run_command(f"{who}: disarm", lambda print_: disarm(self._selection, print_))
+        return self._run_command(f"{requester}: disarm", lambda print_: disarm(self._selection, print_))
 
-    def clear(self, who: str) -> str:
-        """Clear a fault or an emergency stop."""
-        return self._run_command(f"{who}: clear", lambda print_: clear(self._selection, print_))
+    def reset_fault(self, requester: str) -> str:
+        """Reset a fault or an emergency stop."""
+        return self._run_command(f"{requester}: reset", lambda print_: reset(self._selection, print_))
 
-    def change_time(self, who: str, order: SimulatorOrder) -> str:
+    def change_time(self, requester: str, order: SimulatorOrder) -> str:
         """Pause, resume, step, speed up or reset a simulator."""
-        return self._run_command(f"{who}: simulator: {order}", lambda print_: simulator(order, self._selection, print_))
+        return self._run_command(
+            f"{requester}: simulator: {order}", lambda print_: simulator(order, self._selection, print_)
+        )
 
-    def inject(self, who: str, order: FaultOrder) -> str:
+    def inject(self, requester: str, order: FaultOrder) -> str:
         """Inject a fault, or end it, if the run allows fault injection."""
-        title = f"{who}: fault {order.kind}:{order.target}"
-        return self._run_command(title, lambda print_: fault(order, self._selection, print_))
+        title = f"{requester}: fault {order.kind}:{order.target}"
+        return self._run_command(title, lambda print_: inject_fault(order, self._selection, print_))
 
-    def configure(self, who: str, controller: str, settings: str) -> str:
-        """Change the settings of the running controller. settings: all of them, as JSON."""
-        request = SettingsRequest(who=who, controller=controller, settings=settings)
-        return self._run_command(f"{who}: settings", lambda print_: self._send_request(keys.SETTINGS, request, print_))
+    def configure(self, requester: str, controller: str, parameters: str) -> str:
+        """Change the parameters of the running controller. parameters: all of them, as JSON."""
+        request = ParametersRequest(requester=requester, controller=controller, parameters=parameters)
+        return self._run_command(
+            f"{requester}: parameters", lambda print_: self._send_request(keys.PARAMETERS, request, print_)
+        )
 
-    def drive(self, who: str, heading_w_rad: float, speed_m_s: float, acted_ns: int, valid_ns: int) -> None:
+    def drive(self, requester: str, heading_w_rad: float, speed_m_s: float, acted_ns: int, valid_ns: int) -> None:
         """Publish an intent to go in a direction at a speed. Does not wait; does nothing before `connect`.
 
         Args:
-            who: Name of the viewer.
+            requester: Name of the viewer.
             heading_w_rad: Direction in the world frame.
             speed_m_s: Speed; negative is backwards.
             acted_ns: Robot time at which the viewer is known to have acted.
@@ -119,7 +123,7 @@ class Operations:
             return
         intent = Intent(
             timestamp_ns=acted_ns,
-            who=who,
+            requester=requester,
             speed_m_s=speed_m_s,
             heading_w_rad=heading_w_rad,
             valid_for_ns=valid_ns,
@@ -137,7 +141,7 @@ class Operations:
             NotConnectedError: There is no connection or no answer.
         """
         if self._session is None:
-            raise NotConnectedError("not connected to the robot yet")
+            raise NotConnectedError("not connected to the robot yet", code="network/no-robot")
         answer = self._session.request(key, request, ANSWER_S)
         if not answer.ok:
             raise RefusedError(answer.reason)

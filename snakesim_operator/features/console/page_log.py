@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from snakesim_hal.wire.messages import ControlSettings, ControlState, Status
+from snakesim_hal.wire.messages import ControlParameters, ControlState, Status
 
 
 class StateChangeLog:
@@ -13,25 +13,25 @@ class StateChangeLog:
         self._write = write
         self._status: Status | None = None
         self._control: ControlState | None = None
-        self._settings: ControlSettings | None = None
+        self._parameters: ControlParameters | None = None
 
-    def note(self, message: Status | ControlState | ControlSettings | None) -> None:
+    def note(self, message: Status | ControlState | ControlParameters | None) -> None:
         """Compare a message with the one before it of its type. The same message may be given again."""
         match message:
             case Status() if message is not self._status:
                 self._note_status(message)
             case ControlState() if message is not self._control:
                 self._note_control(message)
-            case ControlSettings() if message != self._settings:
-                self._note_settings(message)
+            case ControlParameters() if message != self._parameters:
+                self._note_parameters(message)
             case _:
                 pass
 
     def _note_status(self, status: Status) -> None:
         previous = self._status
         self._status = status
-        if previous is None or (status.lifecycle, status.why) != (previous.lifecycle, previous.why):
-            self._write(f"robot {status.lifecycle}: {status.why}")
+        if previous is None or (status.lifecycle, status.reason) != (previous.lifecycle, previous.reason):
+            self._write(f"robot {status.lifecycle}: {status.reason}")
         known_faults = () if previous is None else previous.faults
         for fault in status.faults:
             if fault not in known_faults:
@@ -44,7 +44,7 @@ class StateChangeLog:
         if previous is None or control.state != previous.state:
             self._write(f"control {control.state}: {control.reason}")
 
-    def _note_settings(self, settings: ControlSettings) -> None:
-        self._settings = settings
-        if settings.who is not None:  # None: the controller started with them
-            self._write(f"settings of {settings.controller} in force, as {settings.who} asked")
+    def _note_parameters(self, parameters: ControlParameters) -> None:
+        self._parameters = parameters
+        if parameters.requester is not None:  # None: the controller started with them
+            self._write(f"parameters of {parameters.controller} in force, as {parameters.requester} asked")

@@ -1,6 +1,6 @@
-"""Many runs: `snakesim evaluate`, `sweep` and `optimize`, on workers of this computer or of a Dask cluster.
+"""Many runs: `snakesim study evaluate`, `sweep` and `optimize`, on workers of this computer or of a Dask cluster.
 
-`arguments`  the three commands' arguments; the only module here that is imported without the extra `evaluate`
+`arguments`  the three commands' arguments; the only module here that is imported without the extra `train`
 `suite`      reads a suite file and makes the cases; `case` is one of them, and runs in a worker
 `cluster`    the workers: processes on this computer, or a lab's cluster
 `evaluation` runs the cases, keeps what is done (`store`), prints and draws it (`table`, `page`)

@@ -1,4 +1,4 @@
-"""Arguments of `snakesim evaluate`, `sweep` and `optimize`. Importable without the extra that they need."""
+"""The commands `snakesim study evaluate`, `sweep` and `optimize`. Importable without the extra that they need."""
 
 import argparse
 import dataclasses
@@ -6,39 +6,30 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.programs.arguments import number_type
+from snakesim_hal.programs.arguments import (
+    add_fields,
+    add_out,
+    add_resume,
+    add_scenario_name,
+    add_seed,
+    add_set,
+    add_workers,
+    number_type,
+)
+from snakesim_hal.programs.commands import Command, Commands
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from snakesim_hal.base.step_limit import Pulse
 
-TASK = "run"  # the heading of `snakesim --help` that lists it
 
-
-def add_commands(commands: Any) -> None:
-    """Add `evaluate`, `sweep` and `optimize` to the parser of `snakesim`."""
-    _add_evaluate(commands)
-    _add_sweep(commands)
-    _add_optimize(commands)
-
-
-def _add_evaluate(commands: Any) -> None:
-    command = commands.add_parser(
-        "evaluate",
-        help="run controllers on many fields; a table with confidence intervals, and a page",
-        epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run; "
-        "130 stopped by Ctrl-C, and --resume goes on.",
-    )
-    command.add_argument("suite", help="name of a shipped suite, or path of a suite file")
-    command.add_argument(
-        "--controllers", "--controller", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
-    )
-    command.add_argument(
-        "--fields", type=number_type(1, 100_000), metavar="N", help="fields for each row and controller"
-    )
-    command.add_argument("--rows", metavar="1,2,...", help="only these rows of the table, by number")
-    command.add_argument(
+def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file")
+    parser.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
+    add_fields(parser, "for each row and controller (default: the suite's)")
+    _add_rows(parser, "only these rows of the table, by number")
+    parser.add_argument(
         "--against",
         action="append",
         default=[],
@@ -46,71 +37,62 @@ def _add_evaluate(commands: Any) -> None:
         metavar="DIR",
         help="pair with the score card there",
     )
-    _add_set(command)
-    _add_shared(command)
-    command.set_defaults(act=_evaluate)
+    add_set(parser)
+    _add_shared(parser)
 
 
-def _add_sweep(commands: Any) -> None:
-    command = commands.add_parser("sweep", help="run a scenario with different values of any setting")
-    command.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
-    command.add_argument(
-        "--vary", action="append", required=True, metavar="KEY=LOW:HIGH:COUNT", help="or KEY=[A, B]; may be repeated"
-    )
-    command.add_argument(
-        "--seeds", type=number_type(1, 100_000), default=1, metavar="N", help="runs for each value (1)"
-    )
-    _add_set(command)
-    _add_shared(command)
-    command.set_defaults(act=_sweep)
+def _add_sweep(parser: argparse.ArgumentParser) -> None:
+    add_scenario_name(parser)
+    _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B]; may be repeated")
+    _add_seeds(parser, "runs for each value (default: 1)")
+    add_set(parser)
+    _add_shared(parser)
 
 
-def _add_optimize(commands: Any) -> None:
-    command = commands.add_parser("optimize", help="search settings for the best mean of a number of the summary")
-    command.add_argument("scenario", help="name of a shipped scenario or path of its file; with --rows, of a suite")
-    command.add_argument("--rows", metavar="1,2,...", help="on these rows of a suite, with what it draws")
-    command.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
-    command.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
-    command.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
-    command.add_argument(
-        "--trials", type=number_type(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
+def _add_optimize(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenario",
+        metavar="SCENARIO",
+        help="name of a shipped scenario, or path of its file; with --rows, of a suite",
     )
-    command.add_argument(
-        "--seeds",
-        type=number_type(1, 100_000),
-        default=1,
-        metavar="N",
-        help="runs for each trial, or fields for each row (1)",
+    _add_rows(parser, "on these rows of a suite, with what it draws")
+    _add_vary(parser, "range of a key: KEY=LOW:HIGH; may be repeated")
+    parser.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
+    parser.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
+    parser.add_argument(
+        "--trials", type=number_type(1, 100_000), default=50, metavar="N", help="in the file at the end (default: 50)"
     )
-    command.add_argument(
+    _add_seeds(parser, "runs for each trial, or fields for each row (default: 1)")
+    parser.add_argument(
         "--storage", type=Path, metavar="FILE", help="SQLite file; an old one goes on (default: a new one in runs/)"
     )
-    _add_set(command)
-    _add_workers(command)
-    command.set_defaults(act=_optimize)
+    add_set(parser)
+    _add_study_seed(parser)
+    add_workers(parser)
 
 
-def _add_set(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="in all runs; may be repeated")
+def _add_rows(parser: argparse.ArgumentParser, about: str) -> None:
+    parser.add_argument("--rows", metavar="1,2,...", help=about)
+
+
+def _add_vary(parser: argparse.ArgumentParser, about: str) -> None:
+    parser.add_argument("--vary", action="append", required=True, metavar="KEY=RANGE", help=about)
+
+
+def _add_seeds(parser: argparse.ArgumentParser, about: str) -> None:
+    parser.add_argument("--seeds", type=number_type(1, 100_000), default=1, metavar="N", help=about)
 
 
 def _add_shared(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/NAME-TIME)")
-    parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
-    _add_workers(parser)
+    add_out(parser, "folder of the results (default: runs/NAME-TIME)")
+    add_resume(parser)
+    _add_study_seed(parser)
+    add_workers(parser)
 
 
-def _add_workers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--seed", type=int, metavar="S", help="the first field; the next is S + 1 (1, or drawn by the suite)"
-    )
-    parser.add_argument(
-        "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
-    )
-    parser.add_argument(
-        "--workers", type=number_type(1, 100_000), metavar="N", help="processes on this computer (one a core)"
-    )
+def _add_study_seed(parser: argparse.ArgumentParser) -> None:
+    add_seed(parser, "of the first field; the next one has SEED + 1; default: 1, or drawn by the suite")
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -139,7 +121,7 @@ def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
     suite = override_suite(suite, _parse_settings(arguments.set))
     names = (arguments.controllers or "").split(",")
     controllers = [name.strip() for name in names if name.strip()]
-    command = ["snakesim", "evaluate", arguments.suite]
+    command = ["snakesim", "study", "evaluate", arguments.suite]
     if controllers:
         command += ["--controllers", ",".join(controllers)]
     if arguments.rows:
@@ -165,7 +147,7 @@ def _sweep_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
     title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"[:200]
     vary = dict(map(parse_vary, arguments.vary))
     suite = Suite(title=title, scenario=arguments.scenario, set=_parse_settings(arguments.set), vary=vary)
-    command = ["snakesim", "sweep", arguments.scenario]
+    command = ["snakesim", "study", "sweep", arguments.scenario]
     command += _repeat_option("--vary", arguments.vary)
     command += _repeat_option("--set", arguments.set)
     request = EvaluationRequest(
@@ -224,7 +206,9 @@ def _parse_numbers(text: str, option: str) -> list[int]:
 
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not all(word.isdecimal() and len(word) < 7 for word in words):
-        raise ConfigError(f"{option} {text[:60]}: give whole numbers, such as {option} 1,2")
+        raise ConfigError(
+            f"{option} {text[:60]}: give whole numbers, such as {option} 1,2", code="command/invalid-option"
+        )
     return [int(word) for word in words]
 
 
@@ -237,7 +221,43 @@ def _repeat_option(option: str, values: list[str]) -> list[str]:
 
 
 def _check_extra() -> None:
-    """Raise an error that names the extra `evaluate` if it is not installed."""
+    """Raise an error that names the extra `train` if it is not installed."""
     from snakesim_operator.base import extras
 
-    extras.require("evaluate", "this command")
+    extras.require("train", "this command")
+
+
+COMMANDS: Commands = (
+    Command(
+        name="study evaluate",
+        help="Run controllers on many fields; writes a table with confidence intervals, and a page.",
+        add=_add_evaluate,
+        run=_evaluate,
+        details="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run; "
+        "130 stopped by Ctrl-C, and --resume goes on.",
+        examples=(
+            "study evaluate clutter --controllers obstacle_aided,hold --fields 20",
+            "study evaluate ./suite.toml --out runs/suite --resume",
+        ),
+    ),
+    Command(
+        name="study sweep",
+        help="Run a scenario with different values of any setting.",
+        add=_add_sweep,
+        run=_sweep,
+        examples=(
+            "study sweep peg_row --vary control.speed_kp_s=0.1:0.5:5",
+            "study sweep peg_row --vary control.speed_kp_s=0.1:0.5:5 --seeds 4 --out runs/sweep",
+        ),
+    ),
+    Command(
+        name="study optimize",
+        help="Search settings for the best mean of a number of the summary.",
+        add=_add_optimize,
+        run=_optimize,
+        examples=(
+            "study optimize peg_row --vary control.speed_kp_s=0.1:0.5 --goal path_distance_m",
+            "study optimize peg_row --vary control.speed_kp_s=0.1:0.5 --goal energy_j_per_m --minimize --trials 100",
+        ),
+    ),
+)

@@ -120,7 +120,9 @@ def read_card(path: Path) -> Card:
     try:
         return msgspec.json.decode(file.read_bytes(), type=Card)
     except (OSError, msgspec.DecodeError) as error:
-        raise ConfigError(f"--against {path}: no score card ({error}); give the folder of an evaluation") from None
+        raise ConfigError(
+            f"--against {path}: no score card ({error}); give the folder of an evaluation", code="file/not-readable"
+        ) from None
 
 
 def compare(card: Card, others: Sequence[Card]) -> list[Comparison]:

@@ -79,7 +79,7 @@ def evaluate(request: EvaluationRequest, pulse: Pulse | None = None) -> int:
 def _run_all_cases(request: EvaluationRequest) -> int:
     """Run all cases that are not done yet, and write the results. Return the exit code."""
     if request.resume and request.out is None:
-        raise ConfigError("--resume: name the folder of the evaluation with --out")
+        raise ConfigError("--resume: name the folder of the evaluation with --out", code="command/invalid-option")
     check_address(request.cluster)
     other_cards = [read_card(path) for path in request.against]
     seed = choose_first_field(request)
@@ -116,7 +116,10 @@ def choose_first_field(request: EvaluationRequest) -> int:
     if not request.suite.fresh:
         return 1
     if request.resume:
-        raise ConfigError("--resume: this suite draws its fields; name with --seed those that were printed as drawn")
+        raise ConfigError(
+            "--resume: this suite draws its fields; name with --seed those that were printed as drawn",
+            code="command/invalid-option",
+        )
     seed = secrets.randbelow(LAST_DRAWN_FIELD - FIRST_DRAWN_FIELD) + FIRST_DRAWN_FIELD
     print_line(f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again")
     return seed
@@ -134,13 +137,19 @@ def find_case(suite: Suite, source: str, only: str) -> Case:
     """Return the case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
     parts = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
     if parts is None:
-        raise ConfigError(f"--only {shorten(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1")
+        raise ConfigError(
+            f"--only {shorten(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1",
+            code="command/invalid-option",
+        )
     cases = make_cases(suite, source, [parts["controller"]], 1, int(parts["field"]))
     matching = [case for case in cases if parts["row"] is None or case.row == int(parts["row"])]
     if len(matching) == 1:
         return matching[0]
     rows = ", ".join(f"{case.row} ({case.setting})" for case in cases[:12])
-    raise ConfigError(f"--only {only}: add one of the rows, as in {name_case(cases[0])}; there are {rows}")
+    raise ConfigError(
+        f"--only {only}: add one of the rows, as in {name_case(cases[0])}; there are {rows}",
+        code="command/invalid-option",
+    )
 
 
 def name_case(case: Case) -> str:

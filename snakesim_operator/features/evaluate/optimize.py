@@ -1,4 +1,4 @@
-"""`snakesim optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
+"""`snakesim study optimize`: searches settings for the best mean of a number, with Optuna. A file keeps all trials."""
 
 import shlex
 import time
@@ -73,7 +73,8 @@ def optimize(request: SearchRequest) -> int:
     space = dict(map(_parse_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(
-            f"--goal {request.goal}: the summary of a run has no such number; it has path_distance_m, advance_m_s, ..."
+            f"--goal {request.goal}: the summary of a run has no such number; it has path_distance_m, advance_m_s, ...",
+            code="command/invalid-option",
         )
     # Both ends of all ranges are configured before anything is started, so that an invalid range is an error now.
     cases_at_ends = _cases_of_trial(request, {key: span.low for key, span in space.items()})
@@ -165,7 +166,7 @@ def _report_best(request: SearchRequest, study: Study) -> int:
     print_line(f"best {request.goal}: {best.value:.4g}, trial {best.user_attrs[NUMBER]}")
     if request.rows:
         rows = ",".join(map(str, request.rows))
-        words = ["snakesim", "evaluate", request.scenario, "--rows", rows]
+        words = ["snakesim", "study", "evaluate", request.scenario, "--rows", rows]
         print_line(f"  {_command_line(words, request.set, best.params)}")
         return 0
     results = best.user_attrs[RESULTS]
@@ -218,4 +219,7 @@ def _parse_span(text: str) -> tuple[str, Span]:
             return key, IntDistribution(int(low), int(high))
         return key, FloatDistribution(float(low), float(high))
     except ValueError:
-        raise ConfigError(f"--vary {shorten(text)}: give key=low:high, such as control.propulsion_n=5:40") from None
+        raise ConfigError(
+            f"--vary {shorten(text)}: give key=low:high, such as control.propulsion_n=5:40",
+            code="command/invalid-option",
+        ) from None

@@ -49,7 +49,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
 
     def command_line(self, storage: Path) -> str:
         """Return the command that continues the search, as a user types it."""
-        words = ["snakesim", "optimize", self.scenario]
+        words = ["snakesim", "study", "optimize", self.scenario]
         if self.rows:
             words += ["--rows", ",".join(map(str, self.rows))]
         for key, limits in self.vary.items():
@@ -88,7 +88,7 @@ def open_study(path: Path, command: SearchCommand) -> Study:
     except STORAGE_ERRORS as error:
         message = getattr(error, "strerror", None) or str(error)
         reason = message.splitlines()[0][:200]
-        raise ConfigError(f"--storage {path}: {reason}; choose another file") from None
+        raise ConfigError(f"--storage {path}: {reason}; choose another file", code="file/not-writable") from None
     _repeat_trials_without_result(study)
     return study
 
@@ -134,7 +134,8 @@ def _check_same_search(path: Path, kept: Any, command: SearchCommand) -> None:
     except msgspec.ValidationError:
         raise ConfigError(
             f"--storage {path}: the file holds trials and does not say with which command they were made: an older "
-            f"version or another program wrote it. Trials of two searches are not comparable; choose another file"
+            f"version or another program wrote it. Trials of two searches are not comparable; choose another file",
+            code="evaluation/other-search",
         ) from None
     here = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
     differences = list(_differences(there, here))
@@ -142,7 +143,8 @@ def _check_same_search(path: Path, kept: Any, command: SearchCommand) -> None:
         return
     raise ConfigError(
         f"--storage {path}: the file holds another search, whose trials are not comparable with this one's. "
-        f"{'; '.join(differences)}. Go on with that search by `{there.command_line(path)}`, or choose another file"
+        f"{'; '.join(differences)}. Go on with that search by `{there.command_line(path)}`, or choose another file",
+        code="evaluation/other-search",
     )
 
 

@@ -65,16 +65,21 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     except OSError as error:
-        raise ConfigError(f"--out {folder}: {error.strerror}; choose another folder") from None
+        raise ConfigError(
+            f"--out {folder}: {error.strerror}; choose another folder", code="file/not-writable"
+        ) from None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(handle).st_size and not resume:
             raise ConfigError(
-                f"--out {folder} holds an evaluation; go on with it by --resume, or choose another folder"
+                f"--out {folder} holds an evaluation; go on with it by --resume, or choose another folder",
+                code="file/already-exists",
             )
         yield ResultStore(handle, _read_results(path, handle))
     except BlockingIOError:
-        raise ConfigError(f"--out {folder}: another evaluation is writing there; choose another folder") from None
+        raise ConfigError(
+            f"--out {folder}: another evaluation is writing there; choose another folder", code="file/in-use"
+        ) from None
     finally:
         os.close(handle)
 

@@ -53,26 +53,62 @@ class SuiteRow(FileStruct, frozen=True, kw_only=True):
     """A setting with a name: `[[row]]`."""
 
     name: Annotated[str, Meta(min_length=1, max_length=80)]
+    """Name of the row in the table of results."""
+
     set: dict[str, Any] = {}
+    """Values that this row sets, as with `--set`, over those of the suite."""
+
     unset: list[str] = []
+    """Optional keys that this row removes, such as `robot.sensors.pose`."""
+
     without: list[str] = []
+    """Keys that no [[draw]] of the suite sets in this row."""
 
 
 class Suite(FileStruct, frozen=True, kw_only=True):
     """A whole suite file."""
 
     title: str = ""
+    """Description in one line, which lists of suites show."""
+
     scenario: Annotated[str, Meta(min_length=1)]
+    """Scenario that all cases begin with: the name of a shipped one, or a path."""
+
     fields: Count = 20
+    """Number of fields for each row and controller, unless `--fields` gives another; a field is the seed of a run and
+    of its random scene.
+    """
+
     controllers: list[str] = []
+    """Controllers to try, unless `--controllers` gives others; empty: that of the scenario."""
+
     give_up_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 12.0
+    """Robot time without 3 cm of advance after which a run is ended as stuck."""
+
     limit_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 1800.0
+    """Wall time of one run after which it is stopped, and counts as an error."""
+
     set: dict[str, Any] = {}
+    """Values that every row sets, as with `--set`."""
+
     unset: list[str] = []
+    """Optional keys that every row removes."""
+
     vary: dict[str, list[Any] | str] = {}
+    """For each key its values, as a list or as "LOW:HIGH:COUNT"; every combination of the values is a row."""
+
     row: list[SuiteRow] = []
+    """Rows with a name, each an entry `[[row]]`, combined with every combination of `vary`; empty: only these
+    combinations.
+    """
+
     draw: list[Draw] = []
-    fresh: bool = False  # new fields are drawn for every evaluation, unless --seed gives the first one
+    """Random values, each an entry `[[draw]]`; a value is the same for every row and controller of one field."""
+
+    fresh: bool = False
+    """True: every evaluation has new fields, unless `--seed` gives the first one; false: fields begin at the same
+    number.
+    """
 
 
 @dataclass(frozen=True)
@@ -102,7 +138,7 @@ def select_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list
     known = {case.row for case in cases}
     for row in rows:
         if row not in known:
-            raise ConfigError(f"--rows {row}: {source} has rows 1 to {cases[-1].row}")
+            raise ConfigError(f"--rows {row}: {source} has rows 1 to {cases[-1].row}", code="command/invalid-option")
     if not rows:
         return list(cases)
     return [case for case in cases if case.row in rows]
@@ -142,7 +178,7 @@ def _check_names_differ(settings: Sequence[SuiteSetting], source: str) -> None:
     counts = Counter(setting.name for setting in settings)
     repeated = [name for name, count in counts.items() if count > 1]
     if repeated:
-        raise ConfigError(f"{source}: two rows are called {min(repeated)!r}; rename one")
+        raise ConfigError(f"{source}: two rows are called {min(repeated)!r}; rename one", code="config/duplicate-name")
 
 
 def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: int, seed: int) -> list[Case]:
@@ -164,7 +200,7 @@ def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: in
     settings = make_settings(suite, source)
     count = len(settings) * len(controllers or [""]) * fields
     if count > MAX_CASES:
-        raise ConfigError(f"{source}: {count} cases; at most {MAX_CASES} are allowed")
+        raise ConfigError(f"{source}: {count} cases; at most {MAX_CASES} are allowed", code="command/invalid-option")
     cases: list[Case] = []
     for number, setting in enumerate(settings, 1):
         for controller in controllers or [None]:
@@ -201,13 +237,19 @@ def parse_vary(text: str) -> tuple[str, list[Any] | str]:
     """Return key and values of `--vary key=low:high:count` or `key=[a, b, c]`. Raises ConfigError."""
     key, equals, given = (part.strip() for part in text.partition("="))
     if not (key and equals and given):
-        raise ConfigError(f"--vary {shorten(text)}: give key=low:high:count, such as control.look_ahead_m=0.05:0.2:4")
+        raise ConfigError(
+            f"--vary {shorten(text)}: give key=low:high:count, such as control.look_ahead_m=0.05:0.2:4",
+            code="command/invalid-option",
+        )
     if not given.startswith("["):
         return key, given
     try:
         return key, parse_toml(f"value = {given}", "--vary")["value"]
     except ConfigError:
-        raise ConfigError(f"--vary {shorten(text)}: {shorten(given)} is no list; write it as in TOML, [1, 2]") from None
+        raise ConfigError(
+            f"--vary {shorten(text)}: {shorten(given)} is no list; write it as in TOML, [1, 2]",
+            code="command/invalid-option",
+        ) from None
 
 
 def _check_config(config: RunConfig, table: Table, where: str) -> None:
@@ -216,7 +258,7 @@ def _check_config(config: RunConfig, table: Table, where: str) -> None:
         check(config)
         check_plugins(config, table)
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        raise ConfigError(f"{where}: {error}", code=error.code) from None
 
 
 def seed_keys(table: Table) -> list[str]:
@@ -242,7 +284,9 @@ def _draws_of_row(suite: Suite, without: Sequence[str], where: str) -> list[Draw
     drawn_keys = {key for draw in suite.draw for key in draw.set}
     for key in without:
         if key not in drawn_keys:
-            raise ConfigError(f"{where}: `without` names {key!r}, which no [[draw]] sets")
+            raise ConfigError(
+                f"{where}: `without` names {key!r}, which no [[draw]] sets", code="command/invalid-option"
+            )
     draws: list[Draw] = []
     for draw in suite.draw:
         kept = [key for key in draw.set if key not in without]
@@ -265,7 +309,7 @@ def _list_values(key: str, given: list[Any] | str, source: str) -> list[Any]:
     if isinstance(given, str):
         return space_evenly(given, f"{source}: `vary.{key}`")
     if not given:
-        raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value")
+        raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value", code="command/invalid-option")
     return given
 
 
@@ -280,7 +324,8 @@ def space_evenly(given: str, where: str) -> list[float]:
     except ValueError:
         raise ConfigError(
             f"{where} = {shorten(given)!r}: give low:high:count with a count of 2 to 1000, such as "
-            "0.05:0.2:4, or a list"
+            "0.05:0.2:4, or a list",
+            code="command/invalid-option",
         ) from None
     return [round(low + (high - low) * i / (count - 1), 12) for i in range(int(count))]
 

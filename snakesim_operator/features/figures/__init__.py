@@ -1,1 +1,1 @@
-"""`snakesim plot`: figures of a run for a paper, as vector graphics: any signals, and those of the SnakeSIM paper."""
+"""`snakesim recording plot`: vector graphics of a run for a paper: signals, and those of the SnakeSIM paper."""

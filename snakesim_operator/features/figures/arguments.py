@@ -1,52 +1,64 @@
-"""Arguments of `snakesim plot`. Importable without the extra that it needs."""
+"""The command `snakesim recording plot`. Importable without the extra that it needs."""
 
 import argparse
-from pathlib import Path
-from typing import Any
 
-from snakesim_hal.programs.arguments import number_type
-from snakesim_operator.playback.arguments import add_span
-
-TASK = "results"  # under which `snakesim --help` lists it
+from snakesim_hal.programs.arguments import add_out, number_type
+from snakesim_hal.programs.commands import Command, Commands
+from snakesim_operator.playback.arguments import add_recording, add_span
 
 
-def add_commands(commands: Any) -> None:
-    """Add it to the parser of `snakesim`."""
-    plot = commands.add_parser(
-        "plot",
-        help="figures of a run for a paper: signals over time, or those of the SnakeSIM paper",
-        epilog="Signals are named as in `snakesim export`. A comma puts several of one unit on one pair of axes: "
-        "angle_rad.joint_7,target.joint_7. Exit code: 0; 2 wrong input; 3 made, but the recording lacks something.",
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    add_recording(parser)
+    parser.add_argument(
+        "signals", nargs="*", metavar="SIGNAL", help="a pair of axes each (default: angle_rad torque_nm)"
     )
-    plot.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
-    plot.add_argument("signals", nargs="*", metavar="SIGNAL", help="a pair of axes each (default: angle_rad torque_nm)")
-    plot.add_argument(
+    parser.add_argument(
         "--paper", action="store_true", help="instead: the paper's Figures 8 to 13, of this run, one file each"
     )
-    plot.add_argument(
-        "--out", type=Path, metavar="PATH", help="FILE.pdf, .svg or .png; with --paper a folder (default: in RUN)"
+    add_out(parser, "FILE.pdf, .svg or .png; with --paper a folder (default: in RUN)")
+    parser.add_argument(
+        "--width-in",
+        type=number_type(1.0, 40.0, "inches"),
+        default=3.5,
+        metavar="INCHES",
+        help="width of the figure in inches (default: 3.5, one column)",
     )
-    plot.add_argument("--width", type=number_type(1.0, 40.0, "inches"), default=3.5, help="in inches (3.5: one column)")
-    plot.add_argument("--dark", action="store_true", help="on black, for slides")
-    add_span(plot)
-    plot.set_defaults(act=_plot)
+    parser.add_argument("--dark", action="store_true", help="on black, for slides")
+    add_span(parser)
 
 
 def _plot(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
-    extras.require("plot", "`snakesim plot`")
+    extras.require("report", "`snakesim recording plot`")
     from snakesim_operator.features.figures.inherited import import_matplotlib
 
     import_matplotlib()
     from snakesim_operator.features.figures.drawn import plot
 
     return plot(
-        arguments.run,
+        arguments.recording,
         arguments.signals,
         arguments.out,
         paper=arguments.paper,
-        width_in=arguments.width,
+        width_in=arguments.width_in,
         span_s=(arguments.from_s, arguments.to_s),
         dark=arguments.dark,
     )
+
+
+COMMANDS: Commands = (
+    Command(
+        name="recording plot",
+        help="Draw figures of a run for a paper: signals over time, or those of the SnakeSIM paper.",
+        add=_add_plot,
+        run=_plot,
+        details="Signals are named as in `snakesim recording export`. A comma puts several of one unit on one pair of "
+        "axes: angle_rad.joint_7,target.joint_7. Exit code: 0; 2 wrong input; 3 made, but something is missing in the "
+        "recording.",
+        examples=(
+            "recording plot runs/demo --out demo.pdf",
+            "recording plot runs/demo angle_rad.joint_7,target.joint_7 torque_nm --from 2 --to 6",
+        ),
+    ),
+)

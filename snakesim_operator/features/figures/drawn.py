@@ -19,7 +19,7 @@ from snakesim_operator.features.figures.lines import STYLE, Floats, plot_over_ti
 from snakesim_operator.features.figures.paper import draw_paper_figures
 from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import zero_s
 
 FORMATS = (".pdf", ".svg", ".png")
@@ -58,7 +58,7 @@ def plot(
     """
     record = RunRecord.load(run)
     if not len(record.time_s):
-        raise ConfigError(f"{run}: nothing was recorded in it; the robot was never armed")
+        raise ConfigError(f"{run}: nothing was recorded in it; the robot was never armed", code="recording/never-armed")
     folder = run if run.is_dir() else run.parent
     style = ["dark_background", STYLE] if dark else STYLE
     with matplotlib.style.context(style):
@@ -67,14 +67,18 @@ def plot(
         else:
             path = out or folder / "plot.pdf"
             if path.suffix not in FORMATS:
-                raise ConfigError(f"--out {path}: give a file that ends in {', '.join(FORMATS)}")
+                raise ConfigError(
+                    f"--out {path}: give a file that ends in {', '.join(FORMATS)}", code="command/invalid-option"
+                )
             write_figure(draw_signals(record, names, width_in, span_s), path)
-    return exit_code(run, record.lacks)
+    return exit_code(run, record.missing)
 
 
 def _write_paper_figures(record: RunRecord, folder: Path, width_in: float, span_s: tuple[float, float]) -> None:
     if folder.suffix in FORMATS:
-        raise ConfigError(f"--out {folder}: the paper's figures are several files; give a folder")
+        raise ConfigError(
+            f"--out {folder}: the paper's figures are several files; give a folder", code="command/invalid-option"
+        )
     for name, figure in draw_paper_figures(record, width_in, span_s).items():
         write_figure(figure, folder / f"{name}.pdf")
 
@@ -141,7 +145,8 @@ def _check_known(name: str, known: Mapping[str, Any], record: RunRecord) -> None
     wide = ", ".join(array for array in arrays(record) if array != "time_s")
     raise ConfigError(
         f"no signal {shorten(name)!r}; {suggest_word(name, list(known))}there are {wide}, and columns of them "
-        f"such as angle_rad.{record.description.joints[0].name}"
+        f"such as angle_rad.{record.description.joints[0].name}",
+        code="recording/unknown-signal",
     )
 
 
@@ -154,7 +159,10 @@ def _find_common_unit(names: Sequence[str], record: RunRecord) -> str:
     if len(units) > 1:
         units.discard(UNITS["target"])
     if len(units) > 1:
-        raise ConfigError(f"{','.join(names)}: {' and '.join(sorted(units))} have no axis in common; leave a space")
+        raise ConfigError(
+            f"{','.join(names)}: {' and '.join(sorted(units))} have no axis in common; leave a space",
+            code="command/invalid-option",
+        )
     (unit,) = units
     return unit
 
@@ -186,6 +194,9 @@ def _limit_time(axes: Axes, record: RunRecord, span_s: tuple[float, float]) -> N
     end_s = min(span_s[1], last_s)
     if start_s >= end_s:
         span = f"--from {span_s[0]:g} --to {span_s[1]:g}"
-        raise ConfigError(f"{span}: give a span, its begin first, within the 0 to {last_s:g} s of this run")
+        raise ConfigError(
+            f"{span}: give a span, its begin first, within the 0 to {last_s:g} s of this run",
+            code="command/invalid-option",
+        )
     axes.set_xlim(start_s, end_s)
     axes.set_xlabel("time [s]")

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.figures.inherited import PLAIN_TEXT
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import zero_s
 
 STYLE: Any = {

@@ -18,12 +18,12 @@ from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.lines import Floats, plot_over_time
-from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_intervals
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
 from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
 from snakesim_operator.results.report.timeline import commanded_torque_nm, most_used_joints, reference_rad
 from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import end_s
 
 MAX_MOMENTS = 4  # in figure 10
@@ -62,12 +62,13 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
     if not instants:
         raise ConfigError(
             f"{record.folder}: at no time within it did a controller say which forces it solved for; such are "
-            "obstacle_triplet and obstacle_aided, with a pose and a recording; signals can be drawn of any run"
+            "obstacle_triplet and obstacle_aided, with a pose and a recording; signals can be drawn of any run",
+            code="recording/missing-data",
         )
     first = instants[0]
     moment_indices = np.unique(np.linspace(0, len(instants) - 1, MAX_MOMENTS).astype(int))
     moments = [instants[i] for i in moment_indices]
-    intervals = propulsion_intervals(record)
+    intervals = find_propulsion_intervals(record)
     joints = most_used_joints(intervals, MAX_JOINTS)
     drawn_span_s = (span_s[0], min(span_s[1], end_s(record)))
     return {

@@ -1,49 +1,36 @@
-"""`snakesim deploy`: what a lab needs, made from one file. Importable without the extra `lab`."""
+"""`snakesim lab`: what a lab needs, made from one file. Importable without the extra `lab`."""
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from snakesim_hal.base.process import stop_signals_raise
 from snakesim_hal.base.terminal import print_line
+from snakesim_hal.programs.arguments import add_json, add_out
+from snakesim_hal.programs.commands import Command, Commands, Noun
 
 if TYPE_CHECKING:
     from snakesim_operator.features.lab.lab_file import Lab
 
 AUTHORITY = "authority"
-TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
-
-
-def add_commands(commands: Any) -> None:
-    """Add `deploy` to the parser of `snakesim`."""
-    deploy = commands.add_parser("deploy", help="make a lab's configuration, access rules and certificates from a file")
-    parts = deploy.add_subparsers(dest="part", required=True, metavar="WHAT")
-
-    example = parts.add_parser("example", help="print a lab file with comments, to begin with")
-    example.set_defaults(act=_example)
-
-    made = parts.add_parser("render", help="write each machine's routers, sessions and units into DIR/MACHINE")
-    _add_lab(made)
-    made.set_defaults(act=_render)
-
-    certs = parts.add_parser("certs", help="make the lab's authority, and the certificates that are missing or ending")
-    _add_lab(certs)
-    certs.add_argument("--authority", type=Path, metavar="DIR", help="folder of the authority (default: DIR/authority)")
-    certs.add_argument("--rotate", action="store_true", help="renew every certificate")
-    certs.set_defaults(act=_certs)
-
-    live = parts.add_parser(
-        "check",
-        help="ask the lab as it runs: certificates, routers, processes, clocks, and what each role may do",
-        epilog="Exit code: 0 all is as the lab file says, 1 something is not, 2 wrong input. It moves nothing.",
-    )
-    _add_lab(live)
-    live.set_defaults(act=_check)
 
 
 def _add_lab(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lab", type=Path, metavar="LAB.toml", help="the lab file")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="one folder for each machine in there")
+    add_out(parser, "folder, with one folder for each machine in there", required=True)
+
+
+def _add_certs(parser: argparse.ArgumentParser) -> None:
+    _add_lab(parser)
+    parser.add_argument(
+        "--authority", type=Path, metavar="DIR", help="folder of the authority (default: authority in --out)"
+    )
+    parser.add_argument("--rotate", action="store_true", help="renew every certificate")
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    _add_lab(parser)
+    add_json(parser)
 
 
 def _example(_arguments: argparse.Namespace) -> int:
@@ -84,7 +71,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
     with stop_signals_raise():  # so that no session file stays behind
         try:
-            return check(lab, arguments.out)
+            return check(lab, arguments.out, as_json=arguments.json)
         except KeyboardInterrupt:
             return 130
 
@@ -93,5 +80,42 @@ def _lab(arguments: argparse.Namespace) -> "Lab":
     from snakesim_operator.base import extras
     from snakesim_operator.features.lab.lab_file import load_lab
 
-    extras.require("lab", "`snakesim deploy`")
+    extras.require("lab", "`snakesim lab`")
     return load_lab(arguments.lab)
+
+
+COMMANDS: Commands = (
+    Noun(
+        name="lab",
+        heading="files and computers",
+        help="Make a lab's configuration, access rules and certificates from a file, and check the lab.",
+    ),
+    Command(
+        name="lab example",
+        help="Print a lab file with comments, to begin with.",
+        run=_example,
+        examples=("lab example", "lab example > lab.toml"),
+    ),
+    Command(
+        name="lab render",
+        help="Write the routers, sessions and systemd units of each machine into a folder.",
+        add=_add_lab,
+        run=_render,
+        examples=("lab render lab.toml --out lab", "lab render /etc/snakesim/lab.toml --out /etc/snakesim/lab"),
+    ),
+    Command(
+        name="lab certs",
+        help="Make the lab's certificate authority, and the certificates that are missing or ending.",
+        add=_add_certs,
+        run=_certs,
+        examples=("lab certs lab.toml --out lab", "lab certs lab.toml --out lab --authority ~/authority --rotate"),
+    ),
+    Command(
+        name="lab check",
+        help="Check a lab as it runs: certificates, routers, processes, clocks, and what each role may do.",
+        add=_add_check,
+        run=_check,
+        details="Exit code: 0 all is as the lab file says, 1 something is not, 2 wrong input. It moves nothing.",
+        examples=("lab check lab.toml --out lab", "lab check lab.toml --out lab --json"),
+    ),
+)

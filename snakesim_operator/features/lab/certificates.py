@@ -81,12 +81,15 @@ def _make_private(folder: Path) -> None:
         folder.mkdir(mode=0o700)
     except FileExistsError:
         if not folder.is_dir():
-            raise ConfigError(f"--authority {folder}: is a file; name a folder") from None
+            raise ConfigError(
+                f"--authority {folder}: is a file; name a folder", code="certificate/invalid-authority"
+            ) from None
         mode = stat.S_IMODE(folder.stat().st_mode)
         if mode & 0o077:
             raise ConfigError(
                 f"--authority {folder}: others may look or write into this folder (mode {mode:o}), and who has the "
-                f"authority's key controls the lab. Name a new folder, or make it yours alone: chmod 700 {folder}"
+                f"authority's key controls the lab. Name a new folder, or make it yours alone: chmod 700 {folder}",
+                code="certificate/invalid-authority",
             ) from None
 
 
@@ -94,18 +97,27 @@ def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
     """Read the authority and check that certificate and key belong together. Raises ConfigError."""
     warning = check_permissions(at_key)
     if warning:
-        raise ConfigError(f"{warning}; as this is the lab's authority, anybody may have joined: better make a new one")
+        raise ConfigError(
+            f"{warning}; as this is the lab's authority, anybody may have joined: better make a new one",
+            code="certificate/invalid-authority",
+        )
     try:
         certificate = x509.load_pem_x509_certificate(read_bytes(at_certificate))
         key = serialization.load_pem_private_key(read_bytes(at_key), None)
     except ValueError as error:
-        raise ConfigError(f"{at_certificate.parent}: not an authority of this command: {error}") from None
+        raise ConfigError(
+            f"{at_certificate.parent}: not an authority of this command: {error}", code="certificate/invalid-authority"
+        ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-        raise ConfigError(f"{at_key}: not the key of {at_certificate}; restore the one that belongs to it")
+        raise ConfigError(
+            f"{at_key}: not the key of {at_certificate}; restore the one that belongs to it",
+            code="certificate/invalid-authority",
+        )
     if certificate.not_valid_after_utc < datetime.now(UTC):
         raise ConfigError(
             f"{at_certificate}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; move the folder away, run "
-            "`snakesim deploy certs` again, and install the new files on every machine"
+            "`snakesim lab certs` again, and install the new files on every machine",
+            code="certificate/expired",
         )
     return Issuer(certificate, key)
 
@@ -194,7 +206,10 @@ def read_certificate(at: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(read_bytes(at))
     except ValueError as error:
-        raise ConfigError(f"{at}: not a certificate: {error}; remove it and run `snakesim deploy certs`") from None
+        raise ConfigError(
+            f"{at}: not a certificate: {error}; remove it and run `snakesim lab certs`",
+            code="certificate/invalid-authority",
+        ) from None
 
 
 def _is_still_valid(path: Path, issuer: Issuer, identity: Identity, lab: Lab) -> bool:

@@ -1,4 +1,4 @@
-"""Checks for `snakesim deploy check` that a running lab is as its lab file says.
+"""Checks for `snakesim lab check` that a running lab is as its lab file says.
 
 The check connects as each identity in turn, with the certificates in the output folder, and moves nothing: it
 subscribes, looks for liveliness tokens, and sends empty queries, which a host refuses.
@@ -9,7 +9,7 @@ import socket
 import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +18,7 @@ from typing import Any
 from cryptography import x509
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.terminal import PrintLine, print_line
+from snakesim_hal.base.terminal import PrintLine, discard_line, print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.private_keys import check_permissions
 from snakesim_hal.network.probe import open_probe
@@ -49,39 +49,54 @@ WRITERS = {  # the process that publishes at a key all the time
 
 @dataclass
 class Findings:
-    """Prints the results of the checks, and counts the wrong ones."""
+    """Prints the results of the checks, and keeps them."""
 
     say: PrintLine
     wrong: int = 0
+    results: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
     def passed(self, text: str) -> None:
         """Print a result that is as it should be."""
+        self.results.append({"passed": True, "text": text})
         self.say(f"  {text}")
 
     def failed(self, text: str) -> None:
         """Print a result that is wrong, and count it."""
         self.wrong += 1
+        self.results.append({"passed": False, "text": text})
         self.say(f"! {text}")
 
 
-def check(lab: Lab, folder: Path, say: PrintLine = print_line) -> int:
+def check(lab: Lab, folder: Path, say: PrintLine = print_line, *, as_json: bool = False) -> int:
     """Check certificates, routers, robots and roles of a lab.
 
     Args:
         lab: The lab.
-        folder: The output folder of `deploy certs`.
+        folder: The output folder of `lab certs`.
         say: Prints a line.
+        as_json: Whether to print one JSON object at the end instead of lines.
 
     Returns:
         The exit code: 0 when all is as the lab file says, 1 otherwise.
     """
-    found = Findings(say)
+    if as_json:
+        found = Findings(discard_line)
+        exit_code = _check_all(lab, folder, found)
+        print_json({"ok": exit_code == 0, "results": found.results}, say)
+        return exit_code
+    return _check_all(lab, folder, Findings(say))
+
+
+def _check_all(lab: Lab, folder: Path, found: Findings) -> int:
+    """Check everything. Returns the exit code."""
+    say = found.say
     say("certificates")
     for identity in identities(lab):
         _check_certificate(identity, folder, found)
     say("routers")
     reached = [name for name in lab.file.routers if _check_router(name, lab, folder, found)]
     if not reached:
+        found.results.append({"passed": False, "text": "no router can be reached"})
         say("no router can be reached, and so neither robots nor roles can be looked at")
         return 1
     for robot in lab.file.robots:
@@ -106,10 +121,10 @@ def _check_certificate(identity: Identity, folder: Path, found: Findings) -> Non
     except ConfigError as error:
         found.failed(f"{identity.common_name}: {error}")
         return
-    _check_expiry(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
+    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", found)
     warning = check_permissions(path.with_suffix(".key"))
     if warning:
-        found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim deploy certs --rotate`")
+        found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
 
 
 def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
@@ -201,7 +216,7 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
         found.failed(f"cannot be looked at as {watcher.common_name}: {error}")
         return
     if state.status is not None:
-        found.passed(f"{state.status.lifecycle} - {state.status.why}")
+        found.passed(f"{state.status.lifecycle} - {state.status.reason}")
         check_what_moves(lab.file.robots[robot], state.description, found)
     host = next((process for process in state.processes if process.name == HOST), None)
     for name, machine in _expected_processes(robot, lab, involved).items():

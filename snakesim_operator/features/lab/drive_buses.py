@@ -150,7 +150,8 @@ def check_buses(robots: Mapping[str, LabRobot], source: str) -> None:
             if other != name:
                 raise ConfigError(
                     f"{where}`: {bus} of machine {robot.machine!r} has the robot {other!r}, too; "
-                    "a bus belongs to one robot"
+                    "a bus belongs to one robot",
+                    code="lab/invalid-file",
                 )
 
 
@@ -160,7 +161,8 @@ def _check_buses_of_robot(robot: LabRobot, where: str) -> None:
         _check_mixed(robot, where)
     elif robot.buses:
         raise ConfigError(
-            f"{where}.buses` is for backend `{MIXED}`; for backend {robot.backend!r} use `can` or `serial`"
+            f"{where}.buses` is for backend `{MIXED}`; for backend {robot.backend!r} use `can` or `serial`",
+            code="lab/invalid-file",
         )
     elif robot.backend in DRIVE_TYPES:
         _check_one_type(robot, where)
@@ -183,12 +185,14 @@ def _check_one_type(robot: LabRobot, where: str) -> None:
     if other_buses:
         raise ConfigError(
             f"{where}.{other_kind}` = {other_buses}: drives of backend {robot.backend!r} are on buses named in "
-            f"`{kind}`, such as {example}; leave `{other_kind}` out"
+            f"`{kind}`, such as {example}; leave `{other_kind}` out",
+            code="lab/invalid-file",
         )
     if not _buses_of_kind(robot, kind):
         raise ConfigError(
             f"{where}.{kind}` is empty, and backend {robot.backend!r} without a bus emulates its drives: nothing real "
-            f"would move. Name the bus, such as {example}; or say `emulated = true`, if that is meant"
+            f"would move. Name the bus, such as {example}; or say `emulated = true`, if that is meant",
+            code="lab/invalid-file",
         )
 
 
@@ -197,18 +201,24 @@ def _check_mixed(robot: LabRobot, where: str) -> None:
     if not robot.buses:
         raise ConfigError(
             f"{where}.buses` is missing, and backend `{MIXED}` without buses emulates its drives: nothing real would "
-            f'move. Say which drive type is on which bus, such as buses = {{ odrive = ["can0"] }}; or `emulated = true`'
+            'move. Say which drive type is on which bus, such as buses = { odrive = ["can0"] }; or `emulated = true`',
+            code="lab/invalid-file",
         )
     assigned: list[str] = []  # buses that have a drive type
     for name, buses in robot.buses.items():
         _check_buses_of_type(robot, name, where)
         for bus in buses:
             if bus in assigned:
-                raise ConfigError(f"{where}.buses.{name}` = {bus!r} has another drive type, too; a bus has one")
+                raise ConfigError(
+                    f"{where}.buses.{name}` = {bus!r} has another drive type, too; a bus has one",
+                    code="lab/invalid-file",
+                )
         assigned += buses
     unassigned = [bus for bus in (*robot.can, *robot.serial) if bus not in assigned]
     if unassigned:
-        raise ConfigError(f"{where}.buses` does not say which drive type is on {', '.join(unassigned)}")
+        raise ConfigError(
+            f"{where}.buses` does not say which drive type is on {', '.join(unassigned)}", code="lab/invalid-file"
+        )
 
 
 def _check_buses_of_type(robot: LabRobot, name: str, where: str) -> None:
@@ -216,16 +226,19 @@ def _check_buses_of_type(robot: LabRobot, name: str, where: str) -> None:
     if name not in DRIVE_TYPES:
         raise ConfigError(
             f"{where}.buses.{name}`: no such drive type; {suggest_word(name, list(DRIVE_TYPES))}there are "
-            f"{', '.join(DRIVE_TYPES)}"
+            f"{', '.join(DRIVE_TYPES)}",
+            code="lab/invalid-file",
         )
     buses = robot.buses[name]
     if not buses:
-        raise ConfigError(f"{where}.buses.{name}` is empty; name its buses, or leave it out")
+        raise ConfigError(f"{where}.buses.{name}` is empty; name its buses, or leave it out", code="lab/invalid-file")
     kind = DRIVE_TYPES[name].kind
     listed = _buses_of_kind(robot, kind)
     for bus in buses:
         if bus not in listed:
-            raise ConfigError(f"{where}.buses.{name}` = {bus!r} is not in `{kind}` = {listed}; add it there")
+            raise ConfigError(
+                f"{where}.buses.{name}` = {bus!r} is not in `{kind}` = {listed}; add it there", code="lab/invalid-file"
+            )
 
 
 def _check_other_backend(robot: LabRobot, where: str) -> None:
@@ -236,7 +249,8 @@ def _check_other_backend(robot: LabRobot, where: str) -> None:
         raise ConfigError(
             f"{where}.backend` = {robot.backend!r} is none of {', '.join([SIMULATOR, *DRIVE_TYPES, MIXED])}, so this "
             f"program does not know how it is given a bus. Configure the bus in `set`, such as "
-            f"set = [\"backends.{robot.backend}.port='/dev/ttyUSB0'\"], or in a scenario file of your own"
+            f"set = [\"backends.{robot.backend}.port='/dev/ttyUSB0'\"], or in a scenario file of your own",
+            code="lab/invalid-file",
         )
 
 
@@ -251,5 +265,6 @@ def _check_settings(robot: LabRobot, where: str) -> None:
         if drive_type is not None and name in (drive_type.buses_key, "bit_rate", "data_bit_rate"):
             raise ConfigError(
                 f"{where}.set` has {setting!r}, which `{drive_type.kind}`, `buses`, `bitrate` and `data_bitrate` say: "
-                f"the units are made from these, too. Say it there"
+                f"the units are made from these, too. Say it there",
+                code="lab/invalid-file",
             )

@@ -1,4 +1,4 @@
-"""The lab file: machines, routers, robots, and who has which role. `snakesim deploy example` prints one."""
+"""The lab file: machines, routers, robots, and who has which role. `snakesim lab example` prints one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,39 +28,71 @@ Days = Annotated[float, Meta(gt=0, le=825, extra_json_schema={"unit": "days"})]
 class Machine(FileStruct, frozen=True, kw_only=True):
     """A computer of the lab."""
 
-    address: Address | None = None  # that others reach it at; a router's machine needs one
-    folder: Folder = "/etc/snakesim"  # where its rendered files are installed
-    user: Name = "snakesim"  # whom the services run as
+    address: Address | None = None
+    """Address at which other machines reach this one; a router's machine needs one."""
+
+    folder: Folder = "/etc/snakesim"
+    """Folder in which its rendered files are installed."""
+
+    user: Name = "snakesim"
+    """User account that runs the services."""
+
     program: Folder = "/opt/snakesim/bin/snakesim"
-    device_groups: list[Name] = msgspec.field(default_factory=lambda: ["dialout"])  # that may open its serial ports
+    """Path of the `snakesim` command on this machine."""
+
+    device_groups: list[Name] = msgspec.field(default_factory=lambda: ["dialout"])
+    """Groups of the system that may open its serial ports."""
 
 
 class Router(FileStruct, frozen=True, kw_only=True):
     """A Zenoh router."""
 
     machine: Name
+    """Machine that the router runs on."""
+
     port: PortNumber = 7447
+    """TCP port at which the router listens."""
 
 
 class Grant(FileStruct, frozen=True, kw_only=True):
     """What a machine is to a robot: one certificate, one session file."""
 
     machine: Name
+    """Machine that gets the role, with one certificate and one session file."""
+
     role: Literal["gnc", "operator", "viewer", "recorder", "administrator"]
-    robot: Name  # or `all`
-    services: list[Name] = msgspec.field(default_factory=lambda: list(GNC_SERVICES))  # of a gnc
+    """Role of the machine: what it may publish, read and ask, see schemas/roles.md."""
+
+    robot: Name
+    """Robot that the role is for, or `all`; a gnc has one robot."""
+
+    services: list[Name] = msgspec.field(default_factory=lambda: list(GNC_SERVICES))
+    """Services that a gnc runs; other roles ignore it."""
 
 
 class LabFile(FileStruct, frozen=True, kw_only=True):
     """A whole lab file."""
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9 _.-]+$")]
-    certificate_days: Days = 30  # of the certificates; short, because nothing revokes them
+    """Name of the lab, which its certificates contain."""
+
+    certificate_days: Days = 30
+    """Lifetime of a machine's certificate; short, because certificates are not revoked."""
+
     authority_days: Annotated[float, from_zero(7300, "days")] = 1825
+    """Lifetime of the lab's certificate authority."""
+
     machines: dict[Name, Machine]
+    """Computers by name, as sections such as `[machines.bench]`."""
+
     routers: dict[Name, Router]
+    """Zenoh routers by name, as sections such as `[routers.main]`; a lab has at least one."""
+
     robots: dict[Name, LabRobot]
+    """Robots by name, as sections such as `[robots.snake]`."""
+
     roles: list[Grant] = []
+    """Roles of the machines, each an entry `[[roles]]`."""
 
 
 @dataclass(frozen=True)
@@ -92,20 +124,30 @@ def load_lab(path: Path) -> Lab:
 
 def _check(file: LabFile, table: Table) -> None:
     if not file.routers:
-        raise ConfigError(f"{table.source}: `routers` is empty; a lab has at least one, such as [routers.main]")
+        raise ConfigError(
+            f"{table.source}: `routers` is empty; a lab has at least one, such as [routers.main]",
+            code="lab/invalid-file",
+        )
     for name, router in file.routers.items():
         _known(table, f"routers.{name}.machine", router.machine, file.machines)
         if file.machines[router.machine].address is None:
             raise ConfigError(
-                f"{table.source}: `machines.{router.machine}.address` is missing; the router `{name}` listens there"
+                f"{table.source}: `machines.{router.machine}.address` is missing; the router `{name}` listens there",
+                code="lab/invalid-file",
             )
     listening = [(router.machine, router.port) for router in file.routers.values()]
     for (name, router), place in zip(file.routers.items(), listening, strict=True):
         if listening.count(place) > 1:
-            raise ConfigError(f"{table.source}: `routers.{name}.port` = {router.port} has another router, too")
+            raise ConfigError(
+                f"{table.source}: `routers.{name}.port` = {router.port} has another router, too",
+                code="lab/invalid-file",
+            )
     for name, robot in file.robots.items():
         if name == ALL:
-            raise ConfigError(f"{table.source}: `robots.{ALL}`: this name stands for every robot; choose another")
+            raise ConfigError(
+                f"{table.source}: `robots.{ALL}`: this name stands for every robot; choose another",
+                code="lab/invalid-file",
+            )
         _known(table, f"robots.{name}.machine", robot.machine, file.machines)
     _check_roles(file, table)
 
@@ -117,17 +159,24 @@ def _check_roles(file: LabFile, table: Table) -> None:
         _known(table, f"{at}.machine", grant.machine, file.machines)
         _known(table, f"{at}.robot", grant.robot, [*file.robots, ALL])
         if grant.role == Role.GNC and grant.robot == ALL:
-            raise ConfigError(f"{table.source}: `{at}.robot` = 'all': a gnc commands one robot; name it")
+            raise ConfigError(
+                f"{table.source}: `{at}.robot` = 'all': a gnc commands one robot; name it", code="lab/invalid-file"
+            )
         if (entry := (grant.machine, grant.role, grant.robot)) in seen:
-            raise ConfigError(f"{table.source}: `{at}` grants {' '.join(entry)} a second time; leave one out")
+            raise ConfigError(
+                f"{table.source}: `{at}` grants {' '.join(entry)} a second time; leave one out", code="lab/invalid-file"
+            )
         seen.add(entry)
         for service in grant.services:
             if service == "hal":
-                raise ConfigError(f"{table.source}: `{at}.services` = 'hal': only the robot itself is that")
+                raise ConfigError(
+                    f"{table.source}: `{at}.services` = 'hal': only the robot itself is that", code="lab/invalid-file"
+                )
 
 
 def _known(table: Table, field: str, name: str, among: Sequence[str] | dict[str, Machine]) -> None:
     if name not in among:
         raise ConfigError(
-            f"{table.origin_of(field)}: `{field}` = {shorten(name)!r} is not in this file; it has {', '.join(among)}"
+            f"{table.origin_of(field)}: `{field}` = {shorten(name)!r} is not in this file; it has {', '.join(among)}",
+            code="lab/invalid-file",
         )

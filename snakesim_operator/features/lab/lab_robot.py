@@ -23,14 +23,39 @@ class LabRobot(FileStruct, frozen=True, kw_only=True):
     """A robot. Its name in the file is its namespace on the network."""
 
     machine: Name
+    """Machine that the robot's host runs on."""
+
     scenario: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[A-Za-z0-9_./-]+$")]
+    """Scenario of its runs: the name of a shipped one, or a path on the machine."""
+
     backend: Name = "can"
-    set: list[Setting] = []  # further settings, as with `snakesim run --set`
-    can: list[CanBus] = []  # buses of its drives; interfaces of the kernel are brought up at every start
-    serial: list[DeviceFile] = []  # serial ports of its drives
-    buses: dict[Name, list[str]] = {}  # of backend `mixed`: which of the buses above each drive type is on
+    """Backend that drives the robot."""
+
+    set: list[Setting] = []
+    """Further values as KEY=VALUE, as with `snakesim run --set`."""
+
+    can: list[CanBus] = []
+    """CAN buses of its drives: interfaces of the kernel, which are brought up at every start, or INTERFACE:CHANNEL of
+    python-can.
+    """
+
+    serial: list[DeviceFile] = []
+    """Serial ports of its drives."""
+
+    buses: dict[Name, list[str]] = {}
+    """For the backend `mixed`: for each driver type, those of the buses in `can` and `serial` that it is on."""
+
     bitrate: BitRate = 1_000_000
-    data_bitrate: DataBitRate = 5_000_000  # of CAN FD, for moteus
-    devices: list[DeviceFile] = []  # further device files that its host opens, such as those of a CAN adapter
-    emulated: bool = False  # the host emulates the drives, and nothing real moves
-    faults: bool = False  # whether an administrator may inject faults
+    """Bit rate of its CAN buses."""
+
+    data_bitrate: DataBitRate = 5_000_000
+    """Bit rate of the data on CAN FD, for moteus."""
+
+    devices: list[DeviceFile] = []
+    """Further device files that its host opens, such as those of a CAN adapter."""
+
+    emulated: bool = False
+    """True: the host emulates the drives, and no real motor moves."""
+
+    faults: bool = False
+    """True: an administrator may inject faults."""

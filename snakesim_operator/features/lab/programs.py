@@ -46,11 +46,11 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
             continue
         file = f"{folder}/{identity.label}.json5"
         if identity.role is None:
-            yield Program(identity, f"Zenoh router {identity.of}", ("router", file))
+            yield Program(identity, f"Zenoh router {identity.of}", ("start", "router", file))
         elif identity.role is Role.ROBOT:
             robot = lab.file.robots[identity.of]
             out = ("--out", f"{STATE}/{identity.of}")
-            arguments = ("host", *_scenario(robot), "--session", file, *out)
+            arguments = ("start", "host", *_scenario(robot), "--session", file, *out)
             yield Program(
                 identity,
                 f"HAL host of {identity.of}",
@@ -61,7 +61,7 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
         elif identity.role is Role.GNC:
             robot = lab.file.robots[identity.of]
             for service in identity.services:
-                arguments = ("service", service, *_scenario(robot), "--session", file)
+                arguments = ("start", "service", service, *_scenario(robot), "--session", file)
                 yield Program(identity, f"{service} of {identity.of}", arguments, service)
         elif identity.role is Role.RECORDER:
             for name in identity.robots(lab):

@@ -50,4 +50,4 @@ def rendered(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
 
 
 def _origin(lab: Lab, what: str) -> str:
-    return f"{what}, of {lab.file.name}: made from {lab.path.name} by `snakesim deploy render`; change it there."
+    return f"{what}, of {lab.file.name}: made from {lab.path.name} by `snakesim lab render`; change it there."

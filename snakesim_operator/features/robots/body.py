@@ -245,7 +245,9 @@ def _measure_lengths(
     """Return the length of every link in m, without the caps of its capsule. Raises ConfigError for a folded robot."""
     gaps = [round(float(gap), LENGTH_DIGITS) for gap in np.diff(joints_x)]
     if min(gaps) < 0:
-        raise ConfigError("the joints are not in order along the chain at zero angles: it is folded")
+        raise ConfigError(
+            "the joints are not in order along the chain at zero angles: it is folded", code="urdf/invalid"
+        )
     for i, gap in enumerate(gaps):
         if gap < MIN_LENGTH_M:
             found.changes.add(

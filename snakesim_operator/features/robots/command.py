@@ -100,6 +100,6 @@ def export_robot(name: str, out: Path | None) -> int:
 
 def _check_new(path: Path, suffix: str, source: Path | None) -> None:
     if path.suffix != suffix:
-        raise ConfigError(f"--out {path}: give a name that ends with {suffix}")
+        raise ConfigError(f"--out {path}: give a name that ends with {suffix}", code="command/invalid-option")
     if path == source or path.exists():
-        raise ConfigError(f"{path} is there already; remove it, or give another --out")
+        raise ConfigError(f"{path} is there already; remove it, or give another --out", code="file/already-exists")

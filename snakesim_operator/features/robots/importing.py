@@ -47,7 +47,10 @@ def import_urdf(file: Path, order: ImportOptions) -> Imported:
         ConfigError: The file is not well formed, is no snake, or has numbers that no robot file may have.
     """
     if not 1e-6 <= order.scale <= 1e3:
-        raise ConfigError(f"--scale {order.scale:g}: give meters per unit of length of the file, such as 0.001 for mm")
+        raise ConfigError(
+            f"--scale {order.scale:g}: give meters per unit of length of the file, such as 0.001 for mm",
+            code="urdf/invalid",
+        )
     urdf = parse_xml(read_bytes(file), str(file))
     if urdf.tag != "robot":
         raise urdf.error("is no URDF; its outermost element is <robot>")

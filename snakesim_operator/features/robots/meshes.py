@@ -40,19 +40,19 @@ def read_vertices(path: Path) -> Floats:
         ConfigError: The file has another format, is damaged, or is too large.
     """
     if path.suffix.lower() not in (".stl", ".obj"):
-        raise ConfigError(f"{path}: only STL and OBJ can be read")
+        raise ConfigError(f"{path}: only STL and OBJ can be read", code="urdf/invalid")
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}", code="urdf/invalid") from None
     if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: is larger than {MAX_BYTES // 1024 // 1024} MB")
+        raise ConfigError(f"{path}: is larger than {MAX_BYTES // 1024 // 1024} MB", code="urdf/invalid")
     points = _parse_binary_stl(data) if path.suffix.lower() == ".stl" else None
     if points is None:
         points = _parse_text(data, path)
     if not len(points) or not np.isfinite(points).all():
-        raise ConfigError(f"{path}: holds no vertices, or numbers that are not finite")
+        raise ConfigError(f"{path}: holds no vertices, or numbers that are not finite", code="urdf/invalid")
     return points
 
 
@@ -76,4 +76,4 @@ def _parse_text(data: bytes, path: Path) -> Floats:
     try:
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
     except ValueError:
-        raise ConfigError(f"{path}: a vertex is not three numbers") from None
+        raise ConfigError(f"{path}: a vertex is not three numbers", code="urdf/invalid") from None

@@ -111,7 +111,7 @@ def _mesh(shape: Shape, element: Element, file: Path, omissions: Notes) -> Float
     path = find_mesh(shape.mesh, file)
     try:
         if path is None:
-            raise ConfigError("not on this computer")
+            raise ConfigError("not on this computer", code="urdf/invalid")
         return read_vertices(path) * np.array(shape.sizes)
     except ConfigError as error:
         omissions.add(f"line {element.line}: mesh {shorten(shape.mesh)!r} left out: {error}")

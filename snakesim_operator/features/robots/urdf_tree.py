@@ -360,7 +360,8 @@ def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: 
     """Order the bodies from the tail on. Raises ConfigError for what is no chain."""
     if tail is not None and tail not in tree.body_of:
         raise ConfigError(
-            f"--tail {shorten(tail)}: there is no such link; there are {', '.join(list(tree.body_of)[:8])}"
+            f"--tail {shorten(tail)}: there is no such link; there are {', '.join(list(tree.body_of)[:8])}",
+            code="urdf/invalid",
         )
     neighbors = _find_neighbors(bodies, tree)
     forks = [name for name, joints in neighbors.items() if len(joints) > 2]

@@ -131,7 +131,7 @@ class Element:
         name = ""
         if "name" in self.attributes:
             name = f" name={shorten(self.attributes['name'])!r}"
-        return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}")
+        return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}", code="urdf/invalid")
 
     def read_all(self) -> None:
         """Mark the element and everything in it as read."""
@@ -205,11 +205,13 @@ def parse_xml(data: bytes, source: str) -> Element:
         line = parser.CurrentLineNumber
         if count > MAX_ELEMENTS or len(open_elements) > MAX_DEPTH:
             raise ConfigError(
-                f"{source}, line {line}: more than {MAX_ELEMENTS} elements, or nested deeper than {MAX_DEPTH} levels"
+                f"{source}, line {line}: more than {MAX_ELEMENTS} elements, or nested deeper than {MAX_DEPTH} levels",
+                code="urdf/invalid",
             )
         if tag.startswith("xacro:"):
             raise ConfigError(
-                f"{source}, line {line}: <{shorten(tag)}> is xacro; convert it first: xacro FILE > robot.urdf"
+                f"{source}, line {line}: <{shorten(tag)}> is xacro; convert it first: xacro FILE > robot.urdf",
+                code="urdf/invalid",
             )
         element = Element(tag, attributes, line, source, absences)
         open_elements[-1].children.append(element)
@@ -222,7 +224,10 @@ def parse_xml(data: bytes, source: str) -> Element:
         open_elements[-1].text += text
 
     def refuse_doctype(*_: object) -> None:
-        raise ConfigError(f"{source}, line {parser.CurrentLineNumber}: has a <!DOCTYPE>; URDF needs none: remove it")
+        raise ConfigError(
+            f"{source}, line {parser.CurrentLineNumber}: has a <!DOCTYPE>; URDF needs none: remove it",
+            code="urdf/invalid",
+        )
 
     parser.buffer_text = True
     parser.StartElementHandler = open_element
@@ -234,5 +239,7 @@ def parse_xml(data: bytes, source: str) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf") from None
+        raise ConfigError(
+            f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf", code="urdf/invalid"
+        ) from None
     return top.children[0]

@@ -1,4 +1,4 @@
-"""`snakesim ros2`: a robot as a node among ROS 2 nodes, through the router of their rmw_zenoh; it needs no ROS.
+"""`snakesim start ros2`: a robot as a node among ROS 2 nodes, through the router of their rmw_zenoh; it needs no ROS.
 
 Data flow:
     robot's keys -> `relay` (newest sample, bounded rate) -> `robot_in_ros` (encoding) -> `graph` (ROS topics)

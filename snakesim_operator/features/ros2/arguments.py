@@ -1,12 +1,12 @@
-"""Arguments of `snakesim ros2`. They can be imported without the extra that the bridge needs, and without Zenoh."""
+"""The command `snakesim start ros2`. It can be imported without the extra that the bridge needs, and without Zenoh."""
 
 import argparse
 import re
-from typing import Any
 
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.network.endpoint import check_endpoint
 from snakesim_hal.programs.arguments import add_network, number_type
+from snakesim_hal.programs.commands import Command, Commands
 
 ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
 MAX_DOMAIN = 232  # as with DDS
@@ -15,20 +15,14 @@ MAX_HZ = 200.0
 DEFAULT_HZ = 50.0
 DEFAULT_IMAGE_HZ = 5.0
 ROS_NAMESPACE = r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
-TASK = "watch"  # the group in which `snakesim --help` lists the command
 
 
-def add_commands(commands: Any) -> None:
-    """Add `ros2` to the commands of `snakesim`."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        "ros2",
-        help="be a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS",
-        epilog="Publishes joint states, transforms, markers, images, IMUs, scans, the robot's URDF, diagnostics and "
-        "/clock. ROS may stop the robot, and nothing else without --cmd-vel, --joint-commands or --operate.",
-    )
-    parser.add_argument("--domain", type=number_type(0, MAX_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--ros-router", default=ROS_ROUTER, metavar="ENDPOINT", help=f"router of the ROS nodes ({ROS_ROUTER})"
+        "--domain", type=number_type(0, MAX_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (default: 0)"
+    )
+    parser.add_argument(
+        "--ros-router", default=ROS_ROUTER, metavar="ENDPOINT", help=f"router of the ROS nodes (default: {ROS_ROUTER})"
     )
     parser.add_argument("--ros-namespace", metavar="NAME", help="of topics and frames, for several robots in one graph")
     _add_rate(parser, "--hz", DEFAULT_HZ, "messages a second of a topic")
@@ -39,14 +33,13 @@ def add_commands(commands: Any) -> None:
         action="store_true",
         help="be the robot's controller: ROS commands joints, on joint_commands",
     )
-    parser.add_argument("--operate", action="store_true", help="let ROS arm, disarm, clear and set parameters")
+    parser.add_argument("--operate", action="store_true", help="let ROS arm, disarm, reset and set parameters")
     parser.add_argument(
         "--stamps",
         choices=["robot", "wall"],
         help="robot: robot time, with /clock; wall: wall-clock time (default: robot if nothing real moves, else wall)",
     )
     add_network(parser)
-    parser.set_defaults(act=_run)
 
 
 def _add_rate(parser: argparse.ArgumentParser, option: str, default_hz: float, subject: str) -> None:
@@ -56,7 +49,7 @@ def _add_rate(parser: argparse.ArgumentParser, option: str, default_hz: float, s
         type=number_type(MIN_HZ, MAX_HZ, "Hz"),
         default=default_hz,
         metavar="HZ",
-        help=f"most {subject} ({default_hz:g})",
+        help=f"maximum {subject} (default: {default_hz:g})",
     )
 
 
@@ -73,10 +66,24 @@ def check(arguments: argparse.Namespace) -> None:
     """Check the arguments and that the extra is installed. Raises ConfigError."""
     from snakesim_operator.base import extras
 
-    extras.require("ros2", "`snakesim ros2`")
+    extras.require("ros2", "`snakesim start ros2`")
     check_endpoint(arguments.ros_router, "--ros-router")
     namespace = arguments.ros_namespace
     if namespace is not None and not re.fullmatch(ROS_NAMESPACE, namespace, re.ASCII):
         raise ConfigError(
-            f"--ros-namespace {shorten(namespace)!r}: give a name such as planar13 or lab/planar13: letters, digits, _"
+            f"--ros-namespace {shorten(namespace)!r}: give a name such as planar13 or lab/planar13: letters, digits, _",
+            code="network/invalid-address",
         )
+
+
+COMMANDS: Commands = (
+    Command(
+        name="start ros2",
+        help="Start a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS.",
+        add=_add_arguments,
+        run=_run,
+        details="Publishes joint states, transforms, markers, images, IMUs, scans, the robot's URDF, diagnostics and "
+        "/clock. ROS may stop the robot, and nothing else without --cmd-vel, --joint-commands or --operate.",
+        examples=("start ros2 --endpoint tcp/127.0.0.1:7448", "start ros2 --domain 3 --cmd-vel --operate"),
+    ),
+)

@@ -43,7 +43,8 @@ class JointCommander:
         if session.present(keys.alive_key(CONTROL)):
             raise RefusedError(
                 "--joint-commands: the robot has a controller already, which holds the lease; run it without one: "
-                "--set services.control.external=true"
+                "--set services.control.external=true",
+                code="robot/has-controller",
             )
         self._session = session
         self._messages = messages
@@ -74,14 +75,16 @@ class JointCommander:
         robot = session.latest(keys.DESCRIPTION, Description, PRESENT_S)
         status = session.latest(keys.STATUS, Status, PRESENT_S)
         if robot is None or status is None:
-            raise NotConnectedError("the robot does not describe itself; is its HAL host running?")
+            raise NotConnectedError(
+                "the robot does not describe itself; is its HAL host running?", code="network/no-robot"
+            )
         commanding = CommandingClient(session, robot, status.clock_mode)
         targets = RosJointTargets(robot)
         self._report(f"joint commands from ROS move {robot.robot} once it is armed")
         while not self._ended.is_set():
             clock = commanding.wait()
             if commanding.host_changed():
-                raise NotConnectedError("the robot's host has restarted")
+                raise NotConnectedError("the robot's host has restarted", code="network/no-robot")
             self._read_messages(targets, clock)
             joints = commanding.read(keys.JOINTS)
             if not isinstance(joints, JointState):

@@ -46,12 +46,15 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
         raise ConfigError(
             f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
             f"let into its network. On one computer give the robot another port: --endpoint tcp/127.0.0.1:7448 behind "
-            "`snakesim run`; this command finds it there"
+            "`snakesim run`; this command finds it there",
+            code="network/invalid-address",
         )
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, START_TIMEOUT_S, is_consistent)
         if robot is None:
-            raise NotConnectedError(f"{link.namespace} does not describe itself within {START_TIMEOUT_S:g} s")
+            raise NotConnectedError(
+                f"{link.namespace} does not describe itself within {START_TIMEOUT_S:g} s", code="network/no-robot"
+            )
         options = _make_options(arguments, robot)
         with contextlib.ExitStack() as cleanup:
             network = _connect_to_ros(arguments.ros_router, cleanup)
@@ -96,7 +99,8 @@ def _connect_to_ros(endpoint: str, cleanup: contextlib.ExitStack) -> ForeignNetw
     except NotConnectedError:
         raise NotConnectedError(
             f"no router of ROS nodes on {endpoint}; start it by "
-            "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router"
+            "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router",
+            code="network/nothing-listens",
         ) from None
 
 
@@ -123,7 +127,7 @@ def _wait_for_robot(selection: RobotSelection) -> Link:
     is_reported = False
     while True:
         try:
-            return only_robot(selection, "ros2")
+            return only_robot(selection, "start ros2")
         except NotConnectedError as error:
             if time.monotonic() > give_up_s:
                 raise

@@ -1,4 +1,4 @@
-"""Offers arm, disarm, clear and stop as ROS services: the same requests as those of `snakesim arm` and the others."""
+"""Offers arm, disarm, reset and stop as ROS services, with the same requests as `snakesim robot`."""
 
 import time
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def make_operating_servers(
         node: The ROS node that offers them.
         link: How to reach the robot.
         prefix: Namespace of the services, with a slash behind it, or empty.
-        operate: Whether ROS may arm, disarm and clear; stop is always offered.
+        operate: Whether ROS may arm, disarm and reset; stop is always offered.
     """
     operator = _Operator(session, link)
     servers = [_make_trigger_server(node, f"/{prefix}stop", operator.stop)]
@@ -46,8 +46,8 @@ def make_operating_servers(
             explain_refusal=_explain_late_arm_request,
         )
         disarm = _make_trigger_server(node, f"/{prefix}disarm", operator.disarm)
-        clear = _make_trigger_server(node, f"/{prefix}clear", operator.clear)
-        servers += [arm, disarm, clear]
+        reset = _make_trigger_server(node, f"/{prefix}reset", operator.reset)
+        servers += [arm, disarm, reset]
     return servers
 
 
@@ -95,18 +95,20 @@ class _Operator:
         """Arm the robot that the host describes at present."""
         robot = self._session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
         if robot is None:
-            raise NotConnectedError(f"{self._link.namespace} publishes no description; is its HAL host running?")
+            raise NotConnectedError(
+                f"{self._link.namespace} publishes no description; is its HAL host running?", code="network/no-robot"
+            )
         # If it does not become ready, the host's answer to the request gives the reason.
         self._session.latest(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
         return self._request(make_arm_request(robot, REQUESTER), "armed")
 
     def disarm(self) -> str:
         """Disarm the robot."""
-        return self._request(LifecycleRequest(action="disarm", who=REQUESTER), "disarmed")
+        return self._request(LifecycleRequest(action="disarm", requester=REQUESTER), "disarmed")
 
-    def clear(self) -> str:
+    def reset(self) -> str:
         """Reset the robot's fault."""
-        return self._request(LifecycleRequest(action="clear", who=REQUESTER), "cleared")
+        return self._request(LifecycleRequest(action="reset", requester=REQUESTER), "reset")
 
     def _request(self, request: LifecycleRequest, done: str) -> str:
         lines: list[str] = []

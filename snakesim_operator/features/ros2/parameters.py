@@ -23,7 +23,7 @@ from snakesim_operator.robot_commands.parameters import (
     change_parameters,
     format_value,
     read_parameters,
-    read_settings,
+    read_parameters_in_force,
 )
 
 # Types of rcl_interfaces/ParameterType.
@@ -115,10 +115,10 @@ class ParameterServices:
     def _read_parameters(self) -> dict[str, Parameter]:
         """Return the controller's parameters by name; none if no controller publishes any."""
         try:
-            settings = read_settings(self._session)
+            in_force = read_parameters_in_force(self._session)
         except NotConnectedError:
             return {}
-        return {PREFIX + parameter.name: parameter for parameter in read_parameters(settings)}
+        return {PREFIX + parameter.name: parameter for parameter in read_parameters(in_force)}
 
     def _read_values(self, names: Sequence[str]) -> list[Any]:
         """Return the value of each name; None for an unknown one."""

@@ -249,7 +249,7 @@ def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:
         values[f"fault {i}"] = f"{fault.what}: {fault.cause}"
     pairs = [ros.make_message("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
     level = _find_diagnostic_level(status)
-    summary = f"{status.lifecycle}: {status.why}"
+    summary = f"{status.lifecycle}: {status.reason}"
     hardware_id = status.robot
     entry = ros.make_message("diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, summary, hardware_id, pairs)
     return ros.encode_message(ros.DIAGNOSTICS, ros.make_header(timestamp_ns, ""), [entry])

@@ -99,7 +99,7 @@ class CmdVelSteering:
         self._update_heading(turn_rate_rad_s, now_ns, body_w_rad)
         return Intent(
             timestamp_ns=max(now_ns - age_ns, 0),
-            who=REQUESTER,
+            requester=REQUESTER,
             speed_m_s=speed_m_s,
             go=speed_m_s != 0.0,
             valid_for_ns=VALID_NS,

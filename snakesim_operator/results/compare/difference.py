@@ -13,9 +13,9 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, drives_in_words, identity
-from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_periods
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_periods
 from snakesim_operator.results.report.timeline import Series, distance, reported_distance
+from snakesim_operator.results.run_log import RunRecord
 
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
 MAX_HAND_OVERS_NAMED = 12
@@ -210,14 +210,17 @@ def _check_comparable(a: RunRecord, b: RunRecord) -> None:
     for record in (a, b):
         if not len(record.time_s):
             raise ConfigError(
-                f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed ({record.host.why}); "
-                f"{record.folder / 'host.log'} may say more. Run it again, until the summary has a time"
+                f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed "
+                f"({record.host.reason}); {record.folder / 'host.log'} may say more. "
+                "Run it again, until the summary has a time",
+                code="recording/never-armed",
             )
     if a.description.layout != b.description.layout:
         robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]
         raise ConfigError(
             f"{', '.join(robots)}: their names, order or axes are not the same, so there is no joint to compare with "
-            "which. Compare runs of one robot file"
+            "which. Compare runs of one robot file",
+            code="recording/not-comparable",
         )
     for record in (a, b):
         _check_shapes(record)
@@ -235,10 +238,14 @@ def _check_shapes(record: RunRecord) -> None:
         if array.shape != shape or array.dtype.kind not in "fiu":
             raise ConfigError(
                 f"{record.folder / BLACK_BOX}: `{name}` holds {array.dtype} {array.shape}, wanted are numbers {shape}: "
-                f"{ticks} ticks, {joints} joints. It is damaged, or not of this run; repeat the run"
+                f"{ticks} ticks, {joints} joints. It is damaged, or not of this run; repeat the run",
+                code="recording/not-readable",
             )
     if not np.isfinite(record.time_s).all() or (np.diff(record.time_s) <= 0).any():
-        raise ConfigError(f"{record.folder / BLACK_BOX}: `time_s` does not grow from tick to tick; repeat the run")
+        raise ConfigError(
+            f"{record.folder / BLACK_BOX}: `time_s` does not grow from tick to tick; repeat the run",
+            code="recording/not-readable",
+        )
 
 
 def _compare_targets(aligned: Aligned, same_mode: NDArray[np.bool_]) -> list[Gap]:
@@ -340,7 +347,7 @@ def _describe_unreported(a: RunRecord, b: RunRecord) -> str:
 
 def _hand_overs_until(record: RunRecord, until_s: float) -> list[Propulsion]:
     """Return the hand-overs within the common time."""
-    return [period for period in propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
+    return [period for period in find_propulsion_periods(record) if period.start_s <= until_s + SAME_INSTANT_S]
 
 
 def _find_divergence(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:

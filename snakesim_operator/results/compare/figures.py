@@ -4,7 +4,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.compare.difference import Advance, Difference, Gap
-from snakesim_operator.results.metrics.propulsion import propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
 
 A, B = "--measured", "--reference"
@@ -53,9 +53,9 @@ def hand_overs(difference: Difference) -> Figure:
     drawn: list[Bar] = []
     propelled: set[int] = set()
     for run, record, color in (("A", difference.a, A), ("B", difference.b, B)):
-        for interval in propulsion_intervals(record):
+        for interval in find_propulsion_intervals(record):
             row = f"{difference.joints[interval.joint]} {run}"
-            drawn.append(Bar(row, interval.start_s, interval.end_s, f"{run} {interval.length_s:.1f} s", color))
+            drawn.append(Bar(row, interval.start_s, interval.end_s, f"{run} {interval.duration_s:.1f} s", color))
             propelled.add(interval.joint)
     rows: list[str] = []
     for joint in sorted(propelled, reverse=True):

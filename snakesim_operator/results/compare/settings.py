@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.model.files import leaves
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 UNSET = "not set"
 # Of the description: what the configuration has already, and what is another in every run.

@@ -52,7 +52,7 @@ def for_scripts(difference: Difference) -> dict[str, Any]:
         divergence = {"joint": names[parted.joint], "time_s": parted.time_s}
     return {
         "identical": difference.identical,
-        "lacks": {"a": difference.a.lacks, "b": difference.b.lacks},
+        "missing": {"a": difference.a.missing, "b": difference.b.missing},
         "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
         "settings": {setting.key: {"a": setting.a, "b": setting.b} for setting in difference.settings},
         "drives": drive_identities(difference.a, difference.b),
@@ -111,7 +111,7 @@ def _compared(difference: Difference) -> list[str]:
     host_b = difference.b.host
     lines.append(_row("faults", str(len(host_a.faults)), str(len(host_b.faults))))
     for name, record in (("A", difference.a), ("B", difference.b)):
-        lines += [f"  not known of {name}: {lack}" for lack in record.lacks]
+        lines += [f"  not known of {name}: {sentence}" for sentence in record.missing]
     digest_a = host_a.command_digest[:16]
     digest_b = host_b.command_digest[:16]
     lines.append(_row("command digest", digest_a, digest_b, "the same" if digest_a == digest_b else ""))

@@ -69,10 +69,10 @@ def _describe_divergence(difference: Difference) -> str:
 
 def _describe_partial(difference: Difference) -> list[str]:
     """Return a sentence if a record is incomplete, so that only a part of the runs is compared."""
-    lacking = [run for run, record in (("A", difference.a), ("B", difference.b)) if record.lacks]
-    if not lacking:
+    incomplete = [run for run, record in (("A", difference.a), ("B", difference.b)) if record.missing]
+    if not incomplete:
         return []
-    who = "A and B" if len(lacking) == 2 else lacking[0]
+    who = "A and B" if len(incomplete) == 2 else incomplete[0]
     return [f"Only a part of the runs is compared, because the record of {who} is incomplete."]
 
 

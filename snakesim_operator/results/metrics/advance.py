@@ -12,7 +12,7 @@ from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 SAMPLE_S = 0.1
 LASTING_S = 0.5  # for which a run goes on at its goal, because noise may move the body back over the line

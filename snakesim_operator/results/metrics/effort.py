@@ -9,7 +9,7 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, Advance, energy_j, energy_j_per_m
 from snakesim_operator.results.metrics.form_closure import contacts_beside, form_closure_margin
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 FORM_CLOSURE_PERIOD_NS = 0.1e9  # form closure is expensive to compute, and changes slowly
 HEADROOM_PERCENTILE = 95

@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import find_nodes_w
 from snakesim_hal.wire.messages import World
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 
 
 @dataclass(frozen=True)

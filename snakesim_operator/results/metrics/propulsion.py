@@ -1,42 +1,49 @@
-"""Which joint propelled when: one place for summary, report and comparison, so that all of them count alike."""
+"""Which joint propelled when. Summary, report and comparison all use this module, so that they count alike."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import merge_reports
 
 
 @dataclass(frozen=True)
 class Propulsion:
-    """A joint propelled for a while."""
+    """An interval in which one joint propelled, on the time axis of the run."""
 
     start_s: float
     end_s: float
-    joint: int
+    joint: int  # index, tail to head
 
     @property
-    def length_s(self) -> float:
-        """How long."""
+    def duration_s(self) -> float:
+        """Return the duration in s."""
         return self.end_s - self.start_s
 
 
-def propulsion_intervals(record: RunRecord) -> list[Propulsion]:
-    """Which joint propelled when, in order of time."""
-    joints = {joint.name: i for i, joint in enumerate(record.description.joints)}
-    bands = merge_reports(record, [state.propulsion_joint for state in record.control])
-    return [Propulsion(b.start_s, b.end_s, joints[b.what]) for b in bands if b.what in joints]
+def find_propulsion_intervals(record: RunRecord) -> list[Propulsion]:
+    """Return the intervals in which control reported a propulsion joint, in time order."""
+    joint_numbers = {joint.name: i for i, joint in enumerate(record.description.joints)}
+    names = [state.propulsion_joint for state in record.control]
+    intervals: list[Propulsion] = []
+    for band in merge_reports(record, names):
+        if band.what in joint_numbers:
+            intervals.append(Propulsion(band.start_s, band.end_s, joint_numbers[band.what]))
+    return intervals
 
 
-def propulsion_periods(record: RunRecord) -> list[Propulsion]:
-    """Every time that a joint began to propel after another one, and the first. One that pauses and goes on is none."""
-    found: list[Propulsion] = []
-    for one in propulsion_intervals(record):
-        if not found or found[-1].joint != one.joint:
-            found.append(one)
-    return found
+def find_propulsion_periods(record: RunRecord) -> list[Propulsion]:
+    """Return the first interval of each period in which one joint propelled, in time order.
+
+    A joint that pauses and continues, with no other joint in between, has one period.
+    """
+    periods: list[Propulsion] = []
+    for interval in find_propulsion_intervals(record):
+        if not periods or periods[-1].joint != interval.joint:
+            periods.append(interval)
+    return periods
 
 
 def count_hand_overs(periods: Sequence[Propulsion]) -> int:
-    """How often propulsion passed from one joint to another: one less than there are periods."""
+    """Return how often propulsion passed from one joint to another: one less than there are periods."""
     return max(len(periods) - 1, 0)

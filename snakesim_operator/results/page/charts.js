@@ -18,7 +18,7 @@
   const base = {
     autosize: true, dragmode: touch ? false : "zoom", margin: { l: 70, r: 14, t: 26, b: 40 },
     paper_bgcolor: "--card", plot_bgcolor: "--card",
-    font: { driver type: "system-ui, -apple-system, 'Segoe UI', Roboto, Arial, sans-serif", size: 12, color: "--ink" },
+    font: { family: "system-ui, -apple-system, 'Segoe UI', Roboto, Arial, sans-serif", size: 12, color: "--ink" },
     legend: { orientation: "h", x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: small, bgcolor: "rgba(0,0,0,0)" },
     hoverlabel: { bgcolor: "--page", bordercolor: "--rule", font: { color: "--ink", size: 12 }, namelength: -1 },
     modebar: { bgcolor: "rgba(0,0,0,0)", color: "--faint", activecolor: "--ink" },

@@ -18,7 +18,7 @@ Figure = dict[str, Any]
 LIBRARY = Path(__file__).parent / "vendor" / "plotly-cartesian.min.js"
 BUCKETS = 500  # of time; each keeps its smallest and its largest value
 MAP_COLUMNS = 480
-ROW = 21  # height of a row of bars
+ROW = 25  # height of a row of bars: enough for words of 11 px in them
 MAX_BARS = 2000
 NAMED_SHARE = 0.03  # of the time: a shorter bar has no room for words
 
@@ -127,7 +127,7 @@ def bars(label: str, rows: Sequence[str], drawn: Sequence[Bar], until_s: float, 
     }
     layout = {
         "barmode": "overlay",
-        "bargap": 0.25,
+        "bargap": 0.12,
         "hovermode": "closest",
         "yaxis": {"type": "category", "categoryarray": list(rows)[::-1], "range": [-0.5, len(rows) - 0.5]},
     }

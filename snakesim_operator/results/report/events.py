@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from snakesim_operator.results.metrics.motion import motion_of
-from snakesim_operator.results.metrics.propulsion import propulsion_periods
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.motion import measure_motion
+from snakesim_operator.results.metrics.propulsion import find_propulsion_periods
 from snakesim_operator.results.report.instants import Instant, balanced_instants, count_unmeasured, instant_at
 from snakesim_operator.results.report.timeline import jam_bands
 from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.results.time_axis import end_s
 
@@ -40,7 +40,7 @@ def find_events(record: RunRecord, summary: RunSummary) -> list[Event]:
     events += _hand_over_events(record)
     events += _largest_force_events(record)
     events += [Event(band.start_s, "Jam") for band in jam_bands(record)[:1]]
-    motion = motion_of(record)
+    motion = measure_motion(record)
     stop = stop_of(record, motion) if motion and summary.locomoting_fraction else None
     if stop is None:
         events.append(Event(end_s(record), "End"))
@@ -52,7 +52,7 @@ def find_events(record: RunRecord, summary: RunSummary) -> list[Event]:
 def _hand_over_events(record: RunRecord) -> list[Event]:
     names = [joint.name for joint in record.description.joints]
     events: list[Event] = []
-    for number, period in enumerate(propulsion_periods(record)):
+    for number, period in enumerate(find_propulsion_periods(record)):
         name = names[period.joint]
         words = f"{name} begins to propel" if number == 0 else f"Hand-over to {name}"
         events.append(Event(period.start_s, words, period.joint))

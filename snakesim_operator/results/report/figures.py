@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_operator.results.metrics.motion import MOVING, STANDING, motion_of
+from snakesim_operator.results.metrics.motion import MOVING, STANDING, measure_motion
 from snakesim_operator.results.metrics.propulsion import Propulsion
 from snakesim_operator.results.page.charts import Bar, Figure, Floats, Line, Mark, bars, joint_map, lines
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import (
     Series,
     commanded_torque_nm,
@@ -16,6 +15,7 @@ from snakesim_operator.results.report.timeline import (
     reference_rad,
     state_bands,
 )
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import SATURATED_FROM, largest
 from snakesim_operator.results.time_axis import end_s, zero_s
 
@@ -45,7 +45,7 @@ def advance(record: RunRecord, moved: Series) -> Figure:
 def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
     """Draw measured motion, states that control reported, jams, and a row for each joint that propelled."""
     names = [joint.name for joint in record.description.joints]
-    motion = motion_of(record)
+    motion = measure_motion(record)
     drawn: list[Bar] = []
     rows: list[str] = []
     if motion is not None:
@@ -59,7 +59,7 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
         if any(bar.row == row for bar in drawn):
             rows.append(row)
     for interval in intervals:
-        words = f"{interval.length_s:.1f} s"
+        words = f"{interval.duration_s:.1f} s"
         drawn.append(Bar(names[interval.joint], interval.start_s, interval.end_s, words, color(interval.joint)))
     propelled = sorted({interval.joint for interval in intervals}, reverse=True)
     rows += [names[joint] for joint in propelled]

@@ -13,7 +13,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.metrics.force_tracking import is_measured
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import reported_at_s
 
 MIN_CONTACTS = 3  # fewer contact forces cannot balance

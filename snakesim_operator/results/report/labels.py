@@ -2,7 +2,7 @@
 
 import math
 
-from snakesim_operator.results.report.svg import Point, text, text_width
+from snakesim_operator.results.page.svg import Point, text, text_width
 
 TEXT_HEIGHT = 13.0
 DIRECTIONS_DEG = (-90, 90, -45, -135, 45, 135, 0, 180)  # of a place from its point; the first ones are preferred

@@ -8,9 +8,8 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
-from snakesim_operator.results.metrics.propulsion import Propulsion, propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
 from snakesim_operator.results.page.html import render
-from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import Event, drawn_instants, find_events, select_listed
 from snakesim_operator.results.report.instants import measured_along_n
@@ -22,6 +21,8 @@ from snakesim_operator.results.report.timeline import distance, in_words, joined
 from snakesim_operator.results.report.top_view import top_view
 from snakesim_operator.results.report.verdict import verdict
 from snakesim_operator.results.report.view import nodes_xy_w, views
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.results.summary import RunSummary, distance_m
 from snakesim_operator.results.time_axis import end_s, zero_s
 
@@ -36,7 +37,7 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_
 def page(record: RunRecord, summary: RunSummary) -> str:
     """Return the whole page as HTML."""
     events = find_events(record, summary)
-    all_intervals = propulsion_intervals(record)
+    all_intervals = find_propulsion_intervals(record)
     intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
     joints: list[tuple[int, list[Propulsion]]] = []
     for joint in most_used_joints(intervals):
@@ -149,10 +150,8 @@ def _config_file(record: RunRecord) -> Path:
 
     A recording alone has no such file beside it: its configuration is on the page.
     """
-    if record.alone:
+    path = record.config_path
+    if path is None:
         return Path(CONFIG)
     here = Path.cwd()
-    folder = record.folder
-    if folder.is_relative_to(here):
-        folder = folder.relative_to(here)
-    return folder / CONFIG
+    return path.relative_to(here) if path.is_relative_to(here) else path

@@ -4,9 +4,9 @@ A phrase that is part of a longer sentence ends with its own separator; without 
 """
 
 from snakesim_operator.results.metrics.motion import Motion
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import reported_while_moving
 from snakesim_operator.results.run_ending import COMPLETE, UNKNOWN
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.results.time_axis import reported_at_s
 

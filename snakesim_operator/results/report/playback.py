@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
-from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, motion_of
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, measure_motion
+from snakesim_operator.results.page.svg import Point, element, figure
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
-from snakesim_operator.results.report.svg import Point, element, figure
 from snakesim_operator.results.report.timeline import in_words
 from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view, nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import end_s, zero_s
 
 MessageT = TypeVar("MessageT", ControlState, World)
@@ -60,7 +60,7 @@ def playback(record: RunRecord) -> Playback | None:
     maps, map_numbers = _perceived_maps(record, view, rows)
     paths, path_numbers = _planned_paths(record, view, rows)
     names = [joint.name for joint in record.description.joints]
-    motion = motion_of(record)
+    motion = measure_motion(record)
     captions: list[str] = []
     frames: list[list[Any]] = []
     with_desired = False
@@ -116,7 +116,7 @@ def _caption(motion: Motion | None, time_s: float, state: ControlState | None) -
     reported = "control reported nothing" if state is None else f"{in_words(state.state)}: {state.reason}"
     if motion is None:
         return reported
-    stands = motion.stands_at(time_s)
+    stands = motion.is_stationary_at(time_s)
     measured = STANDING if stands else MOVING
     if state is None or state.reason == STANDING_STILL:  # control's own measure, which looks back for a window
         return measured

@@ -9,10 +9,10 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score
-from snakesim_operator.results.metrics.motion import motion_of
+from snakesim_operator.results.metrics.motion import measure_motion
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import longest_reason, state_bands
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import end_s, reported_at_s, reported_spans, zero_s
 
 MAX_OBSTACLES = 24  # that get a row of their own: those with the largest impulse
@@ -178,11 +178,11 @@ def _merge_adjacent(spans: list[ForceSpan]) -> list[ForceSpan]:
 
 def _find_stops(record: RunRecord) -> list[StandingSpan]:
     """Return the spans in which the body stood still, as measured; without a pose, as control reported it."""
-    motion = motion_of(record)
+    motion = measure_motion(record)
     if motion is None:
         standing = [band for band in state_bands(record) if band.what == "NotLocomoting"]
     else:
-        standing = motion.standing
+        standing = motion.stops
     stops: list[StandingSpan] = []
     for span in standing:
         if span.end_s - span.start_s >= MIN_STOP_S:

@@ -8,8 +8,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.metrics.force_tracking import EMPTY_N, Pair, pairs
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.top_view import outline_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import SATURATED_FROM, RunSummary
 
 UNKNOWN = "the record does not tell why"

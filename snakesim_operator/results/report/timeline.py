@@ -10,7 +10,7 @@ from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.metrics.motion import Motion
 from snakesim_operator.results.metrics.propulsion import Propulsion
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import arc_position_m
 from snakesim_operator.results.time_axis import Interval, merge_reports, reported_at_s, reported_spans, zero_s
 
@@ -53,7 +53,7 @@ def reported_while_moving(record: RunRecord, motion: Motion) -> Mismatch | None:
     since_s: list[float] = []
     for since, until, state in reported_spans(record):
         is_report = state.state == "NotLocomoting" and state.reason != STANDING_STILL
-        if not is_report or until <= since or motion.stands_at((since + until) / 2):
+        if not is_report or until <= since or motion.is_stationary_at((since + until) / 2):
             continue
         lasted_s[state.reason] = lasted_s.get(state.reason, 0.0) + until - since
         since_s.append(since)
@@ -97,7 +97,7 @@ def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
     """Return the joints that propelled longest, from head to tail, in which order hand-overs happen."""
     spent: dict[int, float] = {}
     for interval in intervals:
-        spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.length_s
+        spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.duration_s
     longest = sorted(spent, key=lambda joint: -spent[joint])[:most]
     return sorted(longest, reverse=True)
 

@@ -7,11 +7,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
-from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.instants import Balance, Instant
-from snakesim_operator.results.report.labels import Labels
-from snakesim_operator.results.report.polygon import with_subscript
-from snakesim_operator.results.report.svg import (
+from snakesim_operator.results.page.svg import (
     arrow,
     element,
     figure,
@@ -23,7 +19,11 @@ from snakesim_operator.results.report.svg import (
     text_width,
     title,
 )
+from snakesim_operator.results.report.instants import Balance, Instant
+from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.polygon import with_subscript
 from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w, reach_m
+from snakesim_operator.results.run_log import RunRecord
 
 MAX_ROUTE_POINTS = 1500
 CIRCLE_CORNERS = 12

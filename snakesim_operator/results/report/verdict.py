@@ -8,8 +8,7 @@ import numpy as np
 from snakesim_hal.model.checked import CHECK
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Fault
-from snakesim_operator.results.metrics.motion import Motion, motion_of
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.motion import Motion, measure_motion
 from snakesim_operator.results.report.phrases import (
     MOVED_M,
     as_sentence,
@@ -24,6 +23,7 @@ from snakesim_operator.results.report.phrases import (
 )
 from snakesim_operator.results.report.timeline import longest_reason
 from snakesim_operator.results.run_ending import COMPLETE
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 from snakesim_operator.results.time_axis import end_s, reported_at_s
 
@@ -31,8 +31,8 @@ MIN_STOP_S = 0.5  # a shorter stop at the end is not mentioned
 MAX_STANDING_FRACTION = 0.5  # a run that stood still for more of its time, up to its end, is a poor one
 MOVED_RAD = 1e-3  # a joint whose target changed by less, as by rounding, was not moved
 JUDGING_COMMANDS = {  # controller that does not locomote -> command that judges its run
-    CHECK: "snakesim joints check",
-    "identify": "snakesim identify",
+    CHECK: "snakesim robot check",
+    "identify": "snakesim robot identify",
 }
 Kind = Literal["good", "poor", "bad"]
 
@@ -72,7 +72,7 @@ def _judge_run(record: RunRecord, summary: RunSummary) -> Verdict:
     command = JUDGING_COMMANDS.get(record.config.controller)
     if command is not None:
         return _judge_joint_test(record, summary, command)
-    motion = motion_of(record)
+    motion = measure_motion(record)
     if motion is None:
         moved = describe_distance(record, summary)
         rest = f"{describe_hand_overs(summary)}{describe_trouble(summary)}.{describe_ending(summary.ended)}"

@@ -7,9 +7,9 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.page.svg import Point
 from snakesim_operator.results.report.instants import Instant
-from snakesim_operator.results.report.svg import Point
+from snakesim_operator.results.run_log import RunRecord
 
 LONGEST_ARROW = 72.0  # of the strongest force, in units of the drawing
 FELT_SHARE = 1.1  # of the longest arrow: a longer measured force is cut, so that one impact does not dwarf the rest

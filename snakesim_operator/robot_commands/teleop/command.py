@@ -46,7 +46,10 @@ def teleop(where: RobotSelection, fastest_m_s: float, joystick: Path | None) -> 
         SnakesimError: no robot, no joystick or no terminal, or the speed is out of range.
     """
     if not 0 < fastest_m_s <= MAX_FASTEST_M_S:
-        raise ConfigError(f"--fastest {fastest_m_s:g}: give a speed above 0, and at most {MAX_FASTEST_M_S} m/s")
+        raise ConfigError(
+            f"--fastest {fastest_m_s:g}: give a speed above 0, and at most {MAX_FASTEST_M_S} m/s",
+            code="command/invalid-option",
+        )
     with contextlib.ExitStack() as opened:
         stick: Joystick | None = None
         if joystick is not None:
@@ -231,8 +234,8 @@ class Teleop:
         if worlds := self._worlds.drain():
             self._body_w_rad = yaw_from_rotation(rotation_from_quaternion(worlds[-1].base_orientation_wxyz))
         for intent in self._others.drain():
-            if intent.who != self._user:
-                self._other_user = intent.who
+            if intent.requester != self._user:
+                self._other_user = intent.requester
 
     def _send_intent(self) -> None:
         """Send an intent for each new robot time, once the operator has made an input.
@@ -266,7 +269,7 @@ class Teleop:
         if status is None:
             return f"{self._link.namespace}: no status yet"
         age = _describe_age(self._status_s)
-        return f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.why}"
+        return f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.reason}"
 
     def _describe_control(self) -> str:
         control = self._control
@@ -277,7 +280,7 @@ class Teleop:
     def _describe_request(self) -> str:
         """Return what the operator requests from the robot, or why no request is sent."""
         if self._stopping is not None:
-            return f"EMERGENCY STOP: {self._describe_stop()}. Then: snakesim clear, snakesim arm"
+            return f"EMERGENCY STOP: {self._describe_stop()}. Then: snakesim robot reset, snakesim robot arm"
         silent_s = time.monotonic() - self._clock_s
         if silent_s > SILENT_S:
             return f"{self._describe_silence(silent_s)}: nothing can be asked for"

@@ -134,7 +134,8 @@ def open_joystick(device: Path | None) -> Joystick:
         problem = f"{path}: has no stick with axes X and Y, and buttons"
     raise ConfigError(
         f"--joystick: {problem}. Plug one in, name its device, or get the permission: sudo usermod -aG input $USER, "
-        f"and log in again"
+        f"and log in again",
+        code="command/invalid-option",
     )
 
 

@@ -71,7 +71,7 @@ class Keyboard:
         """
         self._handle = sys.stdin.fileno()
         if not os.isatty(self._handle):
-            raise ConfigError(no_terminal)
+            raise ConfigError(no_terminal, code="command/invalid-option")
         self._initial_settings = termios.tcgetattr(self._handle)
         self.gone = False  # the terminal was closed
         self.late = False  # the keys of the last reading may be old

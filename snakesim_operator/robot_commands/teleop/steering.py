@@ -14,8 +14,8 @@ LEAD_RAD = math.pi / 2  # the requested direction is ahead of the body's by at m
 class Steering:
     """Speed and direction, changed by keys or by a stick."""
 
-    def __init__(self, who: str, fastest_m_s: float) -> None:
-        self._who = who
+    def __init__(self, requester: str, fastest_m_s: float) -> None:
+        self._requester = requester
         self._max_speed_m_s = fastest_m_s
         self.speed_m_s = 0.0
         self.heading_w_rad: float | None = None  # None: the mission's own goal
@@ -51,7 +51,7 @@ class Steering:
         """Return the request as a message. robot_ns: the present robot time."""
         return Intent(
             timestamp_ns=robot_ns,
-            who=self._who,
+            requester=self._requester,
             speed_m_s=self.speed_m_s,
             go=self.speed_m_s != 0.0,
             valid_for_ns=VALID_NS,

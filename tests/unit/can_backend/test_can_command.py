@@ -1,7 +1,8 @@
-"""`snakesim can`: the sum of a bus, who answers on it, and the spelled-out DBC file."""
+"""`snakesim drive` for joint modules: the sum of a bus, who answers on it, and the spelled-out DBC file."""
 
 import re
 import uuid
+from functools import partial
 from pathlib import Path
 
 import can
@@ -9,7 +10,8 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
 from snakesim_can_backend.bus.load import bus_load, check_load, plan_reports_at
-from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, main, scan, settings_of
+from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, scan, settings_of
+from snakesim_can_backend.commands import COMMANDS
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode
@@ -18,15 +20,18 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
-from tests.unit.can_backend.frames import health, heartbeat
+from snakesim_testing.can.frames import health, heartbeat
+from snakesim_testing.harness.registered import run_registered
+from snakesim_testing.messages import raises_error
 
+run = partial(run_registered, COMMANDS)
 TRIPLET = load_scenario("triplet").config
 
 # --- load --------------------------------------------------------------------------------------------------
 
 
 def test_load_prints_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["load", "triplet"]) == 0
+    assert run(["drive", "load", "can", "triplet"]) == 0
     said = capsys.readouterr().out
     assert "one bus: 13 joints at 100 Hz" in said
     assert "JointState       1300 frames/s x 135 bits (8 bytes) =  17.6 %" in said
@@ -34,21 +39,21 @@ def test_load_prints_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_load_says_what_is_refused_and_what_would_fit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["load", "triplet", "--set", "rate_hz=300"]) == 1
+    assert run(["drive", "load", "can", "triplet", "--set", "rate_hz=300"]) == 1
     assert "Refused. What would fit: rate_hz = " in capsys.readouterr().out
 
 
 def test_load_takes_the_settings_of_the_backend(capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--set", 'backend.channels=["can0", "can1"]', "--set", "backend.contact_rate_hz=0"]
-    assert main(["load", "triplet", *flags]) == 0
+    assert run(["drive", "load", "can", "triplet", *flags]) == 0
     said = capsys.readouterr().out
     assert "can0: 7 joints" in said and "can1: 6 joints" in said and "Contact" not in said
-    with pytest.raises(ConfigError, match=r"backends\.can\.imu_rate_hz"):
-        main(["load", "triplet", "--set", "backend.imu_rate_hz=-1"])
+    with raises_error(ConfigError, code="config/out-of-range"):
+        run(["drive", "load", "can", "triplet", "--set", "backend.imu_rate_hz=-1"])
 
 
 def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["load", "triplet", "--joints", "13", "18", "30", "--rates", "50", "100", "200"]) == 0
+    assert run(["drive", "load", "can", "triplet", "--joints", "13", "18", "30", "--hz", "50", "100", "200"]) == 0
     heading, *rows, about = capsys.readouterr().out.splitlines()
     assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
     for row, joints in zip(rows, (13, 18, 30), strict=True):
@@ -62,27 +67,28 @@ def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_table_of_several_buses_is_of_the_fullest(capsys: pytest.CaptureFixture[str]) -> None:
     two = 'backend.channels=["can0", "can1"]'
-    assert main(["load", "triplet", "--set", two, "--joints", "13"]) == 0
+    assert run(["drive", "load", "can", "triplet", "--set", two, "--joints", "13"]) == 0
     said = capsys.readouterr().out
     loaded = load_scenario("triplet", [parse_set("backend=can"), parse_set(two)])
     assert f"{100 * max(check_load(loaded.config, settings_of(loaded))):.1f} %" in said
     assert "the fullest of 2 buses" in said
 
 
-@pytest.mark.parametrize("flags", [["--joints", "0"], ["--joints", "63"], ["--rates", "19"], ["--rates", "fast"]])
+@pytest.mark.parametrize("flags", [["--joints", "0"], ["--joints", "63"], ["--hz", "19"], ["--hz", "fast"]])
 def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["load", "triplet", *flags])
+        run(["drive", "load", "can", "triplet", *flags])
     assert caught.value.code == 2 and flags[1] in capsys.readouterr().err
 
 
-# --- expand ------------------------------------------------------------------------------------------------
+# --- dbc ---------------------------------------------------------------------------------------------------
 
 
-def test_expand_needs_a_folder(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_the_dbc_file_needs_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"file/all\.dbc: cannot be written: its folder is a file"):
-        main(["expand", "--out", str(tmp_path / "file" / "all.dbc")])
+    with raises_error(ConfigError, code="file/not-writable", field="all.dbc"):
+        run(["drive", "dbc", "--out", str(tmp_path / "file" / "all.dbc")])
 
 
 # --- scan --------------------------------------------------------------------------------------------------
@@ -132,13 +138,13 @@ def test_a_module_that_only_says_who_it_is_has_nothing_made_up() -> None:
 
 
 def test_scan_of_an_empty_bus_is_a_failure(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scan", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--seconds", "0.05"]) == 1
+    assert run(["drive", "scan", "can", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--duration", "0.05"]) == 1
     assert "no module answers" in capsys.readouterr().out
 
 
 def test_scan_of_an_interface_that_is_not_there() -> None:
-    with pytest.raises(ConfigError, match="nocan7"):
-        main(["scan", "nocan7"])
+    with raises_error(ConfigError, code="bus/not-available"):
+        run(["drive", "scan", "can", "nocan7"])
 
 
 def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,9 +158,9 @@ def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.
     ]
     with can.Bus(interface="virtual", channel=channel) as bus:
         chatter = [bus.send_periodic(message, 0.01) for message in theirs]
-        said_no = main(["scan", f"virtual:{channel}", "--seconds", "0.05"])
+        said_no = run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05"])
         assert bus.recv(0) is None, "something was sent"
-        assert main(["scan", f"virtual:{channel}", "--seconds", "0.05", "--anyway"]) == 1
+        assert run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05", "--anyway"]) == 1
         heard = [bus.recv(0.5)]
         for task in chatter:
             task.stop()

@@ -8,6 +8,7 @@ from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParamete
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
+from snakesim_testing.messages import raises_error
 
 
 def read(section: dict[str, Any]) -> CanSettings:
@@ -28,20 +29,23 @@ def test_where_twins_run(section: dict[str, Any], where: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "wanted"),
+    ("key", "value"),
     [
-        ("bit_rate", 2_000_000, "bit/s"),
-        ("contact_rate_hz", -1.0, ">= 0"),
-        ("watchdog_s", 0.5, "0.1"),
-        ("pose_listen", "somewhere", "pose_listen"),
-        ("pose_listen", "host:port", "pose_listen"),
+        ("bit_rate", 2_000_000),
+        ("contact_rate_hz", -1.0),
+        ("watchdog_s", 0.5),
+        ("pose_listen", "somewhere"),
+        ("pose_listen", "host:port"),
     ],
 )
-def test_a_bad_value_is_named_with_its_file_and_what_is_wanted(key: str, value: Any, wanted: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+def test_a_bad_value_is_named_with_its_file_and_what_is_wanted(key: str, value: Any) -> None:
+    with raises_error(
+        ConfigError,
+        code=("config/invalid-value", "config/out-of-range"),
+        field=("crawl.toml", f"backends.can.{key}"),
+        value=value,
+    ):
         read({key: value})
-    text = str(caught.value)
-    assert text.startswith("crawl.toml: ") and f"backends.can.{key}" in text and wanted in text and str(value) in text
 
 
 def test_the_watchdog_goes_as_far_as_modules_let_it() -> None:

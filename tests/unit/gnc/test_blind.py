@@ -7,7 +7,7 @@ from snakesim_gnc.control.hold import Hold
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
 from snakesim_gnc.control.path_following import PathFollowing
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 TAIL_S_M = 0.3
 TORQUE_NM = 2.0  # that every joint is said to have: what the propulsion joint pushes with
@@ -19,19 +19,19 @@ CONTROLLERS = [Hold, PathFollowing, ObstacleTriplet]
 @pytest.mark.parametrize("plugin", CONTROLLERS)
 def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
     stage = make_stage()
-    controller = plugin(stage.robot, plugin.Settings())
+    controller = plugin(stage.robot, plugin.Parameters())
 
     def act(ticks, tail_s_m=TAIL_S_M, **more):
-        return [controller.update(stage.view(t, tail_s_m, torque_nm=TORQUE_NM, **more)) for t in ticks]
+        return [controller.update(stage.observe(t, tail_s_m, torque_nm=TORQUE_NM, **more)) for t in ticks]
 
     before = act(range(100))[-1]
     pushing = Mode.TORQUE in before.setpoints.mode
     assert pushing == (plugin is ObstacleTriplet)
     blind = act(range(100, 300), without=without)
-    assert all(set(action.setpoints.mode) == {Mode.POSITION} for action in blind)
-    assert all(action.report.propulsion_joint is None for action in blind)
-    targets = np.array([action.setpoints.target for action in blind])
-    angles = np.array(stage.view(0, TAIL_S_M).joints.angle_rad)
+    assert all(set(command.setpoints.mode) == {Mode.POSITION} for command in blind)
+    assert all(command.telemetry.propulsion_joint is None for command in blind)
+    targets = np.array([command.setpoints.target for command in blind])
+    angles = np.array(stage.observe(0, TAIL_S_M).joints.angle_rad)
     assert np.abs(np.diff(targets, axis=0)).max() < STEP_RAD
     assert np.abs(targets[-1] - targets[-100]).max() < 2e-3  # it stays
     if pushing:  # what the joint pushed with has faded, and is not kept up by a position target far away
@@ -50,11 +50,11 @@ def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
 @pytest.mark.parametrize("plugin", [PathFollowing, ObstacleTriplet])
 def test_before_it_knows_anything_it_holds_its_first_pose_and_says_what_is_missing(plugin, without):
     stage = make_stage()
-    controller = plugin(stage.robot, plugin.Settings())
-    view = stage.view(0, TAIL_S_M, without=without)
-    first = controller.update(view)
-    assert first.report.why == {"world": "no world model", "trajectory": "no trajectory"}[without]
-    assert first.setpoints.target == pytest.approx(view.joints.angle_rad)
+    controller = plugin(stage.robot, plugin.Parameters())
+    observation = stage.observe(0, TAIL_S_M, without=without)
+    first = controller.update(observation)
+    assert first.telemetry.reason == {"world": "no world model", "trajectory": "no trajectory"}[without]
+    assert first.setpoints.target == pytest.approx(observation.joints.angle_rad)
     assert set(first.setpoints.mode) == {Mode.POSITION}
-    slid = controller.update(stage.view(1, TAIL_S_M, without=without, turned={3: 0.2}))
+    slid = controller.update(stage.observe(1, TAIL_S_M, without=without, turned={3: 0.2}))
     assert slid.setpoints.target == pytest.approx(first.setpoints.target)  # held, not followed

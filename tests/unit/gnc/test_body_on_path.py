@@ -10,7 +10,7 @@ from snakesim_gnc.geometry.body_on_path import BodyOnPath, chain_nodes, compute_
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.route import lay_chain
-from tests.unit.gnc.stage import PERIOD_S, make_robot, make_route, make_stage, nodes_of
+from snakesim_testing.gnc.stage import PERIOD_S, make_robot, make_route, make_stage, nodes_of
 
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]
 ROUTE = make_route()
@@ -74,13 +74,13 @@ def follow(progress, stage, speed_m_s, ticks):
     located = None
     for tick in range(ticks):
         seen = max(tick - 2, 0) // 2 * 2
-        view = stage.view(
+        observation = stage.observe(
             tick,
             0.3 + speed_m_s * tick * PERIOD_S,
             world_age_ticks=tick - seen,
             world_tail_s_m=0.3 + speed_m_s * seen * PERIOD_S,
         )
-        located = progress.update(view)
+        located = progress.update(observation)
     assert isinstance(located, Located)
     return located
 
@@ -98,7 +98,7 @@ def test_a_pose_that_is_repeated_is_no_body_that_stands_still():
     follow(progress, stage, 0.2, 61)
     for tick in range(61, 71):  # new world models, all with the pose of tick 58
         located = progress.update(
-            stage.view(tick, 0.3 + 0.2 * tick * PERIOD_S, world_tail_s_m=0.3 + 0.2 * 0.58, pose_age_ticks=tick - 58)
+            stage.observe(tick, 0.3 + 0.2 * tick * PERIOD_S, world_tail_s_m=0.3 + 0.2 * 0.58, pose_age_ticks=tick - 58)
         )
         assert isinstance(located, Located) and located.fresh
         assert located.speed_m_s == pytest.approx(0.2, abs=0.01)
@@ -109,18 +109,18 @@ def test_a_body_that_was_lost_is_found_again_where_it_is():
     stage, progress = make_stage(), make_progress()
     follow(progress, stage, 0.2, 61)
     for tick in range(61, 161):
-        progress.update(stage.view(tick, 0.5, without="world"))
-    found = progress.update(stage.view(161, 0.55))
+        progress.update(stage.observe(tick, 0.5, without="world"))
+    found = progress.update(stage.observe(161, 0.55))
     assert isinstance(found, Located) and found.restarted
     assert found.tail_s_m == pytest.approx(0.55, abs=2e-3) and found.speed_m_s == 0.0
 
 
 def test_a_new_path_is_noticed():
     stage, progress = make_stage(), make_progress()
-    first = progress.update(stage.view(0, 0.3))
-    again = progress.update(stage.view(1, 0.3))
+    first = progress.update(stage.observe(0, 0.3))
+    again = progress.update(stage.observe(1, 0.3))
     stage.path_id = 7
-    other = progress.update(stage.view(2, 0.3))
+    other = progress.update(stage.observe(2, 0.3))
     assert isinstance(first, Located)
     assert isinstance(again, Located)
     assert isinstance(other, Located)

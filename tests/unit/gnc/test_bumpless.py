@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_hal.safety.limiter import find_bumpless_target
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_robot
-from tests.unit.hal.rig import state
+from snakesim_testing.gnc.stage import make_robot
+from snakesim_testing.hal.small_robots import state
 
 ROBOT = make_robot(4)
 values = st.lists(st.floats(-1, 1), min_size=4, max_size=4)

@@ -11,7 +11,7 @@ from snakesim_gnc.navigation.platform_rises import PlatformRises
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle, Rise
-from tests.unit.gnc.stage import make_robot
+from snakesim_testing.gnc.stage import make_robot
 
 RISE = Rise(from_s_m=1.0, to_s_m=1.6, height_m=0.1)
 AXES = ["yaw", "pitch"] * 9

@@ -16,7 +16,7 @@ from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, find_start_pose, load, parse_set, place_obstacles
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
-from tests.unit.gnc.stage import make_world
+from snakesim_testing.gnc.stage import make_world
 
 TURN_S = 0.08  # a plan takes some of them
 SECOND = 10**9
@@ -81,7 +81,7 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
             assert grown == pytest.approx(1e-4, rel=1e-3)
 
 
-@pytest.mark.parametrize("density", [8.0, 12.0])
+@pytest.mark.parametrize("density", [12.0, pytest.param(8.0, marks=pytest.mark.slow)])
 def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -> None:
     obstacles, body = field(density)
     made = ObstacleGrid(obstacles)
@@ -108,6 +108,7 @@ def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None
     assert seen[0].speed_m_s == 0.2
 
 
+@pytest.mark.slow
 def test_a_body_that_has_left_where_it_stood_gets_a_path_from_where_it_lies() -> None:
     obstacles, body = field()
     made = planner(obstacles)
@@ -130,6 +131,7 @@ def test_only_what_is_seen_is_planned_around() -> None:
     assert min(outline_distance_m(wall, p) for p in np.array(seen.path_w)) > 0.03
 
 
+@pytest.mark.slow  # whole runs through clutter reach it in tests/system/physics
 def test_a_goal_is_reached() -> None:
     obstacles, body = field()
     made = planner(obstacles, HeadingGoal(distance_m=0.5))
@@ -145,7 +147,7 @@ def test_a_goal_is_reached() -> None:
     assert planned(made, body + np.array([0.95, 0.0]), 1.0).finished
 
 
-@pytest.mark.parametrize("heading_rad", [0.7, -0.7, 3.0])
+@pytest.mark.parametrize("heading_rad", [0.7, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.7, 3.0))])
 def test_a_heading_that_is_asked_for_counts_and_not_the_mission(heading_rad: float) -> None:
     obstacles, body = field()
     made = planner(obstacles, HeadingGoal(distance_m=0.1))
@@ -215,7 +217,7 @@ def test_a_tick_that_is_shown_again_is_one_turn() -> None:
 
 @pytest.mark.parametrize(
     ("seen", "turn_s"),
-    [(True, 0.02), (False, 0.2), *(pytest.param(*row, marks=pytest.mark.slow) for row in ((True, 0.2), (False, 0.02)))],
+    [(False, 0.2), *(pytest.param(*row, marks=pytest.mark.slow) for row in ((True, 0.2), (False, 0.02), (True, 0.02)))],
 )
 def test_the_work_of_a_turn_is_bounded_whatever_is_planned(seen: bool, turn_s: float) -> None:
     """Counted, and in CPU time: ten times what the rate allows, so that a slow computer passes."""

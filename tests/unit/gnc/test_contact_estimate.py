@@ -7,8 +7,8 @@ from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushe
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
-from tests.unit.gnc.stage import make_robot
-from tests.unit.hal.rig import pose
+from snakesim_testing.gnc.stage import make_robot
+from snakesim_testing.hal.small_robots import pose
 
 ROBOT = make_robot()
 COUNT = len(ROBOT.joints)

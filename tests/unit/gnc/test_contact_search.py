@@ -9,55 +9,55 @@ import onnxruntime
 import pytest
 
 from snakesim.training.form import Policy
-from snakesim_gnc.control.controller import Action
 from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave
-from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
 from snakesim_gnc.control.policy import POLICIES
 from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.controller import ControllerCommand
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.stage import Stage, make_contact, make_stage
+from snakesim_testing.gnc.stage import Stage, make_contact, make_stage
 
 TAIL_S_M = 0.3
 SEARCHES = "in search of contacts"
 JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
 
 
-def searching(*, among_pegs: bool = False, **settings: float) -> tuple[Stage, ObstacleAided]:
+def searching(*, among_pegs: bool = False, **parameters: float) -> tuple[Stage, ObstacleAided]:
     """A body on its path that searches for contacts after a second, unless configured otherwise."""
     stage = make_stage()
     stage.pegs = stage.pegs if among_pegs else []
-    return stage, ObstacleAided(stage.robot, ObstacleAided.Settings(**{"search_after_s": 1.0, **settings}))
+    return stage, ObstacleAided(stage.robot, ObstacleAidedParameters(**{"search_after_s": 1.0, **parameters}))
 
 
-def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[Action]:
+def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[ControllerCommand]:
     """What is commanded while the body stays where it is."""
-    return [controller.update(stage.view(tick, TAIL_S_M)) for tick in ticks]
+    return [controller.update(stage.observe(tick, TAIL_S_M)) for tick in ticks]
 
 
-def targets(actions: list[Action]) -> np.ndarray:
-    return np.array([action.setpoints.target for action in actions])
+def targets(commands: list[ControllerCommand]) -> np.ndarray:
+    return np.array([command.setpoints.target for command in commands])
 
 
-def period_s(actions: list[Action]) -> float:
+def period_s(commands: list[ControllerCommand]) -> float:
     """Of the wave, at the head."""
-    head = targets(actions)[:, -1]
+    head = targets(commands)[:, -1]
     return len(head) * 0.01 / int(np.argmax(np.abs(np.fft.rfft(head - head.mean()))))
 
 
 def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again() -> None:
     stage, controller = searching(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
     alone = stands(controller, stage, range(300))
-    searches = [SEARCHES in action.report.why for action in alone]
+    searches = [SEARCHES in command.telemetry.reason for command in alone]
     assert not any(searches[:115]) and all(searches[125:])
     assert np.ptp(targets(alone[125:])[:, -1]) > 0.5  # of the head
     stage.pegs = make_stage().pegs
     beside = stands(controller, stage, range(300, 400))
-    assert not any(SEARCHES in action.report.why for action in beside[25:])
-    assert max(action.report.propulsion_n or 0.0 for action in beside) > 5.0
+    assert not any(SEARCHES in command.telemetry.reason for command in beside[25:])
+    assert max(command.telemetry.propulsion_n or 0.0 for command in beside) > 5.0
     assert np.abs(np.diff(targets(alone + beside), axis=0)).max() < JUMP_RAD
     again = stands(controller, stage, range(400, 480))
-    assert SEARCHES in again[-1].report.why
+    assert SEARCHES in again[-1].telemetry.reason
 
 
 @pytest.mark.parametrize("among_pegs", [True, False])
@@ -70,10 +70,11 @@ def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) 
     assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
 
 
+@pytest.mark.slow
 def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_with_the_fast_one() -> None:
     stage, controller = searching(among_pegs=True, shape_nm_per_rad=0.0)
     for tick in range(100):
-        controller.update(stage.view(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
+        controller.update(stage.observe(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
     seen = stands(controller, stage, range(100, 1150))
     slow, fast = pytest.approx(2 * math.tau / 5.39, rel=0.15), pytest.approx(math.tau / 5.39, rel=0.15)
     assert [period_s(seen[first : first + 240]) for first in (150, 750)] == [slow, fast]
@@ -83,26 +84,26 @@ def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_
 def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
     stage, controller = searching()
     stands(controller, stage, range(110))
-    led = [controller.update(stage.view(tick, TAIL_S_M + 0.0003 * (tick - 110))) for tick in range(110, 900)]
-    assert all(SEARCHES in action.report.why for action in led)
+    led = [controller.update(stage.observe(tick, TAIL_S_M + 0.0003 * (tick - 110))) for tick in range(110, 900)]
+    assert all(SEARCHES in command.telemetry.reason for command in led)
     assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [pytest.approx(0.8, rel=0.05)] * 3
 
 
 def test_noise_of_the_pose_does_not_hide_that_a_body_stands() -> None:
     (stage, controller), noise = searching(search_after_s=1.2), np.random.default_rng(1)
-    views = (stage.view(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
-    assert any(SEARCHES in controller.update(view).report.why for view in views)
+    observations = (stage.observe(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
+    assert any(SEARCHES in controller.update(observation).telemetry.reason for observation in observations)
 
 
 def test_nobody_searches_when_told_not_to() -> None:
     stage, never = searching(search_after_s=0.0)
-    assert not any(SEARCHES in action.report.why for action in stands(never, stage, range(500)))
+    assert not any(SEARCHES in command.telemetry.reason for command in stands(never, stage, range(500)))
 
 
 def test_the_wave_is_that_of_the_shipped_policy() -> None:
     stage, passed_s, draw = make_stage(), 2.3, np.random.default_rng(3)
-    view = stage.view(0, TAIL_S_M)
-    assert view.world is not None and view.trajectory is not None
+    observation = stage.observe(0, TAIL_S_M)
+    assert observation.world is not None and observation.trajectory is not None
     contacts = [
         make_contact("peg", (3.0, force_n, 4.0), link) for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
     ]
@@ -110,8 +111,8 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     for contact in contacts:
         forces_n[contact.link] += np.linalg.norm(contact.force_w)
     velocity, torque = draw.normal(0.0, 1.0, 13).tolist(), draw.normal(0.0, 3.0, 13).tolist()
-    joints = msgspec.structs.replace(view.joints, velocity_rad_s=velocity, torque_nm=torque)
-    nodes = PlanarBody(stage.robot).nodes_w(view.world, joints.angle_rad)
+    joints = msgspec.structs.replace(observation.joints, velocity_rad_s=velocity, torque_nm=torque)
+    nodes = PlanarBody(stage.robot).nodes_w(observation.world, joints.angle_rad)
     goal_w = nodes[:, -1] + np.array([0.5, 2.0])
     bearing_rad = np.arctan2(2.0, 0.5) - np.arctan2(*(nodes[:, -1] - nodes[:, 0])[::-1])
     session = onnxruntime.InferenceSession(POLICIES / "lab.onnx")
@@ -121,10 +122,10 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     goal = [np.cos(bearing_rad), np.sin(bearing_rad)]
     seen = [passed_s, *goal, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *forces_n]
     felt = replace(
-        view,
+        observation,
         joints=joints,
-        world=msgspec.structs.replace(view.world, contacts=contacts),
-        trajectory=msgspec.structs.replace(view.trajectory, goal_w=tuple(goal_w.tolist())),
+        world=msgspec.structs.replace(observation.world, contacts=contacts),
+        trajectory=msgspec.structs.replace(observation.trajectory, goal_w=tuple(goal_w.tolist())),
     )
     wave = ForceFeedbackWave(stage.robot).reference_rad(felt, passed_s)
     assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
@@ -132,10 +133,10 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
 
 def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
     """Angles of all joints of a straight body, whatever path there is."""
-    joints = stage.view(0, TAIL_S_M, torque_nm=torque_nm).joints
+    joints = stage.observe(0, TAIL_S_M, torque_nm=torque_nm).joints
     straight = msgspec.structs.replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
-    view = replace(stage.view(0, TAIL_S_M, without="world"), joints=straight)
-    return ForceFeedbackWave(stage.robot).reference_rad(view, 0.3)
+    observation = replace(stage.observe(0, TAIL_S_M, without="world"), joints=straight)
+    return ForceFeedbackWave(stage.robot).reference_rad(observation, 0.3)
 
 
 def test_joints_twice_as_far_apart_bend_twice_as_much_and_so_along_the_same_curve() -> None:
@@ -151,12 +152,14 @@ def test_a_torque_is_felt_by_how_much_it_is_of_the_limit() -> None:
 
 def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     stage = make_stage()
-    view = stage.view(0, TAIL_S_M)
-    knocked = replace(view, joints=msgspec.structs.replace(view.joints, velocity_rad_s=[20.0] * 13))
+    observation = stage.observe(0, TAIL_S_M)
+    knocked = replace(observation, joints=msgspec.structs.replace(observation.joints, velocity_rad_s=[20.0] * 13))
     calm, struck = ForceFeedbackWave(stage.robot), ForceFeedbackWave(stage.robot)
     for wave in (calm, struck):
-        wave.reference_rad(view, 0.01)
-    apart = [np.ptp([calm.reference_rad(view, 0.01), struck.reference_rad(knocked, 0.01)], axis=0) for _ in range(20)]
+        wave.reference_rad(observation, 0.01)
+    apart = [
+        np.ptp([calm.reference_rad(observation, 0.01), struck.reference_rad(knocked, 0.01)], axis=0) for _ in range(20)
+    ]
     assert np.max(np.diff(apart, axis=0)) < 0.11 and np.max(apart[0]) < 0.11 and np.max(apart[-1]) > 0.3  # rad
 
 
@@ -164,8 +167,8 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
 def test_a_body_that_moves_as_it_is_to_does_not_search_whatever_carries_it(speed_m_s: float) -> None:
     stage, controller = searching()
     stage.speed_m_s = speed_m_s
-    moving = [controller.update(stage.view(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
-    assert not any(SEARCHES in action.report.why for action in moving)
+    moving = [controller.update(stage.observe(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
+    assert not any(SEARCHES in command.telemetry.reason for command in moving)
 
 
 @pytest.mark.parametrize(
@@ -178,6 +181,6 @@ def test_a_body_in_a_u_that_nothing_can_push_is_no_error(pegs: list[Obstacle]) -
     stage.route = Route([(-0.3, 0.0), *map(tuple, bend.tolist()), (-3.0, 0.24)])
     stage.pegs = pegs
     for tail_s_m in np.linspace(0.3, 0.7, 9):
-        controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
+        controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
         for tick in range(5):
-            assert np.isfinite(controller.update(stage.view(tick, float(tail_s_m))).setpoints.target).all()
+            assert np.isfinite(controller.update(stage.observe(tick, float(tail_s_m))).setpoints.target).all()

@@ -8,8 +8,8 @@ import pytest
 from snakesim_gnc.control.freshness import AgeLimits
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Description, SensorDescription, Trajectory, World
-from tests.unit.gnc.stage import make_world
-from tests.unit.hal.rig import description, run_config, state
+from snakesim_testing.gnc.stage import make_world
+from snakesim_testing.hal.small_robots import description, run_config, state
 
 SCHEDULE = {
     "control": {"latency_ticks": 2},

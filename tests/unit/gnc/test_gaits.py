@@ -1,13 +1,16 @@
 """Gaits on flat ground, in the simulator: where they carry the body, and a robot that cannot do them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from snakesim_gnc.control.gaits import RaisedHead, Rolling, Sidewinding
+from snakesim_hal.controller import Controller
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import Result, simulate
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 
 def on_flat_ground(*sets: str) -> Result:
@@ -24,7 +27,7 @@ def moved_m(record: RunRecord) -> np.ndarray:
     return (last - first).mean(axis=0)[:2]
 
 
-@pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), (-0.2, 1.0)])
+@pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), pytest.param(-0.2, 1.0, marks=pytest.mark.slow)])
 def test_sidewinding_travels_sideways_and_to_the_side_that_is_asked_for(pitch_rad: float, side: float) -> None:
     along, across = moved_m(on_flat_ground("duration_s=5", f"control.pitch_rad={pitch_rad}").record)
     assert side * across > 0.8 and abs(along) < 0.6 * abs(across)
@@ -35,6 +38,7 @@ def test_rolling_travels_sideways() -> None:
     assert np.hypot(*moved_m(record)) > 0.4
 
 
+@pytest.mark.slow
 def test_a_raised_head_is_level_above_the_ground_and_looks_around() -> None:
     record = on_flat_ground("controller=raised_head", "duration_s=7").record
     shapes = [record.nodes_w(k) for k in range(400, 650)]
@@ -51,10 +55,10 @@ def test_at_speed_zero_a_gait_stands() -> None:
 
 
 @pytest.mark.parametrize("gait", [Sidewinding, Rolling, RaisedHead])
-def test_a_bent_robot_that_cannot_do_it_stays_bent_and_says_why(gait: type[Sidewinding | Rolling | RaisedHead]) -> None:
+def test_a_bent_robot_that_cannot_do_it_stays_bent_and_says_why(gait: type[Controller[Any]]) -> None:
     stage = make_stage()
-    controller = gait(stage.robot, gait.Settings())
-    actions = [controller.update(stage.view(tick, 0.3)) for tick in range(200)]
-    targets = [action.setpoints.target for action in actions]
-    assert all("no joints that turn up and down" in action.report.why for action in actions)
+    controller = gait(stage.robot, gait.Parameters())
+    commands = [controller.update(stage.observe(tick, 0.3)) for tick in range(200)]
+    targets = [command.setpoints.target for command in commands]
+    assert all("no joints that turn up and down" in command.telemetry.reason for command in commands)
     assert np.abs(targets[0]).max() > 0.2 and np.abs(np.array(targets) - targets[0]).max() < 1e-9

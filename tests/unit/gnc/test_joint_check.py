@@ -1,8 +1,8 @@
 """How the joint check moves each joint: to both sides, back, and within its limits."""
 
-from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.joint_check import JointCheck
-from tests.unit.hal.rig import description, state
+from snakesim_gnc.control.joint_check import JointCheck, JointCheckParameters
+from snakesim_hal.controller import Observation
+from snakesim_testing.hal.small_robots import description, state
 
 PERIOD_S = 0.01
 ROBOT = description()
@@ -11,12 +11,12 @@ LIMIT_RAD = ROBOT.joints[0].angle_max_rad
 
 def targets(start_rad: float, seconds: float, dead: int | None = None) -> list[list[float]]:
     """Those of every tick; joints follow at once, but for a dead one."""
-    check = JointCheck(ROBOT, JointCheck.Settings())
+    check = JointCheck(ROBOT, JointCheckParameters())
     angles = [start_rad] * len(ROBOT.joints)
     made: list[list[float]] = []
     for tick in range(round(seconds / PERIOD_S)):
-        view = View(tick, tick * PERIOD_S, PERIOD_S, state(ROBOT, angles), None, None)
-        made.append(list(check.update(view).setpoints.target))
+        observation = Observation(tick, tick * PERIOD_S, PERIOD_S, state(ROBOT, angles), None, None)
+        made.append(list(check.update(observation).setpoints.target))
         angles = [angle if joint == dead else made[-1][joint] for joint, angle in enumerate(angles)]
     return made
 

@@ -12,7 +12,7 @@ from snakesim_gnc.geometry.planar import wrenches
 from snakesim_gnc.navigation.margin import MAX_CONTACT_FORCE_N, compute_margins_n
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
+from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
 
 SEEDS = st.integers(0, 2**31)
 

@@ -8,7 +8,7 @@ from snakesim_gnc.navigation.intents import LONGEST_NS, DesiredMotion, Intents
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
-from tests.unit.gnc.stage import make_world
+from snakesim_testing.gnc.stage import make_world
 
 MISSION_M_S = 0.2
 MISSION = DesiredMotion(MISSION_M_S)
@@ -18,7 +18,7 @@ PEG = Obstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_
 
 
 def intent(at_s: float, **more: Any) -> Intent:
-    return Intent(**{"timestamp_ns": round(at_s * SECOND), "who": "ann", "speed_m_s": 0.1, **more})
+    return Intent(**{"timestamp_ns": round(at_s * SECOND), "requester": "ann", "speed_m_s": 0.1, **more})
 
 
 def world(tail_x_m: float, timestamp_ns: int = 0) -> World:
@@ -27,7 +27,7 @@ def world(tail_x_m: float, timestamp_ns: int = 0) -> World:
 
 def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
     found = intents.desired(newest, round(at_s * SECOND))
-    return found.speed_m_s, found.why
+    return found.speed_m_s, found.reason
 
 
 def test_the_trajectory_is_as_old_as_the_world_model_that_it_was_planned_from() -> None:
@@ -56,7 +56,7 @@ def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops_as_it_
     assert speed == 0.0 and why.startswith("the intent of ann has expired: it is 1.2 s old, valid for 1 s")
     speed, why = desired(intents, None, 60.0)  # it does not go back to its mission
     assert speed == 0.0 and "send a new one to go on" in why
-    assert desired(intents, intent(60.0, who="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
+    assert desired(intents, intent(60.0, requester="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
     assert desired(intents, intent(60.2, go=False), 60.3) == (0.0, "ann wants it to stop")
 
 
@@ -119,7 +119,9 @@ def test_what_a_sender_asked_for_before_its_stop_does_not_set_the_robot_in_motio
     assert desired(intents, intent(2.0, go=False, valid_for_ns=5 * SECOND), 2.1) == (0.0, "ann wants it to stop")
     late = intent(1.5, valid_for_ns=5 * SECOND, speed_m_s=0.3)
     assert desired(intents, late, 2.2)[0] == 0.0, "held back by the network, and valid by its stamp alone"
-    assert desired(intents, intent(1.5, who="bob"), 2.3) == (0.1, "as bob wants it"), "others have clocks of their own"
+    assert desired(intents, intent(1.5, requester="bob"), 2.3) == (0.1, "as bob wants it"), (
+        "others have clocks of their own"
+    )
     assert desired(intents, intent(1.9, go=False), 2.4)[0] == 0.0, "a stop counts in any order"
     intents.start_over()
     assert desired(intents, intent(0.1), 0.2)[0] == 0.1

@@ -1,11 +1,11 @@
-"""`obstacle_aided` between torque and position mode; what it does to a body is in tests/physics."""
+"""`obstacle_aided` between torque and position mode; what it does to a body is in tests/system/physics."""
 
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 HELD_NM = 0.6  # that every joint is measured with
 
@@ -13,22 +13,22 @@ HELD_NM = 0.6  # that every joint is measured with
 @pytest.mark.parametrize("lost", ["world", "trajectory"])
 def test_from_torque_mode_it_goes_on_holding_with_the_torque_that_is_there(lost: str):
     stage = make_stage()
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
-    views = [stage.view(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
-    pushing = [controller.update(view) for view in views][-1].setpoints
+    controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
+    observations = [stage.observe(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
+    pushing = [controller.update(observation) for observation in observations][-1].setpoints
     assert set(pushing.mode) == {Mode.TORQUE}
     assert np.abs(pushing.target).max() > 0.1
 
-    holding = controller.update(stage.view(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
+    holding = controller.update(stage.observe(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
     assert set(holding.mode) == {Mode.POSITION}
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
-    by_spring_nm = (np.array(holding.target) - views[-1].joints.angle_rad) * stiffness
+    by_spring_nm = (np.array(holding.target) - observations[-1].joints.angle_rad) * stiffness
     assert by_spring_nm == pytest.approx(HELD_NM, rel=0.1)
 
 
 def test_a_body_that_nothing_can_push_holds_its_shape_in_position_mode():
     stage = make_stage()
     stage.pegs = []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
-    actions = [controller.update(stage.view(tick, 1.0)) for tick in range(40)]
-    assert set(actions[-1].setpoints.mode) == {Mode.POSITION}
+    controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
+    commands = [controller.update(stage.observe(tick, 1.0)) for tick in range(40)]
+    assert set(commands[-1].setpoints.mode) == {Mode.POSITION}

@@ -1,39 +1,39 @@
-"""The controller on views made by hand: what it commands and reports, without physics."""
+"""The controller on observations made by hand: what it commands and reports, without physics."""
 
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, TripletSettings
+from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, TripletParameters
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import PERIOD_S, known, make_contact, make_stage
+from snakesim_testing.gnc.stage import PERIOD_S, known, make_contact, make_stage
 
 TAIL_S_M = 0.3
 
 
-def make_controller(stage, **settings) -> ObstacleTriplet:
-    return ObstacleTriplet(stage.robot, TripletSettings(**settings))
+def make_controller(stage, **parameters) -> ObstacleTriplet:
+    return ObstacleTriplet(stage.robot, TripletParameters(**parameters))
 
 
-def torque_joints(action) -> list[int]:
-    return [i for i, mode in enumerate(action.setpoints.mode) if mode == Mode.TORQUE]
+def torque_joints(command) -> list[int]:
+    return [i for i, mode in enumerate(command.setpoints.mode) if mode == Mode.TORQUE]
 
 
 def stay(controller, stage, ticks, **more):
     """The last of many updates of a body that does not move."""
-    return [controller.update(stage.view(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
+    return [controller.update(stage.observe(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
 
 
 def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved_triplet():
     stage = make_stage()
-    action = stay(make_controller(stage), stage, 100)
-    report = action.report
-    assert torque_joints(action) == [report.propulsion_joint]
-    assert report.why == ""
+    command = stay(make_controller(stage), stage, 100)
+    report = command.telemetry
+    assert torque_joints(command) == [report.propulsion_joint]
+    assert report.reason == ""
     assert report.usable_push_points == 4
     assert report.propulsion_n == pytest.approx(35.0, rel=0.01)
     assert report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
     others = [i for i in range(13) if i != report.propulsion_joint]
-    targets, angles = np.array(action.setpoints.target), np.array(report.reference_rad)
+    targets, angles = np.array(command.setpoints.target), np.array(report.reference_rad)
     assert targets[others] == pytest.approx(angles[others], abs=1e-3)
     forces = np.array([point.force_w for point in report.push_points])[:, :2]
     tangent = np.array(report.push_points[0].tangent_w)[:2]
@@ -52,36 +52,36 @@ def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved
 def test_on_request_servos_lead_by_the_load_that_they_are_to_hold():
     stage = make_stage()
     controller = make_controller(stage, load_ratio=1.0, load_filter_s=0.05)
-    action = stay(controller, stage, 99)
-    others = [i for i in range(13) if i != action.report.propulsion_joint]
+    command = stay(controller, stage, 99)
+    others = [i for i in range(13) if i != command.telemetry.propulsion_joint]
     stiffness = np.array([joint.stiffness_nm_per_rad for joint in stage.robot.joints])
-    lead = np.array(action.setpoints.target) - np.array(action.report.reference_rad)
-    load = np.array(action.report.bending_torque_nm) / stiffness
+    lead = np.array(command.setpoints.target) - np.array(command.telemetry.reference_rad)
+    load = np.array(command.telemetry.bending_torque_nm) / stiffness
     assert lead[others] == pytest.approx(load[others], abs=2e-3)
     assert np.abs(load[others]).max() > 0.03
-    blind = controller.update(stage.view(99, TAIL_S_M, without="world"))
+    blind = controller.update(stage.observe(99, TAIL_S_M, without="world"))
     targets = np.array(blind.setpoints.target)
-    assert targets[others] == pytest.approx(np.array(action.setpoints.target)[others], abs=5e-3)  # and fades
+    assert targets[others] == pytest.approx(np.array(command.setpoints.target)[others], abs=5e-3)  # and fades
 
 
 def test_the_faster_it_moves_the_less_it_pushes():
     stage = make_stage()
     controller = make_controller(stage)
-    forces = [controller.update(stage.view(t, 0.1 + 0.1 * t * PERIOD_S)).report.propulsion_n for t in range(60)]
+    forces = [controller.update(stage.observe(t, 0.1 + 0.1 * t * PERIOD_S)).telemetry.propulsion_n for t in range(60)]
     assert forces[-1] == pytest.approx(35.0 * 0.5, rel=0.1)
 
 
 def test_a_joint_that_has_swung_out_pushes_less():
     stage = make_stage()
     controller = make_controller(stage)
-    settled = stay(controller, stage, 50).report
+    settled = stay(controller, stage, 50).telemetry
     joint, way = known(settled.propulsion_joint), np.sign(known(settled.propulsion_torque_nm))
     for first, turned_rad, share in ((50, 0.3 * way, 0.5), (60, -0.3 * way, 1.0)):
-        views = [
-            stage.view(tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad})
+        observations = [
+            stage.observe(tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad})
             for tick in range(first, first + 10)
         ]
-        pushed = [controller.update(view).report.propulsion_n for view in views]
+        pushed = [controller.update(observation).telemetry.propulsion_n for observation in observations]
         assert pushed[-1] == pytest.approx(share * 35.0, rel=0.05)
 
 
@@ -89,23 +89,23 @@ def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():
     stage = make_stage()
     stage.pegs = stage.pegs[1:4]
     controller = make_controller(stage, guard_s=0.5)
-    joint = known(stay(controller, stage, 10).report.propulsion_joint)
-    action = controller.update(stage.view(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
-    assert torque_joints(action) == []
-    assert f"joint_{joint + 1} left its reference" in action.report.why
-    turns = [controller.update(stage.view(t, TAIL_S_M)).report.propulsion_joint for t in range(11, 40)]
+    joint = known(stay(controller, stage, 10).telemetry.propulsion_joint)
+    command = controller.update(stage.observe(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
+    assert torque_joints(command) == []
+    assert f"joint_{joint + 1} left its reference" in command.telemetry.reason
+    turns = [controller.update(stage.observe(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(11, 40)]
     assert joint not in turns
-    assert joint in [controller.update(stage.view(t, TAIL_S_M)).report.propulsion_joint for t in range(60, 80)]
+    assert joint in [controller.update(stage.observe(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(60, 80)]
 
 
 def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
     stage = make_stage(torque_nm=1.0)
-    action = stay(make_controller(stage), stage, 100)
-    report = action.report
+    command = stay(make_controller(stage), stage, 100)
+    report = command.telemetry
     assert report.saturated
     assert known(report.torque_headroom_nm) < 0
     assert known(report.propulsion_n) < 35.0
-    assert abs(action.setpoints.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
+    assert abs(command.setpoints.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
     assert abs(report.bending_torque_nm[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
 
 
@@ -117,7 +117,7 @@ def test_the_torque_does_not_step_when_another_triplet_takes_over_the_same_joint
     for tick in range(200):
         if tick == 100:
             stage.pegs = [peg for peg in stage.pegs if peg.name != "peg_2"]
-        reports.append(controller.update(stage.view(tick, tail_s_m, torque_nm=torque_nm)).report)
+        reports.append(controller.update(stage.observe(tick, tail_s_m, torque_nm=torque_nm)).telemetry)
         torque_nm = known(reports[-1].propulsion_torque_nm)
     before, after = reports[99], reports[199]
     assert [[p.obstacle for p in report.push_points] for report in (before, after)] == [
@@ -135,20 +135,20 @@ def test_nobody_wants_to_move():
     controller = make_controller(stage)
     assert torque_joints(stay(controller, stage, 10))
     stage.speed_m_s = 0.0
-    action = controller.update(stage.view(11, TAIL_S_M, world_age_ticks=1))
-    assert torque_joints(action) == []
-    assert action.report.why == ""
-    assert action.report.usable_push_points == 4
+    command = controller.update(stage.observe(11, TAIL_S_M, world_age_ticks=1))
+    assert torque_joints(command) == []
+    assert command.telemetry.reason == ""
+    assert command.telemetry.usable_push_points == 4
 
 
 @pytest.mark.parametrize("pegs", [0, 2])
 def test_fewer_than_three_push_points_do_not_push(pegs):
     stage = make_stage()
     stage.pegs = stage.pegs[1 : 1 + pegs]
-    action = stay(make_controller(stage), stage, 5)
-    assert torque_joints(action) == []
-    assert action.report.usable_push_points == pegs
-    assert action.report.why
+    command = stay(make_controller(stage), stage, 5)
+    assert torque_joints(command) == []
+    assert command.telemetry.usable_push_points == pegs
+    assert command.telemetry.reason
 
 
 def test_standing_still_is_told_and_a_jam_is_let_go_of():
@@ -157,29 +157,29 @@ def test_standing_still_is_told_and_a_jam_is_let_go_of():
     contacts = [make_contact("peg_1", (400.0, 0.0, 0.0)), make_contact("peg_2", (-390.0, 0.0, 0.0))]
     pushed, released, jams = 0, 0, []
     for tick in range(200):
-        report = controller.update(stage.view(tick, TAIL_S_M, contacts=contacts)).report
+        report = controller.update(stage.observe(tick, TAIL_S_M, contacts=contacts)).telemetry
         if report.jammed:
-            jams.append(report.why)
+            jams.append(report.reason)
             pushed += report.propulsion_joint is not None
             released += report.propulsion_joint is None
     assert jams[0].startswith("jammed: standing still") and jams[0].endswith("peg_2 most")
     assert pushed
     assert released
     moved = stay(controller, stage, 3)
-    assert moved.report.jammed
-    report = [controller.update(stage.view(200 + t, TAIL_S_M + 0.002 * t)).report for t in range(40)][-1]
+    assert moved.telemetry.jammed
+    report = [controller.update(stage.observe(200 + t, TAIL_S_M + 0.002 * t)).telemetry for t in range(40)][-1]
     assert not report.jammed
-    assert report.why == ""
+    assert report.reason == ""
 
 
 def test_pitch_joints_stay_straight():
     stage = make_stage(26, ("yaw", "pitch"))
-    action = stay(make_controller(stage), stage, 100)
-    assert known(action.report.propulsion_joint) % 2 == 0
-    assert action.report.why == ""
-    pitch = np.array(action.setpoints.target)[1::2]
+    command = stay(make_controller(stage), stage, 100)
+    assert known(command.telemetry.propulsion_joint) % 2 == 0
+    assert command.telemetry.reason == ""
+    pitch = np.array(command.setpoints.target)[1::2]
     assert np.abs(pitch).max() < 1e-6
-    assert len(action.report.bending_torque_nm) == 26
+    assert len(command.telemetry.bending_torque_nm) == 26
 
 
 def test_a_new_path_moves_no_target_at_once():
@@ -187,7 +187,7 @@ def test_a_new_path_moves_no_target_at_once():
     controller = make_controller(stage)
     before = stay(controller, stage, 50).setpoints
     stage.path_id = 1
-    after = controller.update(stage.view(50, TAIL_S_M + 0.05)).setpoints
+    after = controller.update(stage.observe(50, TAIL_S_M + 0.05)).setpoints
     steady = [i for i in range(13) if before.mode[i] == after.mode[i] == Mode.POSITION]
     assert len(steady) >= 11
     for i in steady:

@@ -1,36 +1,36 @@
-"""Path following on views made by hand."""
+"""Path following on observations made by hand."""
 
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.path_following import PathFollowing
+from snakesim_gnc.control.path_following import PathFollowing, PathFollowingParameters
 from snakesim_hal.wire.messages import Mode
-from tests.unit.gnc.stage import make_stage, nodes_of
+from snakesim_testing.gnc.stage import make_stage, nodes_of
 
 TAIL_S_M = 0.3
 
 
-def make_controller(stage, **settings) -> PathFollowing:
-    return PathFollowing(stage.robot, PathFollowing.Settings(**settings))
+def make_controller(stage, **parameters) -> PathFollowing:
+    return PathFollowing(stage.robot, PathFollowingParameters(**parameters))
 
 
 def test_a_held_body_is_asked_for_no_more_than_the_look_ahead():
     stage = make_stage()
     controller = make_controller(stage, look_ahead_m=0.03)
-    action = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(200)][-1]
-    assert set(action.setpoints.mode) == {Mode.POSITION}
+    command = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(200)][-1]
+    assert set(command.setpoints.mode) == {Mode.POSITION}
     nodes = nodes_of(stage, TAIL_S_M + 0.03)
     headings = np.arctan2(*np.diff(nodes)[::-1])
-    assert action.setpoints.target == pytest.approx(np.diff(headings), abs=0.01)
-    assert action.report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
-    assert action.report.usable_push_points is None
+    assert command.setpoints.target == pytest.approx(np.diff(headings), abs=0.01)
+    assert command.telemetry.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
+    assert command.telemetry.usable_push_points is None
 
 
 def test_the_reference_moves_with_the_mission_and_stops_with_it():
     stage, moved_rad = make_stage(), []
     for stage.speed_m_s in (0.0, 0.1, 0.3):
         controller = make_controller(stage, look_ahead_m=0.2)
-        references = [controller.update(stage.view(tick, TAIL_S_M)).report.reference_rad for tick in range(31)]
+        references = [controller.update(stage.observe(tick, TAIL_S_M)).telemetry.reference_rad for tick in range(31)]
         moved_rad.append(np.abs(np.array(references[-1]) - references[0]).max())
     stopped, slow, fast = moved_rad
     assert fast > 2 * slow > 0 and stopped < 1e-3
@@ -38,7 +38,7 @@ def test_the_reference_moves_with_the_mission_and_stops_with_it():
 
 def test_it_starts_without_a_jump():
     stage = make_stage()
-    view = stage.view(0, TAIL_S_M)
-    action = make_controller(stage).update(view)
-    steps = np.abs(np.array(action.setpoints.target) - view.joints.angle_rad)
+    observation = stage.observe(0, TAIL_S_M)
+    command = make_controller(stage).update(observation)
+    steps = np.abs(np.array(command.setpoints.target) - observation.joints.angle_rad)
     assert steps.max() < 0.02

@@ -11,7 +11,7 @@ from snakesim_gnc.control.push_report import explain_push_standstill, push_point
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.stage import make_robot, make_world
+from snakesim_testing.gnc.stage import make_robot, make_world
 
 BODY = PlanarBody(make_robot())
 NODES = np.vstack([np.array(BODY.node_s_m), 0.06 * np.sin(2 * np.pi * np.array(BODY.node_s_m) / 0.6)])

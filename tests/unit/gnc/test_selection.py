@@ -20,7 +20,7 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.stage import BODY_RADIUS_M, CLEARANCE_M, make_pegs, make_route, make_stage, nodes_of
+from snakesim_testing.gnc.stage import BODY_RADIUS_M, CLEARANCE_M, make_pegs, make_route, make_stage, nodes_of
 
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]
 NODE_S = [0.0, *np.cumsum(SEGMENTS).tolist()]

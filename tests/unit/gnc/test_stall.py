@@ -6,7 +6,7 @@ import pytest
 from snakesim_gnc.control.contact_forces import MeasuredContacts, NetContactForce
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
 from snakesim_hal.wire.messages import World
-from tests.unit.gnc.stage import known, make_contact, make_world
+from snakesim_testing.gnc.stage import known, make_contact, make_world
 
 
 def watch() -> StallWatch:
@@ -70,7 +70,7 @@ def cause(**more):
 def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
     stall = cause()
     assert not stall.jammed and not stall.release_triplet
-    assert stall.why == (
+    assert stall.reason == (
         "standing still with 30.0 N of propulsion; contacts push it on with 29.5 N, too little against the friction of "
         "the ground; raise propulsion_n"
     )
@@ -79,26 +79,26 @@ def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
 def test_a_push_point_that_is_not_felt_is_named():
     stall = cause(net_force=along(PUSHED[0], ("peg_1", 3.2, -4.0)))
     assert not stall.jammed
-    assert "contacts push it on with 3.2 N (no contact at peg_2), too little" in stall.why
+    assert "contacts push it on with 3.2 N (no contact at peg_2), too little" in stall.reason
 
 
 @pytest.mark.parametrize("saturated", [None, "joint_7"])
 @pytest.mark.parametrize("wanted_n", [8.0, 35.0, 300.0])
 def test_a_body_that_touches_nothing_is_not_jammed(wanted_n, saturated):
     stall = cause(wanted_n=wanted_n, net_force=along(), weight_n=40.0, saturated=saturated)
-    assert not stall.jammed and not stall.release_triplet and "no obstacle touches the body" in stall.why
+    assert not stall.jammed and not stall.release_triplet and "no obstacle touches the body" in stall.reason
 
 
 def test_without_a_sensor_of_contacts_the_cause_is_unknown():
     stall = cause(net_force=None, weight_n=40.0)
     assert not stall.jammed and stall.release_triplet
-    assert stall.why.endswith("what holds it is unknown without a sensor of contacts")
+    assert stall.reason.endswith("what holds it is unknown without a sensor of contacts")
 
 
 def test_a_jam_is_what_obstacles_hold_back():
     stall = cause(net_force=along(*PUSHED, ("post", -28.0, 60.0)))
     assert stall.jammed
-    assert stall.why == (
+    assert stall.reason == (
         "jammed: standing still with 30.0 N of propulsion; obstacles push it on with 30 N and hold it back with 28 N, "
         "post most"
     )
@@ -120,7 +120,7 @@ def test_a_jam_is_what_obstacles_hold_back():
 def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given, words):
     stall = cause(**given)
     assert stall.release_triplet and not stall.jammed
-    assert words in stall.why and not stall.why.startswith("jam")
+    assert words in stall.reason and not stall.reason.startswith("jam")
 
 
 def test_forces_are_judged_as_means_over_50_ms():

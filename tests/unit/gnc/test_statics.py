@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.obstacle_triplet import compute_bending_torque_nm, solve_triplet
 from snakesim_gnc.control.obstacle_triplet.statics import add_tether
+from snakesim_testing.messages import raises_error
 
 PROPULSION_N = 35.0
 
@@ -216,5 +217,5 @@ def test_what_is_no_triplet_is_an_error(name, value):
         "propulsion_n": 35.0,
         "joint_w": case.joint,
     }
-    with pytest.raises(ValueError, match=name):
+    with raises_error(ValueError):
         solve_triplet(**{**arguments, name: value})

@@ -7,23 +7,30 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_aided import ObstacleAided
-from snakesim_gnc.control.undulation import CompliantUndulation, HeadSteeredUndulation, LateralUndulation
+from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
+from snakesim_gnc.control.undulation import (
+    CompliantUndulation,
+    CompliantUndulationParameters,
+    HeadSteeredUndulation,
+    HeadSteeredUndulationParameters,
+    LateralUndulation,
+    LateralUndulationParameters,
+)
 from snakesim_hal.model.route import Route
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 TAIL_S_M = 0.3
 BY_SHAPE = {"shape_nm_per_rad": 0.0}  # in position mode, whose targets show the push
 
 
 def references(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndarray:
-    views = [stage.view(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(ticks)]
-    return np.array([controller.update(view).report.reference_rad for view in views])
+    observations = [stage.observe(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(ticks)]
+    return np.array([controller.update(observation).telemetry.reference_rad for observation in observations])
 
 
 def test_the_wave_travels_from_head_to_tail() -> None:
     stage = make_stage()
-    angles = references(LateralUndulation(stage.robot, LateralUndulation.Settings()), stage, 200)
+    angles = references(LateralUndulation(stage.robot, LateralUndulationParameters()), stage, 200)
     peaks = angles.argmax(axis=0)
     assert peaks[11] < peaks[10] < peaks[9]
 
@@ -33,30 +40,31 @@ def test_the_head_steers_towards_the_path_and_against_its_bend_if_the_wave_goes_
     lag_rad: float, bends: float
 ) -> None:
     stage = make_stage()
-    straight = references(LateralUndulation(stage.robot, LateralUndulation.Settings(lag_rad=lag_rad)), stage, 1)
+    straight = references(LateralUndulation(stage.robot, LateralUndulationParameters(lag_rad=lag_rad)), stage, 1)
     stage.route = Route([(0.0, 0.0), (2.0, 0.0), (2.0, 3.0)])
-    steered = references(HeadSteeredUndulation(stage.robot, HeadSteeredUndulation.Settings(lag_rad=lag_rad)), stage, 1)
+    steered = references(HeadSteeredUndulation(stage.robot, HeadSteeredUndulationParameters(lag_rad=lag_rad)), stage, 1)
     assert bends * (np.mean(steered[0]) - np.mean(straight[0])) > 0.01
 
 
 def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> None:
     stage = make_stage()
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(max_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE))
-    first, *_, last = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(400)]
+    controller = ObstacleAided(stage.robot, ObstacleAidedParameters(max_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE))
+    first, *_, last = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(400)]
     pushed = np.abs(np.array(last.setpoints.target) - first.setpoints.target)
     assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
-    assert last.report.propulsion_n is not None and first.report.propulsion_n is not None
-    assert last.report.propulsion_n > first.report.propulsion_n
+    assert last.telemetry.propulsion_n is not None and first.telemetry.propulsion_n is not None
+    assert last.telemetry.propulsion_n > first.telemetry.propulsion_n
 
 
 @cache
 def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
     """References of a body that stays where it is."""
     stage = make_stage()
-    settings = ObstacleAided.Settings(push_scale=push_scale, push_sign_s=push_sign_s, search_after_s=0.0, **BY_SHAPE)
-    return references(ObstacleAided(stage.robot, settings), stage, 300)
+    parameters = ObstacleAidedParameters(push_scale=push_scale, push_sign_s=push_sign_s, search_after_s=0.0, **BY_SHAPE)
+    return references(ObstacleAided(stage.robot, parameters), stage, 300)
 
 
+@pytest.mark.slow
 def test_a_scaled_push_is_turned_round() -> None:
     still = pushed(0.0)
     forward, back = (pushed(scale)[-1] - still[-1] for scale in (1.0, -1.0))
@@ -68,8 +76,8 @@ def test_a_push_reckons_with_the_friction_that_the_path_was_planned_with() -> No
     for friction in (0.0, 0.2):
         stage = make_stage()
         stage.peg_friction = friction
-        controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
-        points = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(50)][-1].report.push_points
+        controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
+        points = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(50)][-1].telemetry.push_points
         assert len(points) >= 3
         tilts.append(float(np.mean([point.normal_w[0] for point in points])))  # of the forces, along the way
     assert tilts[0] - tilts[1] == pytest.approx(0.2, abs=0.05)
@@ -82,34 +90,34 @@ def test_a_push_of_random_sign_goes_both_ways() -> None:
 
 
 def test_a_compliant_wave_shrinks_where_it_meets_resistance_and_not_otherwise() -> None:
-    stage, settings = make_stage(), CompliantUndulation.Settings(softness_rad_per_nm=0.1, steering=0.0)
+    stage, parameters = make_stage(), CompliantUndulationParameters(softness_rad_per_nm=0.1, steering=0.0)
 
     def largest(resistance: float) -> float:
-        controller, swing = CompliantUndulation(stage.robot, settings), 0.0
+        controller, swing = CompliantUndulation(stage.robot, parameters), 0.0
         for tick in range(400):
-            view = stage.view(tick, TAIL_S_M)
-            resisted = [resistance * angle for angle in controller.reference_rad(view, 0.0)]
-            joints = msgspec.structs.replace(view.joints, torque_nm=resisted)
-            reference = controller.update(dataclasses.replace(view, joints=joints)).report.reference_rad
+            observation = stage.observe(tick, TAIL_S_M)
+            resisted = [resistance * angle for angle in controller.reference_rad(observation, 0.0)]
+            joints = msgspec.structs.replace(observation.joints, torque_nm=resisted)
+            reference = controller.update(dataclasses.replace(observation, joints=joints)).telemetry.reference_rad
             swing = max(swing, float(np.abs(reference).max())) if tick > 200 else 0.0
         return swing
 
-    assert abs(largest(0.0) - settings.amplitude_rad) < 0.01
-    assert largest(4.0) < 0.8 * settings.amplitude_rad
+    assert abs(largest(0.0) - parameters.amplitude_rad) < 0.01
+    assert largest(4.0) < 0.8 * parameters.amplitude_rad
 
 
 def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
     stage = make_stage()
-    controller = CompliantUndulation(stage.robot, CompliantUndulation.Settings())
-    views = [stage.view(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)]
-    held = [controller.update(view).report.reference_rad for view in views]
+    controller = CompliantUndulation(stage.robot, CompliantUndulationParameters())
+    observations = [stage.observe(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)]
+    held = [controller.update(observation).telemetry.reference_rad for observation in observations]
     assert all(one == held[0] for one in held)
 
 
 def test_a_jammed_wave_travels_the_other_way_for_a_while_and_one_that_comes_on_does_not() -> None:
-    settings = CompliantUndulation.Settings(softness_rad_per_nm=0.0, steering=0.0, jam_after_s=0.5, back_s=0.3)
+    parameters = CompliantUndulationParameters(softness_rad_per_nm=0.0, steering=0.0, jam_after_s=0.5, back_s=0.3)
     stage = make_stage()
-    jammed, free = (references(CompliantUndulation(stage.robot, settings), stage, 200, speed) for speed in (0.0, 0.2))
+    jammed, free = (references(CompliantUndulation(stage.robot, parameters), stage, 200, speed) for speed in (0.0, 0.2))
     assert np.abs(jammed[:50] - free[:50]).max() < 1e-9
     assert np.abs(jammed[80] - free[20]).max() < 0.05  # 0.5 s on, 0.3 s back
     assert np.abs(jammed[110] - free[50]).max() < 0.05  # and on again

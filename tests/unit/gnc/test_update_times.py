@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_gnc.control.update_times import UpdateTimes
-from tests.unit.gnc.stage import make_stage
+from snakesim_testing.gnc.stage import make_stage
 
 ROBOT = make_stage(3).robot
 PERIOD_S, LEASE_S = ROBOT.period_ns * 1e-9, ROBOT.lease_ns * 1e-9

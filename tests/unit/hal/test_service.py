@@ -6,8 +6,8 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.service import Service, ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Done, JointState, Message, Process
-from tests.unit.hal.network.test_strangers import CLOCK, ROBOT
-from tests.unit.hal.rig import run_config, state
+from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
+from snakesim_testing.hal.small_robots import run_config, state
 
 
 class Undemanding(Service):

@@ -7,6 +7,7 @@ import serial
 
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_serial_backend.wire import USB_LATENCY_S, Pty, SerialWire, latency_s
+from snakesim_testing.messages import raises_error
 
 
 def test_the_latency_timer_is_the_adapters(tmp_path: Path) -> None:
@@ -22,7 +23,7 @@ def test_a_port_is_for_one_alone_and_what_came_too_late_is_thrown_away(tmp_path:
     pty, log = Pty(), tmp_path / "bytes.txt"
     with log.open("w") as file:
         wire = SerialWire(pty.path, 1_000_000, file)
-        with pytest.raises(BackendError, match=r"cannot be opened: .*Is another program using it\?"):
+        with raises_error(BackendError, code="bus/cannot-open"):
             SerialWire(pty.path, 1_000_000)
         wire.send(b"first?")
         pty.send(b"late")
@@ -55,7 +56,7 @@ def test_an_adapter_that_is_pulled_is_said_and_no_exception() -> None:
 
 
 def test_a_port_that_is_not_there_is_named() -> None:
-    with pytest.raises(ConfigError, match="port '/dev/ttyUSB77': there is none; plug the adapter in"):
+    with raises_error(ConfigError, code="bus/not-available", field="/dev/ttyUSB77"):
         SerialWire("/dev/ttyUSB77", 57600)
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import Mode
-from tests.unit.sim_backend.rig import G, Run, make_config
+from snakesim_testing.sim.simulator_rig import G, Run, make_config
 
 ICE = {"ground": {"friction": 0.0}}
 

@@ -13,7 +13,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
 from snakesim_sim_backend.flat_ground import SINK_M
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.messages import raises_error
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 NOSE_M = 13 * 0.11 + 0.04
 CAMERA = {"name": "head", "width": 161, "height": 121, "rate_hz": 100.0, "delay_s": 0.0, "range_min_m": 0.02}
@@ -183,5 +184,5 @@ def test_a_colour_image_comes_beside_the_depth_and_shows_the_same():
 def test_without_opengl_the_error_names_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    with pytest.raises(ConfigError, match=r"camera 'head'.*OpenGL.*libegl1"):
+    with raises_error(ConfigError, code="simulator/no-opengl", field="head"):
         looking(color=True)

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.scenario import place_obstacles
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 KINDS = {
     "tall_peg": {"cylinder": [{"position_m": [3.0, 1.0], "radius_m": 0.1, "height_m": 0.4}]},

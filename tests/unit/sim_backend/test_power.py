@@ -10,7 +10,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.messages import raises_error
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 WITH = {"sensors!": {"joints": {}, "power": {"rate_hz": 5.0}}}
 
@@ -60,7 +61,7 @@ def test_heat_on_request_goes_away_by_itself_or_is_held():
 
 def test_without_the_sensor_there_is_no_heat_on_request():
     config = make_config({"sensors!": {"joints": {}}}, faults=["overheat:joint_1@1"])
-    with pytest.raises(ConfigError, match=r"without \[sensors.power\] in the robot file heat would not be measured"):
+    with raises_error(ConfigError, code="injection/not-supported"):
         SimBackend.check(config, SimSettings())
     assert not Run(make_config({"sensors!": {"joints": {}}})).sim.inject(overheat(), begins=True)
     assert SimBackend.check(make_config(WITH, faults=["overheat:joint_1@1"]), SimSettings())

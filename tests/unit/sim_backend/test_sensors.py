@@ -8,7 +8,7 @@ from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
 from snakesim_sim_backend.sensors.timing import SamplingSchedule
-from tests.unit.sim_backend.rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 CORNER = {
     "ground": {"friction": 0.0},

@@ -9,10 +9,8 @@ from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.flat_ground import SINK_M
 from snakesim_sim_backend.ground import make_heights
-from tests.unit.sim_backend.rig import Run, make_config
-
-HILLS = {"ground": {"friction": 0.6, "heightfield": {"height_m": 0.06, "wavelength_m": 0.8, "area_m": 6.0}}}
-CURVE = {"route": {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}}  # cannot roll
+from snakesim_testing.sim.hilly_start import CURVE, HILLS
+from snakesim_testing.sim.simulator_rig import Run, make_config
 
 
 def uneven_of(config):

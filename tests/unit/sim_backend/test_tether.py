@@ -4,7 +4,8 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.sim_backend.rig import Run, make_config, open_sim
+from snakesim_testing.messages import raises_error
+from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
 
 ICE = {"ground": {"friction": 0.0}}
 BACKWARD = {"link": 0, "point_m": 0.0, "direction_w": [-1.0, 0.0]}
@@ -49,9 +50,7 @@ def test_it_pulls_towards_its_direction_from_any_point():
     assert run.sim.tether_tension_n == pytest.approx(9.0, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("change", "word"), [({"link": 14}, "links 0 to 13"), ({"direction_w": [0.0, 0.0]}, "direction_w")]
-)
-def test_a_tether_that_cannot_be_is_refused(change, word):
-    with pytest.raises(ConfigError, match=word):
+@pytest.mark.parametrize("change", [{"link": 14}, {"direction_w": [0.0, 0.0]}])
+def test_a_tether_that_cannot_be_is_refused(change):
+    with raises_error(ConfigError, code=("config/invalid-value", "config/out-of-range")):
         open_sim(make_config(), tether={**BACKWARD, **change})

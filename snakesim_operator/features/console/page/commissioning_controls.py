@@ -12,7 +12,7 @@ from snakesim_operator.features.console.page.page_html import escape_text
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import PageAction
 
-HOLD_REPEAT_HZ = 20.0  # `snakesim joints jog` counts a key as held for 0.15 s
+HOLD_REPEAT_HZ = 20.0  # `snakesim robot jog` counts a key as held for 0.15 s
 
 
 class CommissioningControls:
@@ -112,7 +112,7 @@ class CommissioningControls:
         joint = int(self._joint.value)
         options: list[str] = []
         if verb == "jog":
-            options += ["--speed", f"{self._speed_rad_s.value:g}"]
+            options += ["--joint-speed", f"{self._speed_rad_s.value:g}"]
             options += ["--travel", f"{self._travel_rad.value:g}"]
             options += ["--torque", f"{self._torque_fraction.value:g}"]
         if self._is_in_control():

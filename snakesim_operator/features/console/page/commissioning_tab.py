@@ -1,4 +1,4 @@
-"""The Commission tab: all joints in a table, and the commands of `snakesim joints`, run from the page.
+"""The Commission tab: all joints in a table, and the commands of `snakesim robot calibrate`, run from the page.
 
 One step runs at a time, for the viewer in control. It ends when that viewer releases control or closes the page.
 """
@@ -18,7 +18,7 @@ from snakesim_hal.network.session import Link
 from snakesim_hal.wire.messages import Configuration
 from snakesim_operator.base.targets import flags_of
 from snakesim_operator.features.console.control_token import ControlToken
-from snakesim_operator.features.console.joint_step import ENTER, JointStep
+from snakesim_operator.features.console.joint_step import ENTER, JointStep, name_command
 from snakesim_operator.features.console.operations import PageLog
 from snakesim_operator.features.console.page.joint_table import AngleRange, commissioning_html
 from snakesim_operator.features.console.page.page_html import escape_text
@@ -94,21 +94,21 @@ class Commissioning:
             RefusedError: A step runs already, or the step cannot be started from this page.
         """
         if self.robot_file is None:
-            raise RefusedError("the console was started without --commission FILE")
+            raise RefusedError("the console was started without --commission FILE", code="commissioning/not-possible")
         if verb == "jog" and not joint:
-            raise RefusedError("jog moves one joint: give its number")
+            raise RefusedError("jog moves one joint: give its number", code="commissioning/not-possible")
         joint_names: list[str] = []
         if joint and verb != "zero":
             joint_names.append(f"joint_{joint}")
         with self._lock:
             if self._step is not None and self._step.is_running:
-                raise RefusedError(f"{self._step.verb} is under way: end it first")
+                raise RefusedError(f"{self._step.verb} is under way: end it first", code="commissioning/not-possible")
             robot_flags = shlex.split(flags_of(self._link, None))
             self._step = JointStep([verb, str(self.robot_file), *joint_names, *options, *robot_flags])
             self._viewer = viewer
             self._last_key_s = time.monotonic()
             self._moved_ranges = []
-        command = f"joints {' '.join([verb, *joint_names])}"
+        command = " ".join([name_command(verb), *joint_names])
         self._log.write(f"viewer {viewer + 1}: {command}")
         return command
 
@@ -147,7 +147,7 @@ class Commissioning:
             reason = "control was given up"
         else:
             return
-        self._log.write(f"joints {step.verb} ends: {reason}")
+        self._log.write(f"{name_command(step.verb)} ends: {reason}")
         self._viewer = NO_VIEWER
         step.end()
 
@@ -181,7 +181,7 @@ class Commissioning:
             steps: list[str] = []
             for verb in STEPS:
                 joint = " joint_N" if verb == "jog" else ""
-                steps.append(f"snakesim joints {verb} FILE{joint}{flags}")
+                steps.append(f"snakesim {name_command(verb)} FILE{joint}{flags}")
             parts = [
                 _commands_html("Where the robot's FILE is, with which the host was started, type:", steps),
                 _commands_html(
@@ -193,7 +193,7 @@ class Commissioning:
         backend = snapshot.robot.backend
         check = [
             f"snakesim run SCENARIO --controller joint_check --backend {backend} --out runs/check",
-            f"snakesim joints check runs/check {file_name} --straight",
+            f"snakesim robot check runs/check --write {file_name} --straight",
         ]
         parts.append(
             _commands_html(
@@ -218,7 +218,7 @@ def _step_html(step: JointStep) -> str:
     lines = "".join(f"<div>{escape_text(line)}</div>" for line in step.lines)
     return (
         f"<div data-step style='margin:.4em .6em;padding:.4em .6em;border:1px solid;border-radius:6px;"
-        f"font-size:.85em'><b>joints {escape_text(step.verb)}</b>{lines}</div>"
+        f"font-size:.85em'><b>{escape_text(name_command(step.verb))}</b>{lines}</div>"
     )
 
 

@@ -14,6 +14,7 @@ from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import MIN_FORCE_N
 from snakesim_operator.features.console.scene.scene_colors import MEASURED_FORCE, RESULTANT, Color
+from snakesim_operator.results.page import svg
 
 WIDTH_PX = 380.0
 HEIGHT_PX = 250.0
@@ -21,6 +22,9 @@ MARGIN_PX = 34.0
 SPANS_N = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # that the height stands for: few, so that the scale seldom jumps
 MIN_LABELED_PX = 26.0  # shorter arrows have no number
 MIN_ARROW_PX = 1.0  # shorter arrows are not drawn
+HEAD_PX = 11.0
+LABEL_DISTANCE_PX = 20.0  # of a label from the middle of its arrow
+FONT_PX = 11
 NO_FORCES = "<div style='padding:.3em .6em;opacity:.7'>no contact force is measured on the body now</div>"
 
 
@@ -33,13 +37,14 @@ def force_polygon(snapshot: RobotSnapshot) -> str:
     px_per_n, span_n = _choose_scale(corners_n)
     corners_px = _place_on_page(corners_n, px_per_n)
     resultant_n = float(np.linalg.norm(corners_n[-1]))
-    arrows = [_arrow_svg(start, end, MEASURED_FORCE, px_per_n) for start, end in pairwise(corners_px)]
-    arrows.append(_arrow_svg(corners_px[0], corners_px[-1], RESULTANT, px_per_n))
-    scale_bar = _scale_bar_svg(span_n / 5, px_per_n)
+    arrows = [_draw_arrow(start, end, MEASURED_FORCE, px_per_n) for start, end in pairwise(corners_px)]
+    arrows.append(_draw_arrow(corners_px[0], corners_px[-1], RESULTANT, px_per_n))
+    scale_bar = _draw_scale_bar(span_n / 5, px_per_n)
+    label = f"Force polygon of the contact forces on the body; resultant {resultant_n:.1f} N"
+    drawing = svg.figure(WIDTH_PX, HEIGHT_PX, label, *arrows, scale_bar)
     return (
         f"<div style='padding:.2em .6em;font-size:.85em'>Contact forces on the body, tail to head; resultant "
-        f"{resultant_n:.1f} N</div>"
-        f"<svg viewBox='0 0 {WIDTH_PX} {HEIGHT_PX}' width='100%'>{''.join(arrows)}{scale_bar}</svg>"
+        f"{resultant_n:.1f} N</div>{drawing}"
     )
 
 
@@ -68,11 +73,10 @@ def _place_on_page(corners_n: Floats, px_per_n: float) -> Floats:
     return center_px + px_per_n * (corners_n - center_n) * [1, -1]
 
 
-def _scale_bar_svg(force_n: float, px_per_n: float) -> str:
-    return (
-        f"<path d='M8 {HEIGHT_PX - 8} h{force_n * px_per_n:.1f}' stroke='currentColor' stroke-width='2'/>"
-        f"<text x='8' y='{HEIGHT_PX - 14}' font-size='11' fill='currentColor'>{force_n:.3g} N</text>"
-    )
+def _draw_scale_bar(force_n: float, px_per_n: float) -> str:
+    y = HEIGHT_PX - 8
+    bar = svg.line((8, y), (8 + force_n * px_per_n, y), stroke="currentColor", stroke_width=2)
+    return bar + svg.text(8, y - 6, f"{force_n:.3g} N", fill="currentColor", font_size=FONT_PX)
 
 
 def push_point_table(control: ControlState | None) -> str:
@@ -97,26 +101,19 @@ def push_point_table(control: ControlState | None) -> str:
     return f"<table style='{style}'>{head}{''.join(rows)}</table>"
 
 
-def _arrow_svg(start: Floats, end: Floats, color: Color, px_per_n: float) -> str:
+def _draw_arrow(start: Floats, end: Floats, color: Color, px_per_n: float) -> str:
     """Return an arrow between two points in pixels, labeled with its force in newtons."""
     length_px = float(np.linalg.norm(end - start))
     if length_px < MIN_ARROW_PX:
         return ""
+    color_text = f"rgb{color}"
+    start_x, start_y = start.tolist()
+    end_x, end_y = end.tolist()
+    arrow = svg.arrow((start_x, start_y), (end_x, end_y), head=HEAD_PX, color=color_text)
+    if length_px <= MIN_LABELED_PX:
+        return arrow
     along = (end - start) / length_px
     side = np.array([-along[1], along[0]])
-    head_px = min(11.0, 0.6 * length_px)
-    neck = end - head_px * along
-    left = neck + 0.4 * head_px * side
-    right = neck - 0.4 * head_px * side
-    head = " ".join(f"{x:.1f},{y:.1f}" for x, y in (end, left, right))
-    label = ""
-    if length_px > MIN_LABELED_PX:
-        x, y = (start + end) / 2 + 20 * side
-        label = (
-            f"<text x='{x:.1f}' y='{y + 4:.1f}' font-size='11' text-anchor='middle' "
-            f"fill='rgb{color}'>{length_px / px_per_n:.1f} N</text>"
-        )
-    return (
-        f"<path d='M{start[0]:.1f} {start[1]:.1f} L{neck[0]:.1f} {neck[1]:.1f}' stroke='rgb{color}' stroke-width='3'/>"
-        f"<polygon points='{head}' fill='rgb{color}'/>{label}"
-    )
+    x, y = (start + end) / 2 + LABEL_DISTANCE_PX * side
+    words = f"{length_px / px_per_n:.1f} N"
+    return arrow + svg.text(x, y + 4, words, anchor="middle", fill=color_text, font_size=FONT_PX)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import viser
 
-from snakesim_hal.wire.messages import ControlSettings, Description
+from snakesim_hal.wire.messages import ControlParameters, Description
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page import page_html
@@ -151,8 +151,8 @@ class Page:
     def _add_command_tabs(self, tabs: viser.GuiTabGroupHandle, operations: Operations) -> None:
         """Add the tabs with which viewers change the robot."""
         gui = self._server.gui
-        with tabs.add_tab("Settings"):
-            self._settings_tab = gui.add_folder(None)
+        with tabs.add_tab("Parameters"):
+            self._parameters_tab = gui.add_folder(None)
         with tabs.add_tab("Commission"):
             self._commission_tab = gui.add_folder(None)
         self._commissioning = Commissioning(
@@ -187,14 +187,14 @@ class Page:
                 self._token,
                 operations,
                 lambda: self._snapshot,
-                self._settings_tab,
+                self._parameters_tab,
                 self._on_control_changed,
                 self._server.admission,
                 self._commissioning,
                 self._commission_tab,
             )
-            if self._snapshot is not None and self._snapshot.settings is not None:
-                controls.show_settings(self._snapshot.settings)
+            if self._snapshot is not None and self._snapshot.parameters is not None:
+                controls.show_parameters(self._snapshot.parameters)
             self._controls[client.client_id] = controls
 
     def _on_viewer_disconnect(self, client: viser.ClientHandle) -> None:
@@ -307,7 +307,7 @@ class Page:
         return self._frame_count % decimation == 1
 
     def _show_robot(self, previous: RobotSnapshot | None, snapshot: RobotSnapshot) -> None:
-        """Show the scene at once, and charts, images and settings when they are due."""
+        """Show the scene at once, and charts, images and parameters when they are due."""
         if self._scene is None or previous is None or previous.robot.layout != snapshot.robot.layout:
             self._show_new_robot(snapshot.robot)
         if previous is None or previous.robot is not snapshot.robot:
@@ -320,9 +320,9 @@ class Page:
         self._update_charts(snapshot)
         if self._is_due(PICTURE_DECIMATION):
             self._show_pictures(snapshot)
-        settings = snapshot.settings
-        if settings is not None and (previous is None or settings != previous.settings):
-            self._show_settings(settings)
+        parameters = snapshot.parameters
+        if parameters is not None and (previous is None or parameters != previous.parameters):
+            self._show_parameters(parameters)
 
     def _update_charts(self, snapshot: RobotSnapshot) -> None:
         """Keep a sample for the charts, and redraw them when they are due."""
@@ -357,11 +357,11 @@ class Page:
             with self._sensors_tab:
                 self._sensor_charts = CustomSensorCharts(self._server.gui)
 
-    def _show_settings(self, settings: ControlSettings) -> None:
+    def _show_parameters(self, parameters: ControlParameters) -> None:
         with self._lock:
             for controls in self._controls.values():
                 with self._ignore_closed_page(controls.client):
-                    controls.show_settings(settings)
+                    controls.show_parameters(parameters)
 
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
         log_lines = self._log.lines()
@@ -410,6 +410,6 @@ def _urgent_state(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
         return None
     status = snapshot.status
     control = snapshot.control
-    host_state = None if status is None else (status.lifecycle, status.why, status.paused_by)
+    host_state = None if status is None else (status.lifecycle, status.reason, status.paused_by)
     control_state = None if control is None else control.state
     return host_state, control_state

@@ -62,7 +62,9 @@ def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control
     lines = [_format_backend_bar(snapshot.robot, recorded), *_list_alarms(snapshot)]
     status = snapshot.status
     if status is not None:
-        lines.append(_format_state(status.lifecycle.upper(), LIFECYCLE_COLORS[status.lifecycle], status.why, ".45em"))
+        lines.append(
+            _format_state(status.lifecycle.upper(), LIFECYCLE_COLORS[status.lifecycle], status.reason, ".45em")
+        )
     control_state = snapshot.control
     if control_state is not None:
         state_color = CONTROL_STATE_COLORS[control_state.state]

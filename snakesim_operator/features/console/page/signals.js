@@ -119,9 +119,9 @@
     place();
   };
   const rows = (plot) => [
-    element("tr", {}, ...["", "", "least", "mean", "most", ""].map((words) => element("th", { textContent: words }))),
+    element("tr", {}, ...["", "", "min", "mean", "max", ""].map((words) => element("th", { textContent: words }))),
     ...every(plot).map((name) => element("tr", {},
-      element("td", {}, element("span", { textContent: "■ ", style: `color:var(${look(plot, name)})` }), `${name}, ${units[name]}`),
+      element("td", {}, element("span", { textContent: "■\u00a0", style: `color:var(${look(plot, name)})` }), `${name}, ${units[name]}`),
       ...Array.from({ length: 4 }, () => element("td")),
       element("td", {}, element("button", { textContent: "×", title: `take ${name} away`, onclick: () => leave(plot, name) })))),
   ];
@@ -161,8 +161,8 @@
       Object.assign(plot.cursor.style, { display: inside ? "block" : "none", left: `${plot.view.offsetLeft + size.l + x}px`, top: `${plot.view.offsetTop + size.t}px`, height: `${size.h}px` });
       plot.table.rows[0].cells[1].textContent = time === null ? "at cursor" : `at ${time.toFixed(2)} s`;
       every(plot).forEach((name, i) => {
-        const data = plot.data[name], [least, mean, most] = data?.range ?? [];
-        [data && time !== null ? near(data, time) : null, least, mean, most].forEach((value, k) => {
+        const data = plot.data[name], [min, mean, max] = data?.range ?? [];
+        [data && time !== null ? near(data, time) : null, min, mean, max].forEach((value, k) => {
           plot.table.rows[i + 1].cells[k + 1].textContent = shown(value);
         });
       });

@@ -11,14 +11,14 @@ from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.base.workers import ErrorReport
 from snakesim_hal.model.fault_kinds import KINDS, TargetType
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlSettings
+from snakesim_hal.wire.messages import ControlParameters
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import Operations
 from snakesim_operator.features.console.page.commissioning_controls import CommissioningControls
 from snakesim_operator.features.console.page.commissioning_tab import Commissioning
 from snakesim_operator.features.console.page.drive_controls import DriveControls
 from snakesim_operator.features.console.page.page_html import BAD, escape_text
-from snakesim_operator.features.console.page.settings_form import SettingsForm
+from snakesim_operator.features.console.page.parameter_form import ParameterForm
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_PRESS_AGE_S, Admission, format_age
 from snakesim_operator.robot_commands.fault import FaultOrder
@@ -53,7 +53,7 @@ class ViewerControls:
         token: ControlToken,
         operations: Operations,
         get_snapshot: Callable[[], RobotSnapshot | None],
-        settings_tab: viser.GuiFolderHandle,
+        parameters_tab: viser.GuiFolderHandle,
         on_control_changed: Callable[[], None],
         admission: Admission,
         commissioning: Commissioning,
@@ -67,7 +67,7 @@ class ViewerControls:
             token: Decides which viewer has control.
             operations: Sends commands to the robot.
             get_snapshot: Returns the newest snapshot; None while there is no robot.
-            settings_tab: The place of the controller's settings.
+            parameters_tab: The place of the controller's parameters.
             on_control_changed: Called when this viewer took or released control.
             admission: Decides which messages of the page count.
             commissioning: Runs steps; all viewers share one.
@@ -86,8 +86,8 @@ class ViewerControls:
         self._offers_unchecked = False  # the host refused to arm because the joints were not checked
         self._errors = ErrorReport(f"console, {self.name}")
         # The controls.
-        self._settings_tab = settings_tab
-        self._settings_form: SettingsForm | None = None
+        self._parameters_tab = parameters_tab
+        self._parameter_form: ParameterForm | None = None
         with control_folder:
             self._add_control_buttons()
             self._add_simulator_controls()
@@ -95,7 +95,7 @@ class ViewerControls:
                 client, admission, self._is_in_control, get_snapshot, partial(operations.drive, self.name)
             )
             self._add_fault_controls()
-        with settings_tab:
+        with parameters_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
         self._admit_controls()
         self._commissioning_controls = CommissioningControls(
@@ -113,7 +113,7 @@ class ViewerControls:
     def _add_control_buttons(self) -> None:
         gui = self.client.gui
         self._take_control = gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
-        self._lifecycle = gui.add_button_group("Robot", ("Arm", "Disarm", "Clear"))
+        self._lifecycle = gui.add_button_group("Robot", ("Arm", "Disarm", "Reset fault"))
         self._unchecked_reason = gui.add_html("", visible=False)
         self._arm_unchecked = gui.add_button("Arm it unchecked", color="red", visible=False)
 
@@ -175,7 +175,7 @@ class ViewerControls:
         self._simulator_speed.on_update(lambda _: self._change_time("speed"))
         self._fault_kind.on_update(lambda _: self._suggest_fault_target())
         self._fault_buttons.on_click(lambda event: self._change_fault(end=event.target.value == "End it"))
-        self._apply.on_click(lambda _: self._apply_settings())
+        self._apply.on_click(lambda _: self._apply_parameters())
 
     @property
     def name(self) -> str:
@@ -200,8 +200,8 @@ class ViewerControls:
         self._simulator_speed.visible = status is not None and status.clock_mode == "realtime"
         self._apply.disabled = not in_control
         self._commissioning_controls.refresh()
-        if self._settings_form is not None:
-            self._settings_form.set_enabled(in_control)
+        if self._parameter_form is not None:
+            self._parameter_form.set_enabled(in_control)
 
     def _show_take_control(self) -> None:
         """Show whether this viewer can take control, or can release it, or which other viewer has it."""
@@ -226,22 +226,22 @@ class ViewerControls:
         self._unchecked_reason.visible = self._offers_unchecked
         self._arm_unchecked.visible = self._offers_unchecked
 
-    def show_settings(self, settings: ControlSettings) -> None:
-        """Show the controller settings in force."""
-        if self._settings_form is None or not self._settings_form.show_values(settings):
-            self._replace_settings_form(settings)
+    def show_parameters(self, parameters: ControlParameters) -> None:
+        """Show the controller parameters in force."""
+        if self._parameter_form is None or not self._parameter_form.show_values(parameters):
+            self._replace_parameter_form(parameters)
         self._apply.visible = True
         self.refresh()
 
-    def _replace_settings_form(self, settings: ControlSettings) -> None:
+    def _replace_parameter_form(self, parameters: ControlParameters) -> None:
         """Add the form of the running controller, in the place of the form of another controller."""
-        former = self._settings_form
+        former = self._parameter_form
         if former is not None:
             for control in former.inputs:
                 self._admission.forget(control)
             former.remove()
-        self._settings_form = SettingsForm(self.client.gui, self._settings_tab, settings)
-        for control in self._settings_form.inputs:
+        self._parameter_form = ParameterForm(self.client.gui, self._parameters_tab, parameters)
+        for control in self._parameter_form.inputs:
             self._admission.admit(control, self.viewer, self._is_in_control)
 
     def notify(self, title: str, text: str, *, bad: bool = False) -> None:
@@ -284,7 +284,7 @@ class ViewerControls:
             case "Disarm":
                 self.run_operation("Disarm", lambda: self._operations.disarm(self.name))
             case _:
-                self.run_operation("Clear", lambda: self._operations.clear(self.name))
+                self.run_operation("Reset fault", lambda: self._operations.reset_fault(self.name))
 
     def _arm(self, *, unchecked: bool) -> None:
         """Arm the robot; offer to arm it unchecked, with a button of its own, once the host has refused."""
@@ -301,7 +301,7 @@ class ViewerControls:
         if not self._is_in_control():
             return
         speed = float(self._simulator_speed.value)
-        order = SimulatorOrder(action, speed=speed, who=self.name)
+        order = SimulatorOrder(action, speed=speed, requester=self.name)
         self.run_operation("Simulator", lambda: self._operations.change_time(self.name, order))
 
     def _suggest_fault_target(self) -> None:
@@ -318,13 +318,13 @@ class ViewerControls:
         order = FaultOrder(kind, target, end=end)
         self.run_operation("Fault", lambda: self._operations.inject(self.name, order))
 
-    def _apply_settings(self) -> None:
-        form = self._settings_form
+    def _apply_parameters(self) -> None:
+        form = self._parameter_form
         if form is None or not self._is_in_control():
             return
         self.run_operation(
-            "Settings",
-            lambda: self._operations.configure(self.name, form.controller, form.encode_settings()),
+            "Parameters",
+            lambda: self._operations.configure(self.name, form.controller, form.encode_parameters()),
         )
 
     def run_operation(self, title: str, operation: Callable[[], str]) -> bool:

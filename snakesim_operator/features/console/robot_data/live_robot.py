@@ -38,7 +38,7 @@ MAX_JOINT_STATES = 128  # enough to find the joint state of the instant of a pos
 RATE_PERIOD_S = 1.0  # over which the rates of messages are measured
 MAX_STATUS_AGE_S = 2.0  # a host that is silent for longer has ended; it does not count as a second host
 
-LATCHED_KEYS = (keys.DESCRIPTION, keys.STATUS, keys.SETTINGS_IN_FORCE, keys.CONFIG)
+LATCHED_KEYS = (keys.DESCRIPTION, keys.STATUS, keys.PARAMETERS_IN_FORCE, keys.CONFIG)
 STREAM_KEYS = (
     keys.CLOCK,
     keys.JOINTS,
@@ -169,7 +169,7 @@ class LiveRobot:
             world=world,
             trajectory=newest(keys.TRAJECTORY),
             control=newest(keys.CONTROL_STATE),
-            settings=newest(keys.SETTINGS_IN_FORCE),
+            parameters=newest(keys.PARAMETERS_IN_FORCE),
             # Network.
             streams=self._list_streams(clock),
         )

@@ -17,7 +17,7 @@ from snakesim_operator.recording.message import RecordedMessage
 IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOR_ALL)
 
 # Rows of the key space whose messages are kept, because the rows of a run's record do not have them.
-KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.SETTINGS_IN_FORCE, keys.OWN_ALL, *IMAGE_ROWS})
+KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.PARAMETERS_IN_FORCE, keys.OWN_ALL, *IMAGE_ROWS})
 
 # Rows of which only the times are kept, to show their rates and ages.
 TIMED_ROWS = frozenset(
@@ -32,7 +32,7 @@ TIMED_ROWS = frozenset(
         keys.CONTROL_STATE,
     }
 )
-LATCHED_KEYS = (keys.STATUS, keys.SETTINGS_IN_FORCE)  # published on change, so they have no rate
+LATCHED_KEYS = (keys.STATUS, keys.PARAMETERS_IN_FORCE)  # published on change, so they have no rate
 MAX_IMAGE_BYTES = 256_000_000  # of all images together; beyond this, every second image is dropped
 MAX_DECODED = 256  # messages that stay decoded
 RATE_PERIOD_S = 1.0

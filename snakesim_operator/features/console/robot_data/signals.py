@@ -1,7 +1,8 @@
 """Every number of a robot over time, by name and unit, and the last minute of these numbers for a live robot.
 
-Names are those of `snakesim plot` and `snakesim export`. A number that these commands do not have has the name of its
-message in front: `control.reference_rad.joint_3`, `power.voltage_v.joint_1`, `imu.acceleration_m_s2.0.x`.
+Names are those of `snakesim recording plot` and `snakesim recording export`. A number that these commands do not
+have has the name of its message in front: `control.reference_rad.joint_3`, `power.voltage_v.joint_1`,
+`imu.acceleration_m_s2.0.x`.
 """
 
 import threading

@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import (
     ColorImage,
     Configuration,
     Contacts,
-    ControlSettings,
+    ControlParameters,
     ControlState,
     DepthImage,
     Description,
@@ -63,7 +63,7 @@ class RobotSnapshot:
     world: World | None = None
     trajectory: Trajectory | None = None
     control: ControlState | None = None
-    settings: ControlSettings | None = None
+    parameters: ControlParameters | None = None
 
     # Network and log.
     streams: dict[str, Stream] = field(default_factory=dict)  # by key

@@ -4,12 +4,11 @@ import math
 import re
 from pathlib import Path
 
-import pytest
-
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_testing.messages import raises_error
 
 LINE = re.compile(r"\((\d+\.\d{6})\) (\S+) ([0-9A-F]{3})#([0-9A-F]*) ([RT])\n")
 
@@ -37,7 +36,7 @@ def test_what_is_taken_and_what_comes_is_logged_in_order_and_everything_else_is_
         assert neighbor.send(Frame(0, b"\x02"))
         for one in (other, wire, neighbor):
             one.close()
-        with pytest.raises(BackendError, match="can3: cannot send"):
+        with raises_error(BackendError, code="bus/io-failed"):
             wire.send(Frame(0, b""))
         lines = [LINE.fullmatch(line) for line in path.read_text().splitlines(keepends=True)]
     assert [line and line.groups()[1:] for line in lines] == [
@@ -51,5 +50,5 @@ def test_what_is_taken_and_what_comes_is_logged_in_order_and_everything_else_is_
 
 
 def test_a_log_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"backends\.can\.log.*choose another file"):
+    with raises_error(ConfigError, code="file/not-writable"):
         open_log(tmp_path / "nowhere" / "bus.log")

@@ -16,9 +16,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.can.driver_loop import chain_of
 from snakesim_testing.contract.rig import Rig
-from tests.unit.can_backend.loop import chain_of
-from tests.unit.hal.rig import run_config
+from snakesim_testing.hal.small_robots import run_config
 
 RATED_NM = 4.0
 STEP_NM = 0.003  # of the bus, and what a joint at its stop still sways by
@@ -72,7 +72,7 @@ def pushes_nm(rig: Rig, limit_nm: float) -> float:
 
 
 @pytest.mark.parametrize("curve", CURVES)
-@pytest.mark.parametrize("over", [-0.2, 0.48, 0.96])
+@pytest.mark.parametrize("over", [0.48, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.2, 0.96))])
 @pytest.mark.parametrize("backend", ["sim", "can"])
 def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
     """over: how far the winding is from `derate_from_c` to `stop_at_c`."""

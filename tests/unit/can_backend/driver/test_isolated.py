@@ -18,9 +18,9 @@ from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Modu
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
+from snakesim_testing.can.driver_loop import JOINTS, chain_of, config
+from snakesim_testing.can.module_faults import MODULE_FAULTS
 from snakesim_testing.contract.rig import Rig
-from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
-from tests.unit.can_backend.loop import JOINTS, chain_of, config
 
 FAILS = 2  # joint_3
 OTHERS = [i for i in range(JOINTS) if i != FAILS]
@@ -41,7 +41,7 @@ class Lame(Rig):
     def inject(self, text: str, *, begins: bool = True) -> None:
         assert self.can.inject(parse_injection(f"{text}@0"), begins=begins)
 
-    def ask(self, action: Literal["disarm", "clear"]) -> None:
+    def ask(self, action: Literal["disarm", "reset"]) -> None:
         answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
         assert answer.ok, answer.reason
 
@@ -98,7 +98,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         reported = len(robot.faults)
         robot.ask("disarm")
         robot.idle(5)
-        robot.ask("clear")
+        robot.ask("reset")
         robot.idle(20)
         robot.arm()
         robot.wave(30)
@@ -133,7 +133,7 @@ def test_one_joint_too_many_stops_all() -> None:
 
 
 def swallowed(robot: Lame, *joints: int) -> None:
-    """Modules fail with a fault that lasts until they are cleared, and a person clears before a period has passed."""
+    """Modules fail with a fault that lasts until they are reset, and a person resets before a period has passed."""
     chain = chain_of(robot.can)
     for joint in joints:
         chain.slots[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
@@ -143,7 +143,7 @@ def swallowed(robot: Lame, *joints: int) -> None:
         (robot.wave if robot.authority.state == "armed" else robot.idle)(1)
     if robot.authority.state == "armed":
         robot.ask("disarm")
-    robot.ask("clear")
+    robot.ask("reset")
     robot.idle(20)
 
 
@@ -166,7 +166,7 @@ def test_who_clears_before_a_period_has_passed_clears_all_the_same(
         assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
 
 
-@pytest.mark.parametrize("then", ["clear", "estop", "fault"])
+@pytest.mark.parametrize("then", ["reset", "estop", "fault"])
 def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch, then: str) -> None:
     """A module that is lost needs its parameters again and does not take them: that takes a second."""
     sent: list[Frame] = []
@@ -186,7 +186,7 @@ def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch
             robot.isolate_joint(0)
         else:
             robot.ask("disarm")
-        robot.ask("clear")
+        robot.ask("reset")
         if then == "estop":
             robot.estop()
         monkeypatch.setattr(VirtualWire, "send", overheard)

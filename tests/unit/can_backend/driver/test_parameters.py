@@ -16,6 +16,7 @@ from snakesim_hal.model.files import decode, list_shipped, read_part
 from snakesim_hal.model.joints import JointExceptions
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import load
+from snakesim_testing.messages import raises_error
 
 ROBOT = load("triplet").config.robot
 RATED = (ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED)
@@ -54,28 +55,26 @@ def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
 
 
 MISPLACED = {
-    "an id": (JointExceptions(id=25), {}, ["`joints.joint_2.id` = 25", "here 2", "leave `id` out"]),
-    "a port": (JointExceptions(port="can3"), {}, ["joint_2: `port` = 'can3'", "`backends.can.channels`"]),
-    "a zero": (JointExceptions(zero_rad=2.5), {}, ["joint_2: `limits.angle_rad` = 4.07", "at the module's shaft"]),
-    "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}, ["mounted.joint_99", "to joint_13"]),
+    "an id": (JointExceptions(id=25), {}),
+    "a port": (JointExceptions(port="can3"), {}),
+    "a zero": (JointExceptions(zero_rad=2.5), {}),
+    "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}),
     "no emulators": (
         JointExceptions(),
         {"mounted": {"joint_2": Mounted(sign=-1)}, "emulators": "none", "channels": ["can0"]},
-        ["is for emulators"],
     ),
 }
 
 
 @pytest.mark.parametrize("wrong", MISPLACED)
 def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
-    own, given, words = MISPLACED[wrong]
+    own, given = MISPLACED[wrong]
     settings = CanSettings(**given)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code=("bus/invalid-channel", "config/conflict", "drive/unsupported-setting")):
         check_drives(robot, settings)
         check_mounted(robot, "backends.can", settings.mounted, emulators=settings.emulators_run != "none")
         check_ratings(robot)
-    assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
 @pytest.mark.parametrize("tail", [True, False])
@@ -101,37 +100,35 @@ def test_the_safe_action_is_the_robots_the_watchdog_that_of_the_settings_and_rep
 
 
 def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
-    with pytest.raises(ConfigError, match='Use "damp" or "passive"'):
+    with raises_error(ConfigError, code="drive/unsupported-setting"):
         check_ratings(changed("safety", action="hold"))
 
 
 @pytest.mark.parametrize(
-    ("field", "opcode", "signal", "room", "unit"),
+    ("field", "opcode", "signal", "room"),
     [
-        ("angle_rad", Opcode.JOINT_STATE, "angle", 1.0, "rad"),
-        ("speed_rad_s", Opcode.JOINT_STATE, "velocity", SPEED_ROOM, "rad/s"),
-        ("torque_nm", Opcode.JOINT_STATE, "torque", 1.0, "N·m"),
-        ("stop_at_c", Opcode.HEALTH, "motor_temperature", 1.0, "°C"),
+        ("angle_rad", Opcode.JOINT_STATE, "angle", 1.0),
+        ("speed_rad_s", Opcode.JOINT_STATE, "velocity", SPEED_ROOM),
+        ("torque_nm", Opcode.JOINT_STATE, "torque", 1.0),
+        ("stop_at_c", Opcode.HEALTH, "motor_temperature", 1.0),
     ],
 )
-def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, room: float, unit: str) -> None:
+def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, room: float) -> None:
     most = load_layouts()[opcode].signals[signal].high / room
     if field != "angle_rad" or most <= 3.1:
         check_ratings(changed("limits", **{field: most * 0.999}))
-    with pytest.raises(
-        ConfigError, match=rf"planar13.*limits\.{field}` = .* {unit} exceeds the range of the bus protocol"
-    ):
+    with raises_error(ConfigError, code="drive/unsupported-setting"):
         check_ratings(changed("limits", **{field: most * 1.001}))
 
 
 @pytest.mark.parametrize(
-    ("torque_nm", "speed_rad_s", "words"),
+    ("torque_nm", "speed_rad_s"),
     [
-        (6.9, 7.5, "rated for 6.9 N·m.*needs 7"),
-        (7.0, 7.0, "rated for 7 rad/s.*needs 7.5"),
-        (float("nan"), 7.5, "rated for nan N·m.*needs 7"),
+        (6.9, 7.5),
+        (7.0, 7.0),
+        (float("nan"), 7.5),
     ],
 )
-def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float, words: str) -> None:
-    with pytest.raises(BackendError, match=f"joint_4 is {words}: lower the limit in the robot file"):
+def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float) -> None:
+    with raises_error(BackendError, code="drive/unsupported-setting", field="joint_4"):
         check_ratings(ROBOT, rated(torque_nm, speed_rad_s))

@@ -5,20 +5,8 @@ import pytest
 from snakesim_can_backend.driver.reports import MAX_LATE_SYNCS, ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode
-from tests.unit.can_backend.frames import answer, begin, contact, joint_state, syncs
-
-JOINTS = 3
-
-
-def reading(syncs_before: int = 5) -> ModuleReports:
-    made = ModuleReports(JOINTS)
-    syncs(made, syncs_before)
-    return made
-
-
-def angles(made: ModuleReports) -> list[float]:
-    return made.shaft_values()[0].tolist()
-
+from snakesim_testing.can.frames import answer, begin, contact, joint_state, syncs
+from snakesim_testing.can.readings import JOINTS, angles, reading
 
 # --- states ------------------------------------------------------------------------------------------------
 

@@ -19,8 +19,8 @@ from snakesim_can_backend.protocol.definitions import (
     parse_node,
     parse_opcode,
 )
-from tests.unit.can_backend.driver.test_reading import JOINTS, angles, reading
-from tests.unit.can_backend.frames import accelerometer, begin, contact, gyro, health, heartbeat, joint_state, syncs
+from snakesim_testing.can.frames import accelerometer, begin, contact, gyro, health, heartbeat, joint_state, syncs
+from snakesim_testing.can.readings import JOINTS, angles, reading
 
 # --- forces, IMUs, health ----------------------------------------------------------------------------------
 

@@ -27,8 +27,8 @@ from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Power
 from snakesim_hal.wire.quantities import Vector
-from tests.unit.can_backend.frames import accelerometer, answer, begin, contact, gyro, health, syncs
-from tests.unit.can_backend.loop import config
+from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.frames import accelerometer, answer, begin, contact, gyro, health, syncs
 
 JOINTS = 4
 PERIOD_NS = 10_000_000

@@ -13,7 +13,8 @@ from snakesim_can_backend.driver.module_monitor import (
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
-from tests.unit.can_backend.driver.watch_rig import (
+from snakesim_testing.can.frames import begin, corrupted, heartbeat, joint_state
+from snakesim_testing.can.monitor_rig import (
     HOT,
     HOT_AND_WET,
     PERIOD_S,
@@ -25,7 +26,6 @@ from tests.unit.can_backend.driver.watch_rig import (
     reporting,
     said,
 )
-from tests.unit.can_backend.frames import begin, corrupted, heartbeat, joint_state
 
 # --- what one module can do wrong --------------------------------------------------------------------------
 
@@ -71,7 +71,7 @@ def test_it_is_named_in_time_with_joint_and_cause_once_and_again_after_a_clearin
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
     assert bench.tick(speak) == [Finding(what, WHO + cause, 1, alone=what not in CONCERNS_ALL)]
     assert bench.ticks(40, speak) == []
-    bench.clear()
+    bench.reset()
     assert (what, 1) in said(bench.ticks(CLEAR_GRACE + 1, speak))
     assert bench.ticks(40, speak) == []
 
@@ -125,7 +125,7 @@ def test_a_restart_is_told_once_with_its_joint_and_what_it_lost() -> None:
     assert said(found) == [("module_restarted", 1)]
     assert found[0].cause.startswith(WHO + "has restarted") and "0.20 s" in found[0].cause
     assert bench.watch.take_changed() == {1} and bench.watch.take_changed() == set()
-    bench.clear()
+    bench.reset()
     assert bench.ticks(10) == []
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
 
@@ -190,11 +190,11 @@ def test_a_fault_whose_heartbeat_is_lost_is_told_by_its_state() -> None:
 def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
     bench = Bench()
     bench.tick(HOT_AND_WET)
-    bench.clear()
+    bench.reset()
     assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
     bench.tick(reporting())
     assert bench.ticks(10) == []
-    bench.clear()
+    bench.reset()
     assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
     assert said(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], "and is told again when it stays"
 

@@ -8,8 +8,8 @@ from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode, frame_id
-from tests.unit.can_backend.driver.watch_rig import Bench, answering, quiet, said
-from tests.unit.can_backend.frames import answer, joint_state
+from snakesim_testing.can.frames import answer, joint_state
+from snakesim_testing.can.monitor_rig import Bench, answering, quiet, said
 
 # --- the bus -----------------------------------------------------------------------------------------------
 
@@ -19,8 +19,8 @@ from tests.unit.can_backend.frames import answer, joint_state
     [
         ("bus_off", "look for a short, a wrong bit rate, a missing terminator"),
         ("error_passive", "look at cables, terminators and bit rate"),
-        ("interface_down", "bring it up again, then clear and arm"),
-        ("restarted", "clear and arm when the bus is in order"),
+        ("interface_down", "bring it up again, then reset and arm"),
+        ("restarted", "reset and arm when the bus is in order"),
         ("receive_overflow", "states may be missing"),
     ],
 )
@@ -32,7 +32,7 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
     assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
     assert bench.tick(errors=[error]) == []
     assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
-    bench.clear()
+    bench.reset()
     assert said(bench.tick(errors=[error])) == [(kind, None)]
 
 
@@ -86,7 +86,7 @@ def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
     (found,) = bench.tick(speak)
     assert (found.what, found.joint) == (what, None) and words in found.cause
     assert bench.tick(speak) == []
-    bench.clear()
+    bench.reset()
     assert bench.tick() == [], "it was there once and is no more"
     assert said(bench.tick(speak)) == [(what, None)]
 

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.physics.backlash import BacklashModel, without_rotors
-from tests.unit.can_backend.loop import config
+from snakesim_testing.can.driver_loop import config
 
 BACKLASH_RAD = 0.03
 

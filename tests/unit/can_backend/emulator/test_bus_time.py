@@ -7,7 +7,7 @@ from snakesim_can_backend.emulator.bus_time import MAX_AHEAD_US, BusTime, traffi
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_sync
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id, parse_opcode
-from tests.unit.can_backend.emulator.rig import run_at, setpoint
+from snakesim_testing.can.module_rig import run_at, setpoint
 
 FULL = worst_frame_bits(8)
 

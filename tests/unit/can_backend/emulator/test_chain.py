@@ -13,9 +13,9 @@ from snakesim_can_backend.protocol.definitions import CommandAction, ModuleParam
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
-from tests.unit.can_backend.emulator.rig import Host, chain, only, setpoint
-from tests.unit.can_backend.loop import config
-from tests.unit.hal.rig import pose
+from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.module_rig import Host, chain, only, setpoint
+from snakesim_testing.hal.small_robots import pose
 
 G = 9.81
 POSE = pose(position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5))

@@ -5,6 +5,7 @@ import pytest
 from snakesim_can_backend.emulator.faults import format_typed_fault, parse_fault, parse_typed_fault
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
+from snakesim_testing.messages import raises_error
 
 
 def test_what_is_typed_is_a_fault_that_begins_or_ends_now():
@@ -16,14 +17,14 @@ def test_what_is_typed_is_a_fault_that_begins_or_ends_now():
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ("mote:joint_3@2", "knows no 'mote', only mute, freeze"),
-        ("mute:joint_5@2", "no joint_5; this run has joint_1 to joint_4"),
-        ("wrong:joint_1@1", "modules support mute, freeze, reboot"),
-        ("kill:control@1", "modules support mute, freeze, reboot"),
+        "mote:joint_3@2",
+        "mute:joint_5@2",
+        "wrong:joint_1@1",
+        "kill:control@1",
     ],
 )
-def test_wrong_texts_are_told_what_is_allowed(text: str, message: str):
-    with pytest.raises(ConfigError, match=message):
+def test_wrong_texts_are_told_what_is_allowed(text: str):
+    with raises_error(ConfigError, code=("injection/unknown-fault", "injection/unknown-target")):
         parse_fault(text, 4)

@@ -19,7 +19,8 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_hal.wire.messages import Mode
-from tests.unit.can_backend.emulator.rig import (
+from snakesim_testing.can.frames import corrupted
+from snakesim_testing.can.module_rig import (
     BOOTED,
     MS,
     NODE,
@@ -31,7 +32,6 @@ from tests.unit.can_backend.emulator.rig import (
     parameter,
     setpoint,
 )
-from tests.unit.can_backend.frames import corrupted
 
 WITHOUT_KEY = load_layouts()[Opcode.COMMAND].encode(BROADCAST, action=CommandAction.ARM)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
-from tests.unit.can_backend.loop import config
+from snakesim_testing.can.driver_loop import config
 
 INERTIA = 0.005 + 0.2 * 0.1**2 / 12  # of the middle joints of the test robot
 

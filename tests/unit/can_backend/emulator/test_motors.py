@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
-from tests.unit.can_backend.loop import config
+from snakesim_testing.can.driver_loop import config
 
 STEP_S, RESPONSE_S, RATED_NM, SPEED = 1e-3, 0.01, 4.0, 5.0
 REST = np.zeros(1)

@@ -12,7 +12,7 @@ from snakesim_can_backend.protocol.definitions import (
     ParameterOperation,
     ParameterResult,
 )
-from tests.unit.can_backend.emulator.rig import BOOTED, armed, booted, only, parameter
+from snakesim_testing.can.module_rig import BOOTED, armed, booted, only, parameter
 
 
 def ask(module, *request, **given):

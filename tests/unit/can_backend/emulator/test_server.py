@@ -15,7 +15,8 @@ from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Modu
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.can_backend.emulator.rig import chain, only, setpoint
+from snakesim_testing.can.module_rig import chain, only, setpoint
+from snakesim_testing.messages import raises_error
 
 Wall = tuple[VirtualWire, EmulatorServer, Callable[[float], list[Frame]]]
 JOINTS = 4
@@ -104,5 +105,5 @@ def test_stepped_twins_run_when_the_host_has_nothing_to_do():
 
 @pytest.mark.parametrize("address", ["nowhere", ":7450", "host:0", "host:99999", "host:x"])
 def test_a_wrong_pose_address_is_refused(address: str):
-    with pytest.raises(ConfigError, match=r"HOST:PORT"):
+    with raises_error(ConfigError, code="network/invalid-address"):
         PoseSender(address)

@@ -10,15 +10,17 @@ from moteus.protocol import parse_message, parse_registers
 
 from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
 from snakesim_can_backend.moteus import protocol
-from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
+from snakesim_can_backend.moteus.backend import MoteusBackend
 from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION, configured_gains
+from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from tests.unit.can_backend.loop import config
-from tests.unit.hal.drive_rig import drives_of
+from snakesim_testing.can.driver_loop import config
+from snakesim_testing.drivers.drive_rig import drives_of
+from snakesim_testing.messages import raises_error
 
 TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
 JOINTS = 4
@@ -170,12 +172,11 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
 def test_the_ids_of_the_host_and_of_everybody_are_no_controllers(number: int) -> None:
     """Their firmware's filters and mjbots' library take 127 for a broadcast: all controllers would follow one joint."""
     wrong = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
-    words = f"joint_2: `id` = {number}, and controllers have ids of 1 to 126: 0 is the host's, 127 the broadcast"
-    with pytest.raises(ConfigError, match=words):
+    with raises_error(ConfigError, code="drive/unsupported-setting"):
         MoteusBackend.check(wrong, MoteusSettings())
     MoteusBackend.check(config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings())
 
 
 def test_real_controllers_need_to_be_configured_for_the_robot_and_a_reference() -> None:
-    with pytest.raises(ConfigError, match=r"needs `servo.pid_position.kp` from .* N·m/turn on, .*say what they have"):
+    with raises_error(ConfigError, code="drive/unsupported-setting", field="servo.pid_position.kp"):
         MoteusBackend.check(CONFIG, MoteusSettings(kp_nm_per_turn=0.01))

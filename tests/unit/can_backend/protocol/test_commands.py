@@ -17,7 +17,7 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_hal.wire.messages import LifecycleState, Mode
-from tests.unit.can_backend.frames import read
+from snakesim_testing.can.frames import read
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
 TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque"}

@@ -8,8 +8,8 @@ from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Contact, Obstacle
-from tests.unit.gnc.stage import BODY_RADIUS_M, make_robot
-from tests.unit.hal.rig import contact
+from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
+from snakesim_testing.hal.small_robots import contact
 
 ROBOT = make_robot()
 LENGTHS = [link.length_m for link in ROBOT.links]

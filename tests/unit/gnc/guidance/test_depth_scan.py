@@ -11,7 +11,7 @@ from snakesim_gnc.guidance.depth_scan import DepthScanner, decode_depth_m
 from snakesim_gnc.guidance.ground import fit_plane_under, refine_plane
 from snakesim_gnc.guidance.scan import Noise, Scan, make_scan
 from snakesim_hal.model.outlines import outline_distance_m
-from tests.unit.gnc.guidance.rendered import INTRINSICS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
+from snakesim_testing.gnc.rendered import INTRINSICS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
 
 EYE_M = 0.06  # height of the camera
 SCENE = [cylinder("near", 0.6, 0.1, 0.04), cylinder("far", 1.2, -0.3, 0.06), box("block", 0.8, 0.4, (0.12, 0.08), 0.5)]
@@ -40,6 +40,7 @@ def test_points_lie_on_what_stands_there(ground, eye, median_m, max_m):
     assert len(off) > 20 and np.median(off) < median_m and off.max() < max_m
 
 
+@pytest.mark.slow
 @given(st.floats(-0.6, 0.6), st.floats(-0.1, 0.15), st.floats(-0.15, 0.15))
 def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
     scan = look(SCENE, turned(yaw, pitch, roll))

@@ -8,8 +8,8 @@ import pytest
 from snakesim_gnc.guidance.body_history import Base, BodyHistory
 from snakesim_gnc.guidance.perceived_world import quaternion_from_rotation
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from tests.unit.gnc.guidance.drive import STEP_NS, Drive, random_field
-from tests.unit.gnc.guidance.rendered import turned
+from snakesim_testing.gnc.rendered import turned
+from snakesim_testing.gnc.sliding_snake import STEP_NS, Drive, random_field
 
 
 def errors_m(drive: Drive, places) -> list[float]:

@@ -11,7 +11,7 @@ from snakesim_gnc.guidance import obstacle_map
 from snakesim_gnc.guidance.obstacle_map import KEPT_M, ObstacleMap
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.wire.messages import Obstacle
-from tests.unit.gnc.guidance.rendered import box, cylinder, scanned
+from snakesim_testing.gnc.rendered import box, cylinder, scanned
 
 S = 1_000_000_000
 BODY_M = 0.04

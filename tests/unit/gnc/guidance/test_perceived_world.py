@@ -8,9 +8,9 @@ from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_hal.wire.messages import Contacts, World
 from snakesim_operator.results.metrics.map_score import MapScore, moved, score
-from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, random_field
-from tests.unit.gnc.guidance.rendered import cylinder, hills, lidar
-from tests.unit.hal.rig import contact
+from snakesim_testing.gnc.rendered import cylinder, hills, lidar
+from snakesim_testing.gnc.sliding_snake import NOISE, STEP_NS, Drive, random_field
+from snakesim_testing.hal.small_robots import contact
 
 
 def reported(drive: Drive) -> World:
@@ -31,6 +31,7 @@ def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
     return total
 
 
+@pytest.mark.slow  # a lidar maps the same below
 def test_a_field_is_mapped_to_millimetres():
     total = scored(Drive(random_field(1)), 200)
     assert len(total.position_m) > 30 and total.visible > 20
@@ -39,7 +40,7 @@ def test_a_field_is_mapped_to_millimetres():
     assert np.median(total.in_sd) < 1.5 and np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be
 
 
-@pytest.mark.slow  # a whole run on hills is in tests/physics/test_locomotion.py
+@pytest.mark.slow  # a whole run on hills is in tests/system/physics/test_locomotion.py
 def test_so_it_is_on_hills():
     total = scored(Drive(random_field(2), ground=hills(0.02, 1.5)), 200)
     assert np.median(total.position_m) < 0.008
@@ -77,6 +78,7 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     assert after.depth_timestamp_ns == before.depth_timestamp_ns and len(after.obstacles) == len(before.obstacles)
 
 
+@pytest.mark.slow
 def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     drive = Drive(random_field(1))
     list(drive.turns(60))

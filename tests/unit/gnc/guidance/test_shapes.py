@@ -12,7 +12,7 @@ from snakesim_gnc.guidance.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, Surface
 from snakesim_gnc.guidance.tracks import Track, fit_shapes
 from snakesim_hal.model.outlines import outline_distance_m
-from tests.unit.gnc.guidance.rendered import box, cylinder, scanned
+from snakesim_testing.gnc.rendered import box, cylinder, scanned
 
 NOISE_M = 0.002
 

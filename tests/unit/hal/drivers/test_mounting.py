@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.wire.messages import Mode
-from tests.unit.hal.rig import robot_file
+from snakesim_testing.hal.small_robots import robot_file
 
 MIXED = {
     "joint_1": {"sign": -1, "zero_rad": 3.0, "gear": 9.0, "angle_min_rad": -0.4},
@@ -19,35 +19,35 @@ numbers = st.lists(st.floats(-10, 10), min_size=3, max_size=3).map(np.array)
 
 
 def test_the_drive_of_a_reversed_geared_joint_turns_against_it_and_further_with_less_torque() -> None:
-    assert mounting.drive_angle_rad(np.array([0.1, 0.1, 0.1])) == pytest.approx([3.0 - 0.9, 0.1, -0.1])
-    assert mounting.drive_velocity_rad_s(np.ones(3)).tolist() == [-9.0, 1.0, 1.0]
-    assert mounting.drive_torque_nm(np.full(3, 1.8)) == pytest.approx([-0.2, 1.8, 1.8])
-    assert mounting.drive_torque_limit_nm(np.full(3, 1.8)) == pytest.approx([0.2, 1.8, 1.8]), "limits have no sign"
+    assert mounting.to_drive_angle_rad(np.array([0.1, 0.1, 0.1])) == pytest.approx([3.0 - 0.9, 0.1, -0.1])
+    assert mounting.to_drive_velocity_rad_s(np.ones(3)).tolist() == [-9.0, 1.0, 1.0]
+    assert mounting.to_drive_torque_nm(np.full(3, 1.8)) == pytest.approx([-0.2, 1.8, 1.8])
+    assert mounting.to_drive_torque_limit_nm(np.full(3, 1.8)) == pytest.approx([0.2, 1.8, 1.8]), "limits have no sign"
 
 
 @given(angle=numbers, velocity=numbers, torque=numbers)
 def test_there_and_back_is_the_same_and_so_is_the_power(
     angle: np.ndarray, velocity: np.ndarray, torque: np.ndarray
 ) -> None:
-    assert mounting.joint_angle_rad(mounting.drive_angle_rad(angle)) == pytest.approx(angle, abs=1e-12)
-    speeds, torques = mounting.drive_velocity_rad_s(velocity), mounting.drive_torque_nm(torque)
-    assert mounting.joint_velocity_rad_s(speeds) == pytest.approx(velocity)
-    assert mounting.joint_torque_nm(torques) == pytest.approx(torque)
+    assert mounting.to_joint_angle_rad(mounting.to_drive_angle_rad(angle)) == pytest.approx(angle, abs=1e-12)
+    speeds, torques = mounting.to_drive_velocity_rad_s(velocity), mounting.to_drive_torque_nm(torque)
+    assert mounting.to_joint_velocity_rad_s(speeds) == pytest.approx(velocity)
+    assert mounting.to_joint_torque_nm(torques) == pytest.approx(torque)
     assert speeds * torques == pytest.approx(velocity * torque), "a gear makes no power"
 
 
 @given(values=numbers)
 def test_plainly_mounted_drives_have_the_joints_numbers_to_the_bit(values: np.ndarray) -> None:
     for there, back in (
-        (plain.drive_angle_rad, plain.joint_angle_rad),
-        (plain.drive_velocity_rad_s, plain.joint_velocity_rad_s),
-        (plain.drive_torque_nm, plain.joint_torque_nm),
+        (plain.to_drive_angle_rad, plain.to_joint_angle_rad),
+        (plain.to_drive_velocity_rad_s, plain.to_joint_velocity_rad_s),
+        (plain.to_drive_torque_nm, plain.to_joint_torque_nm),
     ):
         assert there(values).tolist() == values.tolist() == back(values).tolist()
 
 
 def test_targets_are_converted_by_the_mode_of_each_joint() -> None:
     asked = [1.0, 1.0, 0.5]
-    assert mounting.drive_targets([Mode.POSITION] * 3, asked) == pytest.approx([-6.0, 1.0, 0.3])
-    assert mounting.drive_targets([Mode.VELOCITY, Mode.TORQUE, Mode.PASSIVE], asked).tolist() == [-9.0, 1.0, 0.0]
-    assert mounting.drive_targets([Mode.TORQUE] * 3, asked) == pytest.approx([-1 / 9, 1.0, 0.5])
+    assert mounting.to_drive_targets([Mode.POSITION] * 3, asked) == pytest.approx([-6.0, 1.0, 0.3])
+    assert mounting.to_drive_targets([Mode.VELOCITY, Mode.TORQUE, Mode.PASSIVE], asked).tolist() == [-9.0, 1.0, 0.0]
+    assert mounting.to_drive_targets([Mode.TORQUE] * 3, asked) == pytest.approx([-1 / 9, 1.0, 0.5])

@@ -12,7 +12,7 @@ from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, corrupted
 from snakesim_hal.model.fault_kinds import Injection, check_injection
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
-from tests.unit.hal.rig import command, description
+from snakesim_testing.hal.small_robots import command, description
 
 KEY = "sensor/joints"
 MESSAGES = [b"%05d" % i for i in range(400)]

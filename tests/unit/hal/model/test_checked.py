@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord, mounting_digest, why_unchecked
 from snakesim_hal.wire.messages import Description
-from tests.unit.hal.rig import description, robot_file
+from snakesim_testing.hal.small_robots import description, robot_file
 
 JOINTS = robot_file().joint_table
 CHECKED = StartCheckRecord(

@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, Table, decode, find_file, leaves, list_shipped, read_table
+from snakesim_testing.messages import raises_error
 
 
 class Part(FileStruct, frozen=True):
@@ -35,42 +36,36 @@ class Whole(FileStruct, frozen=True):
 GOOD = {"part": {"size_m": 1.0}}
 
 WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "missing": ({"part": {}}, ["`part.size_m` is missing", "a number > 0 and <= 2 in m"]),
-    "missing section": ({}, ["`part` is missing", "a section with size_m, many"]),
-    "type": ({"part": {"size_m": "big"}}, ["`part.size_m` = 'big'", "a number > 0 and <= 2 in m"]),
-    "section for number": ({"part": {"size_m": {"x": 1}}}, ["`part.size_m`", "a number"]),
-    "number for section": ({"part": 3}, ["`part` = 3", "a section with size_m"]),
-    "below": ({"part": {"size_m": 0.0}}, ["`part.size_m` = 0.0 m", "> 0"]),
-    "above": ({"part": {"size_m": 3}}, ["`part.size_m` = 3 m", "<= 2"]),
-    "nan": ({"part": {"size_m": float("nan")}}, ["`part.size_m` = nan m"]),
-    "infinite": ({"part": {"size_m": float("inf")}}, ["`part.size_m` = inf m"]),
-    "fraction": ({"part": {"size_m": 1, "many": 1.5}}, ["`part.many` = 1.5", "a whole number >= 1 and < 10"]),
-    "unknown": ({"part": {"size_m": 1, "mnay": 2}}, ["unknown field `part.mnay`", "did you mean `many`?"]),
-    "unknown, nothing like it": ({**GOOD, "zzz": 1}, ["unknown field `zzz`", "known fields: at_m, by_name, free"]),
-    "unknown section": ({**GOOD, "prat": {"x": 1}}, ["unknown field `prat`", "did you mean `part`?"]),
-    "no list": ({**GOOD, "parts": 1}, ["`parts` = 1", "a list, each a section with size_m"]),
-    "in a list": ({**GOOD, "parts": [{"size_m": 1}, {"size_m": 9}]}, ["`parts.1.size_m` = 9 m", "<= 2"]),
-    "unknown in a list": ({**GOOD, "parts": [{"size": 1}]}, ["unknown field `parts.0.size`", "`size_m`"]),
-    "in a tuple": ({**GOOD, "at_m": [9.0, 0.0]}, ["`at_m.0` = 9.0 m", ">= -5 and <= 5"]),
-    "tuple too short": ({**GOOD, "at_m": [1.0]}, ["`at_m` = [1.0]", "2 values"]),
-    "free key": (
-        {**GOOD, "by_name": {"a": {"size_m": 1}, "b": {"size_m": 1, "many": 99}}},
-        ["`by_name.b.many` = 99", ">= 1 and < 10"],
-    ),
-    "unknown under a free key": (
-        {**GOOD, "by_name": {"ok": {"size_m": 1}, "b-2": {"size_m": 1, "mnay": 1}}},
-        ["unknown field `by_name.b-2.mnay`", "did you mean `many`?"],
-    ),
-    "missing under a free key": ({**GOOD, "by_name": {"b": {}}}, ["`by_name.b.size_m` is missing"]),
-    "free key that is no section": ({**GOOD, "free": {"a": {}, "b": 3}}, ["`free.b` = 3"]),
-    "flag": ({**GOOD, "open": 1}, ["`open` = 1", "true or false"]),
-    "text": ({**GOOD, "word": 1}, ["`word` = 1", "a text"]),
+    "missing": {"part": {}},
+    "missing section": {},
+    "type": {"part": {"size_m": "big"}},
+    "section for number": {"part": {"size_m": {"x": 1}}},
+    "number for section": {"part": 3},
+    "below": {"part": {"size_m": 0.0}},
+    "above": {"part": {"size_m": 3}},
+    "nan": {"part": {"size_m": float("nan")}},
+    "infinite": {"part": {"size_m": float("inf")}},
+    "fraction": {"part": {"size_m": 1, "many": 1.5}},
+    "unknown": {"part": {"size_m": 1, "mnay": 2}},
+    "unknown, nothing like it": {**GOOD, "zzz": 1},
+    "unknown section": {**GOOD, "prat": {"x": 1}},
+    "no list": {**GOOD, "parts": 1},
+    "in a list": {**GOOD, "parts": [{"size_m": 1}, {"size_m": 9}]},
+    "unknown in a list": {**GOOD, "parts": [{"size": 1}]},
+    "in a tuple": {**GOOD, "at_m": [9.0, 0.0]},
+    "tuple too short": {**GOOD, "at_m": [1.0]},
+    "free key": {**GOOD, "by_name": {"a": {"size_m": 1}, "b": {"size_m": 1, "many": 99}}},
+    "unknown under a free key": {**GOOD, "by_name": {"ok": {"size_m": 1}, "b-2": {"size_m": 1, "mnay": 1}}},
+    "missing under a free key": {**GOOD, "by_name": {"b": {}}},
+    "free key that is no section": {**GOOD, "free": {"a": {}, "b": 3}},
+    "flag": {**GOOD, "open": 1},
+    "text": {**GOOD, "word": 1},
 }
 
 
 def test_a_section_of_a_larger_file_names_its_place_there() -> None:
     table = Table({"size_m": 5}, "my.toml", {"box.size_m": "--set box.size_m=5"})
-    with pytest.raises(ConfigError, match=r"^--set box\.size_m=5: `box\.size_m` = 5 m is not allowed"):
+    with raises_error(ConfigError, code="config/out-of-range", field="--set", value=5):
         decode(table, Part, "box")
 
 
@@ -78,17 +73,17 @@ def test_the_error_names_the_file_in_which_the_field_should_stand() -> None:
     table = Table({}, "outer.toml")
     table.put("parts", [], "outer.toml")
     table.put("part", {"many": 2, "typo": {"x": 1}}, "inner.toml")
-    with pytest.raises(ConfigError, match=r"^inner\.toml: unknown field `part\.typo`"):
+    with raises_error(ConfigError, code="config/unknown-key", field="inner.toml"):
         decode(table, Whole)
     del table.values["part"]["typo"]
-    with pytest.raises(ConfigError, match=r"^inner\.toml: field `part\.size_m` is missing"):
+    with raises_error(ConfigError, code="config/missing-key", field="inner.toml"):
         decode(table, Whole)
     table.put("part.size_m", 7, "--set part.size_m=7")
-    with pytest.raises(ConfigError, match=r"^--set part\.size_m=7: `part\.size_m` = 7 m"):
+    with raises_error(ConfigError, code="config/out-of-range", field="--set", value=7):
         decode(table, Whole)
     table.put("part.size_m", 1, "--set part.size_m=1")
     table.put("part.sise_m", 7, "--set part.sise_m=7")
-    with pytest.raises(ConfigError, match=r"^--set part\.sise_m=7: unknown field `part\.sise_m`"):
+    with raises_error(ConfigError, code="config/unknown-key", field="--set"):
         decode(table, Whole)
 
 
@@ -121,37 +116,28 @@ class Thing(FileStruct, frozen=True):
 
 
 UNION: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "unknown kind": ({"shape": {"kind": "spiral"}}, ["`shape.kind` = 'spiral'", "one of 'round', 'square'"]),
-    "unknown kind in a list": (
-        {"shapes": [{"kind": "round", "radius_m": 1}, {"kind": "x"}]},
-        ["`shapes.1.kind` = 'x'", "one of 'round', 'square'"],
-    ),
-    "kind of another type": ({"shape": {"kind": 3}}, ["`shape.kind` = 3", "one of 'round', 'square'"]),
-    "no kind": ({"shape": {"radius_m": 1}}, ["`shape.kind` is missing", "one of 'round', 'square'"]),
-    "no section": ({"shape": 3}, ["`shape` = 3", "kind = 'round', radius_m", "kind = 'square', edge_m, color"]),
-    "field of the other kind": (
-        {"shape": {"kind": "square", "edge_m": 1, "radius_m": 1}},
-        ["unknown field `shape.radius_m`", "known fields: color, edge_m, kind"],
-    ),
-    "field missing": ({"shape": {"kind": "square"}}, ["`shape.edge_m` is missing", "a number"]),
-    "wrong in the second kind": (
-        {"shape": {"kind": "square", "edge_m": 1, "color": "green"}},
-        ["`shape.color` = 'green'", "one of 'blue', 'red'"],
-    ),
-    "enumeration": ({"grip": "soft"}, ["`grip` = 'soft'", "one of 'firm', 'loose'"]),
+    "unknown kind": {"shape": {"kind": "spiral"}},
+    "unknown kind in a list": {"shapes": [{"kind": "round", "radius_m": 1}, {"kind": "x"}]},
+    "kind of another type": {"shape": {"kind": 3}},
+    "no kind": {"shape": {"radius_m": 1}},
+    "no section": {"shape": 3},
+    "field of the other kind": {"shape": {"kind": "square", "edge_m": 1, "radius_m": 1}},
+    "field missing": {"shape": {"kind": "square"}},
+    "wrong in the second kind": {"shape": {"kind": "square", "edge_m": 1, "color": "green"}},
+    "enumeration": {"grip": "soft"},
 }
 
 
 @pytest.mark.parametrize("wrong", [*WRONG, *UNION])
 def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
-    values, words = WRONG.get(wrong) or UNION[wrong]
-    with pytest.raises(ConfigError) as caught:
+    values = WRONG[wrong] if wrong in WRONG else UNION[wrong]
+    with raises_error(
+        ConfigError,
+        code=("config/invalid-value", "config/missing-key", "config/out-of-range", "config/unknown-key"),
+        field="my.toml",
+    ) as caught:
         decode(Table(values, "my.toml"), Whole if wrong in WRONG else Thing)
-    said = str(caught.value)
-    assert said.startswith("my.toml: ")
-    for word in words:
-        assert word in said, said
-    assert "\n" not in said and caught.value.__cause__ is None and caught.value.__suppress_context__
+    assert "\n" not in str(caught.value) and caught.value.__cause__ is None and caught.value.__suppress_context__
 
 
 @pytest.mark.parametrize(
@@ -192,27 +178,26 @@ def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words"),
+    ("name", "content"),
     [
-        ("a.toml", b"robot = \n", ["not valid TOML", "line 1"]),
-        ("a.toml", b"a = 1\na = 2\n", ["not valid TOML"]),
-        ("a.json", b"", ["not valid JSON"]),
-        ("a.json", b"[1, 2]", ["holds a list"]),
-        ("a.json", b"{", ["not valid JSON"]),
+        ("a.toml", b"robot = \n"),
+        ("a.toml", b"a = 1\na = 2\n"),
+        ("a.json", b""),
+        ("a.json", b"[1, 2]"),
+        ("a.json", b"{"),
     ],
 )
-def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: bytes, words: list[str]) -> None:
+def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code="file/invalid-syntax") as caught:
         read_table(path)
     assert str(caught.value).startswith(f"{path}: ")
-    assert all(word in str(caught.value) for word in words)
 
 
 def test_a_file_that_is_not_there_is_named_and_so_are_those_that_are(tmp_path: Path) -> None:
     (tmp_path / "elsewhere.toml").touch()
-    with pytest.raises(ConfigError, match=r"a\.toml: no such file; in .* are elsewhere\.toml"):
+    with raises_error(ConfigError, code="file/not-found", field="a.toml"):
         read_table(tmp_path / "a.toml")
 
 
@@ -221,9 +206,8 @@ def test_find_takes_names_and_paths(tmp_path: Path) -> None:
     assert find_file("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
     assert find_file("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
     assert find_file("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code="config/unknown-name", field="planar31", stored=False) as caught:
         find_file("planar31", "robots")
-    assert "no robot called 'planar31'" in str(caught.value)
     assert all(name in str(caught.value) for name in list_shipped("robots"))
 
 
@@ -250,18 +234,11 @@ def test_putting_into_lists() -> None:
     table = Table({"at_m": [0.0, 0.0], "parts": [{"size_m": 1.0}], "word": "x"}, "my.toml")
     table.put("at_m.1", 2.0, "--set at_m.1=2")
     assert table.values["at_m"] == [0.0, 2.0]
-    for dotted, words in {
-        "parts.1.size_m": "`parts.1`: the list has entries 0 to 0",
-        "parts.-1.size_m": "`parts.-1`: the list has entries 0 to 0",
-        "parts.first.size_m": "`parts.first`: the list has entries 0 to 0; name one by its number",
-        "at_m.2": "`at_m.2`: the list has entries 0 to 1",
-        "word.length": "`word` is the value 'x', not a section",
-    }.items():
-        with pytest.raises(ConfigError) as caught:
+    for dotted in ("parts.1.size_m", "parts.-1.size_m", "parts.first.size_m", "at_m.2", "word.length"):
+        with raises_error(ConfigError, code="config/unknown-key", field=f"--set {dotted}=1"):
             table.put(dotted, 1, f"--set {dotted}=1")
-        assert str(caught.value).startswith(f"--set {dotted}=1: ") and words in str(caught.value)
     table.values["parts"] = []
-    with pytest.raises(ConfigError, match="the list is empty"):
+    with raises_error(ConfigError, code="config/unknown-key"):
         table.put("parts.0.size_m", 1, "--set")
 
 

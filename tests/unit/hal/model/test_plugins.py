@@ -1,9 +1,6 @@
-"""Plugins by name and by file, their settings, and the rules of who may import whom."""
+"""Plugins by name and by file, and their settings."""
 
 import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,36 +19,33 @@ from snakesim_hal.model.plugins import (
     offer_plugin,
     plugin_settings,
 )
+from snakesim_testing.messages import raises_error
 
-REPOSITORY = Path(__file__).parents[4]
 WAVE = """\
 import msgspec
 
 class Wave:
     class Settings(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         gain: float = 1.0
-
-    def __init__(self, robot, settings):
-        self.settings = settings
 """
 
 
 @pytest.mark.parametrize("group", [BACKENDS, CONTROLLERS, SERVICES])
-def test_everything_installed_loads_and_states_its_settings(group: str) -> None:
+def test_everything_installed_loads_and_backends_declare_their_settings(group: str) -> None:
     assert list_installed(group) == sorted(set(list_installed(group))) != []
     for name in list_installed(group):
         plugin: Any = find_plugin(group, name)
         assert callable(plugin)
-        if group != SERVICES:
-            assert issubclass(getattr(plugin, "Settings"), msgspec.Struct), name  # noqa: B009
+        if group == BACKENDS:
+            assert issubclass(vars(plugin)["Settings"], msgspec.Struct), name
 
 
 def test_an_unknown_name_says_what_is_installed_and_how_one_is_added() -> None:
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(
+        ConfigError, code="plugin/not-found", field=("wiggle", "snakesim.controllers"), stored=False
+    ) as caught:
         find_plugin(CONTROLLERS, "wiggle")
-    said = str(caught.value)
-    assert said.startswith("no controller called 'wiggle' is installed; installed are ")
-    assert all(name in said for name in list_installed(CONTROLLERS)) and "'snakesim.controllers'" in said
+    assert all(name in str(caught.value) for name in list_installed(CONTROLLERS))
 
 
 def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
@@ -78,9 +72,8 @@ NAMELESS = {"no class": "", "empty class": ":", "unknown class": ":Wove"}
 @pytest.mark.parametrize("find", [find_plugin, find_installed])
 def test_a_file_without_its_class_lists_the_classes(find: Any, nameless: str, tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code="plugin/not-found", field=f"{tmp_path}/wave.py:Wave"):
         find(CONTROLLERS, f"{tmp_path}/wave.py{NAMELESS[nameless]}")
-    assert f"as in {tmp_path}/wave.py:Wave; the classes in it are Wave, Other" in str(caught.value)
     assert (tmp_path / "mark").exists() == (find is find_plugin and nameless == "unknown class")
 
 
@@ -93,24 +86,23 @@ def test_looking_at_a_file_runs_none_of_it(tmp_path: Path) -> None:
 
 
 BROKEN = {
-    "no such class": (WAVE, "Wove", "the file has no 'Wove', as in .*wave.py:Wave; the classes in it are Wave$"),
-    "not Python": ("class Wave(:\n", "Wave", "SyntaxError"),
-    "import that fails": ("import no_such_module_anywhere\n", "Wave", "no_such_module_anywhere"),
-    "name that is not there": ("x = undefined_thing\n", "Wave", "undefined_thing"),
-    "exception of its own": ("x = 1 / 0\n", "Wave", "ZeroDivisionError: division by zero"),
-    "exit": ("raise SystemExit(0)\n", "Wave", "SystemExit"),
-    "deep": ("x = " + "(" * 100_000, "Wave", "too many nested parentheses"),
-    "NUL": ("x = 1\0", "Wave", "null bytes"),
+    "no such class": (WAVE, "Wove"),
+    "not Python": ("class Wave(:\n", "Wave"),
+    "import that fails": ("import no_such_module_anywhere\n", "Wave"),
+    "name that is not there": ("x = undefined_thing\n", "Wave"),
+    "exception of its own": ("x = 1 / 0\n", "Wave"),
+    "exit": ("raise SystemExit(0)\n", "Wave"),
+    "deep": ("x = " + "(" * 100_000, "Wave"),
+    "NUL": ("x = 1\0", "Wave"),
 }
 
 
 @pytest.mark.parametrize("broken", BROKEN)
 def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) -> None:
-    text, name, words = BROKEN[broken]
+    text, name = BROKEN[broken]
     (tmp_path / "wave.py").write_text(text)
-    with pytest.raises(ConfigError, match=words) as caught:
+    with raises_error(ConfigError, code=("plugin/not-found", "plugin/not-loadable")):
         find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:{name}")
-    assert "controller '" in str(caught.value)
 
 
 def test_a_program_may_offer_what_a_name_stands_for() -> None:
@@ -118,7 +110,7 @@ def test_a_program_may_offer_what_a_name_stands_for() -> None:
     with offer_plugin(CONTROLLERS, "hold", Plugin), offer_plugin(CONTROLLERS, "mine", Plugin):
         assert find_plugin(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "mine") is Plugin
     assert find_plugin(CONTROLLERS, "hold") is installed_one
-    with pytest.raises(ConfigError, match="no controller called 'mine'"):
+    with raises_error(ConfigError, code="plugin/not-found", field="mine"):
         find_plugin(CONTROLLERS, "mine")
 
 
@@ -129,71 +121,17 @@ class Plugin:
 
 def test_settings_are_checked_by_the_plugins_own_struct_and_name_file_or_flag() -> None:
     assert plugin_settings(Plugin, {}, "a.toml", "controllers.p").gain == 1.0
-    with pytest.raises(ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"):
+    with raises_error(ConfigError, code="config/unknown-key", field="a.toml"):
         plugin_settings(Plugin, {"gian": 1}, "a.toml", "controllers.p")
     origin = {"controllers.p.gain": "--set control.gain=x"}
-    with pytest.raises(ConfigError, match=r"^--set control\.gain=x: `controllers\.p\.gain` = 'x'"):
+    with raises_error(ConfigError, code="config/invalid-value", field="--set"):
         plugin_settings(Plugin, {"gain": "x"}, "a.toml", "controllers.p", origin)
 
 
 def test_a_plugin_without_settings_is_told_to_state_them() -> None:
     for bad in (object(), type("Bare", (), {}), type("Odd", (), {"Settings": dict})):
-        with pytest.raises(ConfigError, match="has no `Settings` Struct"):
+        with raises_error(ConfigError, code="plugin/not-loadable", field="Settings"):
             plugin_settings(bad, {}, "a.toml", "x")
-
-
-# --- who may import whom ---------------------------------------------------------------------------------------
-
-LINTER = Path(sys.executable).parent / "lint-imports"
-NEIGHBORS = "Packages: each imports only packages below it"
-HAL = "Subpackages of the HAL"
-OPERATOR = "Subpackages of the operator package"
-CAN = "Subpackages of the CAN backend"
-PURE = "What keeps a robot safe is pure"
-WRONG = [  # (folder, import, contract that it breaks)
-    ("snakesim_gnc", "mujoco", "Only the simulator runs MuJoCo"),
-    ("snakesim_gnc", "snakesim_sim_backend.model", NEIGHBORS),
-    ("snakesim_hal/host", "snakesim_gnc.guidance.service", NEIGHBORS),
-    ("snakesim_operator/run", "zenoh", "Only the HAL's network room talks Zenoh"),
-    ("snakesim_hal/host", "zenoh", "Only the HAL's network room talks Zenoh"),
-    ("snakesim_gnc", "can", "Only the CAN backend touches CAN"),
-    ("snakesim_hal/safety", "time", PURE),
-    ("snakesim_hal/safety", "threading", PURE),
-    ("snakesim_hal/wire", "snakesim_hal.model.robot", HAL),
-    ("snakesim_hal/model", "snakesim_hal.backend", HAL),
-    ("snakesim_hal/safety", "snakesim_hal.network.session", HAL),
-    ("snakesim_hal/network", "snakesim_hal.faults.injector", HAL),
-    ("snakesim_hal/faults", "snakesim_hal.host.host", HAL),
-    ("snakesim_hal/host", "snakesim_hal.programs.service_program", HAL),
-    ("snakesim_hal/faults", "snakesim_hal.service", HAL),
-    ("snakesim_operator/results", "snakesim_operator.robot_commands.status", OPERATOR),
-    ("snakesim_operator/robot_commands", "snakesim_operator.run.supervisor", OPERATOR),
-    ("snakesim_operator/run", "snakesim_operator.cli", OPERATOR),
-    ("snakesim_can_backend/protocol", "snakesim_can_backend.settings", CAN),
-    ("snakesim_can_backend/bus", "snakesim_can_backend.emulator.chain", CAN),
-    ("snakesim_can_backend/emulator", "snakesim_can_backend.driver.backend", CAN),
-    ("snakesim_can_backend/driver", "snakesim_can_backend.can_command", CAN),
-]
-
-
-@pytest.mark.skipif(not LINTER.is_file(), reason="import-linter is not installed in this environment")
-def test_a_wrong_import_is_found_at_every_level(tmp_path: Path) -> None:
-    shutil.copy(REPOSITORY / "pyproject.toml", tmp_path)
-    for package in REPOSITORY.glob("snakesim*/"):
-        shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
-    for folder, _, _ in WRONG:
-        wrong = sorted({module for place, module, _ in WRONG if place == folder})
-        lines = "".join(f"import {module}\n" for module in wrong)
-        (tmp_path / folder / "planted.py").write_text(f'"""Breaks rules."""\n\n{lines}')
-    (tmp_path / "snakesim_hal" / "in_no_room.py").write_text('"""Where does this belong?"""\n')
-    command = [str(LINTER), "--config", "pyproject.toml", "--no-cache"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False).stdout
-    for folder, module, contract in WRONG:
-        broken = next(row for row in said.splitlines() if row.startswith(contract))
-        assert broken.endswith("BROKEN"), broken
-        planted = f"{folder.replace('/', '.')}.planted"
-        assert re.search(rf"{re.escape(planted)} -> {re.escape(module)}\b|{re.escape(planted)}.*{module}", said), said
-    assert "in_no_room" in said
 
 
 def test_two_packages_with_a_plugin_of_one_name_are_refused_by_name(
@@ -205,7 +143,7 @@ def test_two_packages_with_a_plugin_of_one_name_are_refused_by_name(
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
         (metadata / "entry_points.txt").write_text(f"[snakesim.controllers]\nwave = {package}:Wave\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ConfigError, match="controller 'wave' is in several installed packages: ") as raised:
+    with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as raised:
         find_plugin(CONTROLLERS, "wave")
     assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(re.split(": | and |; ", str(raised.value)))
     assert find_plugin(CONTROLLERS, "hold").__name__ == "Hold"

@@ -13,7 +13,8 @@ from snakesim_hal.model.robot import RobotFile, describe_robot, layout_hash
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Description, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, description, robot_file
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, ROBOT, description, robot_file
+from snakesim_testing.messages import raises_error
 
 SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 
@@ -135,10 +136,10 @@ def test_a_robot_may_extend_another_and_say_only_what_differs(tmp_path: Path) ->
     further = decode(read_part(str(more), "robots"), RobotFile)
     assert (further.name, further.limits.torque_nm, further.chain) == ("more", 3.0, plain.chain)
     file.write_text('extends = "./more.toml"')
-    with pytest.raises(ConfigError, match="`extends` leads back to this file"):
+    with raises_error(ConfigError, code="config/conflict", field="extends"):
         read_part(str(more), "robots")
     file.write_text("extends = 13")
-    with pytest.raises(ConfigError, match="`extends` = 13 must be the name or the path of another file"):
+    with raises_error(ConfigError, code="config/invalid-value", field="extends", value=13):
         read_part(str(file), "robots")
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, next_on_route, sine_points, yaw_segments_m
+from snakesim_testing.messages import raises_error
 
 
 @st.composite
@@ -113,7 +114,7 @@ def test_inflections_are_found_across_a_straight_piece_and_not_where_there_is_no
 
 @pytest.mark.parametrize("points", [[(0, 0)], [(0, 0), (0, 0)], [(0, 0), (1, 0), (1, 0), (2, 0)]])
 def test_degenerate_routes_are_refused(points: list[tuple[float, float]]) -> None:
-    with pytest.raises(ValueError, match="at least two points"):
+    with raises_error(ValueError):
         Route(points)
 
 

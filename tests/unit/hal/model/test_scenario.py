@@ -19,7 +19,7 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.scenario import (
     Loaded,
     Override,
-    Service,
+    ServiceSchedule,
     WaypointGoal,
     capsules_at_start,
     config_hash,
@@ -32,7 +32,8 @@ from snakesim_hal.model.scenario import (
     write_config,
 )
 from snakesim_hal.model.scene import make_route
-from tests.unit.hal.rig import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
+from snakesim_testing.hal.small_robots import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
+from snakesim_testing.messages import raises_error
 
 
 def with_flags(path: str, *flags: str) -> Loaded:
@@ -45,7 +46,7 @@ def with_flags(path: str, *flags: str) -> Loaded:
 def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     config = load(write_files(tmp_path)).config
     assert (config.name, config.robot.name, config.scene.name) == ("crawl", "worm", "bend")
-    assert config.services == {"control": Service(), "guidance": Service(decimation=2)}
+    assert config.services == {"control": ServiceSchedule(), "guidance": ServiceSchedule(decimation=2)}
     assert config.robot.sensors.pose is not None and config.robot.sensors.contacts is None
     assert (config.clock_mode, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
     assert config.period_ns == 10_000_000
@@ -56,7 +57,7 @@ def test_a_flag_makes_another_field_or_another_goal() -> None:
     assert place_obstacles(first.config) != place_obstacles(other.config)
     points = with_flags("clutter", 'mission.goal={kind="waypoints", points_m=[[3, 0], [5, 0.5]]}')
     assert points.config.mission.goal == WaypointGoal(points_m=[(3.0, 0.0), (5.0, 0.5)])
-    with pytest.raises(ConfigError, match=r"mission\.map"):
+    with raises_error(ConfigError, code="config/invalid-value"):
         with_flags("clutter", "mission.map=guessed")
 
 
@@ -67,7 +68,7 @@ def test_a_survey_is_off_by_its_error_and_by_the_same_for_everybody() -> None:
     errors_m = np.array([one.position_w for one in survey_obstacles(off)]) - truth
     assert 0.003 < errors_m[:, :2].std() < 0.007 and not errors_m[:, 2].any()
     assert survey_obstacles(off) == survey_obstacles(off)
-    with pytest.raises(ConfigError, match="map_error_m"):
+    with raises_error(ConfigError, code="config/invalid-value"):
         with_flags("clutter", "mission.map_error_m=0.005")
 
 
@@ -121,7 +122,7 @@ def test_an_external_service_is_waited_for_and_not_started() -> None:
     assert list(Participants(external.services)) == list(own.services)
     for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
         check_planned(with_flags("triplet", f'faults=["{text}"]').config)
-        with pytest.raises(ConfigError, match=r"`faults\[0\]`: .*control"):
+        with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
             check_planned(with_flags("triplet", f'faults=["{text}"]', "services.control.external=true").config)
 
 
@@ -135,7 +136,7 @@ def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(r
 
 @given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
 def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, lag: int) -> None:
-    service = Service(decimation=every, latency_ticks=lag)
+    service = ServiceSchedule(decimation=every, latency_ticks=lag)
     counting = service.used_output_tick(tick)
     assert counting % every == 0 and counting >= 0
     assert counting == 0 or counting <= tick - lag
@@ -167,7 +168,7 @@ def test_set_reads_values_as_toml_and_else_as_text(text: str, key: str, value: A
 
 @pytest.mark.parametrize("text", ["", "seed", "=3", " = 3"])
 def test_set_without_key_or_value_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"give section\.key=value"):
+    with raises_error(ConfigError, code="command/invalid-option", field="section.key"):
         parse_set(text)
 
 
@@ -207,7 +208,7 @@ def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_fla
     for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):
         config = with_flags(path, *flags).config
         assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
-        assert config.control_settings == {"gain": 3} and config.control_section == "controllers.Wave"
+        assert config.controller_parameters == {"gain": 3} and config.control_section == "controllers.Wave"
     assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
     assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {"emulator": {"step": 1}}
 
@@ -215,66 +216,59 @@ def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_fla
 # --- what is wrong: one error, in words ------------------------------------------------------------------------
 
 FILES = {
-    "scenario type": ("crawl.toml", "rate_hz = 100", 'rate_hz = "100"', ["`rate_hz` = '100'", "a number"]),
-    "scenario missing": ("crawl.toml", 'controller = "hold"\n', "", ["`controller` is missing", "a text"]),
-    "not TOML": ("crawl.toml", "rate_hz = 100", "rate_hz = ", ["not valid TOML", "line"]),
-    "robot range": ("worm.toml", "mass_kg = 0.2", "mass_kg = 200.0", ["`robot.module.mass_kg` = 200.0 kg", "<= 100"]),
-    "robot missing": ("worm.toml", "torque_nm = 4.0\n", "", ["`robot.limits.torque_nm` is missing", "in N·m"]),
-    "robot empty": ("worm.toml", ROBOT_TOML, "", ["`robot.name` is missing"]),
-    "scene list": (
-        "bend.toml",
-        "radius_m = 0.05\n[[",
-        "radius_m = 0\n[[",
-        ["`scene.cylinder.0.radius_m` = 0 m", "> 0"],
-    ),
+    "scenario type": ("crawl.toml", "rate_hz = 100", 'rate_hz = "100"'),
+    "scenario missing": ("crawl.toml", 'controller = "hold"\n', ""),
+    "not TOML": ("crawl.toml", "rate_hz = 100", "rate_hz = "),
+    "robot range": ("worm.toml", "mass_kg = 0.2", "mass_kg = 200.0"),
+    "robot missing": ("worm.toml", "torque_nm = 4.0\n", ""),
+    "robot empty": ("worm.toml", ROBOT_TOML, ""),
+    "scene list": ("bend.toml", "radius_m = 0.05\n[[", "radius_m = 0\n[["),
 }
 
 
 @pytest.mark.parametrize("wrong", FILES)
 def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
-    name, old, new, words = FILES[wrong]
+    name, old, new = FILES[wrong]
     path = write_files(tmp_path)
     text = (tmp_path / name).read_text()
     assert old in text
     (tmp_path / name).write_text(text.replace(old, new, 1))
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(
+        ConfigError, code=("config/invalid-value", "config/missing-key", "config/out-of-range", "file/invalid-syntax")
+    ) as caught:
         load(path)
     said = str(caught.value)
     if wrong != "robot empty":  # an empty file has no neighbor that could tell whose the field is
         assert said.startswith(f"{tmp_path / name}: "), said
-    assert all(word in said for word in words), said
     assert "\n" not in said
 
 
 def test_absent_files_are_named(tmp_path: Path) -> None:
     path = write_files(tmp_path)
-    with pytest.raises(ConfigError, match=r"no scenario called 'nowhere'; shipped are .*triplet"):
+    with raises_error(ConfigError, code="config/unknown-name", field="nowhere"):
         load("nowhere")
-    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
+    with raises_error(ConfigError, code="file/not-found", field="none.toml"):
         load(str(tmp_path / "none.toml"))
     (tmp_path / "worm.toml").unlink()
-    with pytest.raises(ConfigError, match=r"worm\.toml: no such file"):
+    with raises_error(ConfigError, code="file/not-found", field="worm.toml"):
         load(path)
-    with pytest.raises(ConfigError, match="no robot called 'wurm'"):
+    with raises_error(ConfigError, code="config/unknown-name", field="wurm"):
         with_flags(path, "robot=wurm")
 
 
 SCENES = {
-    "overlap": ("position_m = [1.0, 1.0]", "position_m = [0.2, 0.0]", ["'cylinder_0' overlaps link_", "mm", "[start]"]),
-    "no route": ('[route]\nkind = "sine"\namplitude_m = 0.05\nwavelength_m = 0.8\nlength_m = 2.0\n', "",
-                 ["`start.on_route` is true", "'bend' has no route", "start.on_route = false"]),
-    "too sharp": ("wavelength_m = 0.8", "wavelength_m = 0.1", ["joint_", "rad", "-1.5 to 1.5 rad", "smoother route"]),
+    "overlap": ("position_m = [1.0, 1.0]", "position_m = [0.2, 0.0]"),
+    "no route": ('[route]\nkind = "sine"\namplitude_m = 0.05\nwavelength_m = 0.8\nlength_m = 2.0\n', ""),
+    "too sharp": ("wavelength_m = 0.8", "wavelength_m = 0.1"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong", SCENES)
 def test_scenes_that_do_not_fit_the_robot_are_refused(wrong: str, tmp_path: Path) -> None:
-    old, new, words = SCENES[wrong]
+    old, new = SCENES[wrong]
     assert old in SCENE_TOML
-    with pytest.raises(ConfigError) as caught:
+    with raises_error(ConfigError, code=("config/out-of-range", "scene/no-route", "scene/overlap")):
         load(write_files(tmp_path, scene=SCENE_TOML.replace(old, new)))
-    said = str(caught.value)
-    assert ("'crawl'" in said or "'bend'" in said) and all(word in said for word in words), said
 
 
 # --- the start -------------------------------------------------------------------------------------------------

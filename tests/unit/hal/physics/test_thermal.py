@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.physics.thermal import HeatLimits, Thermal
-from tests.unit.hal.rig import robot_file
+from snakesim_testing.hal.small_robots import robot_file
 
 LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.safety.lifecycle import find_far_targets
-from tests.unit.hal.rig import command, description
+from snakesim_testing.hal.small_robots import command, description
 
 ROBOT = description()
 MAX = ROBOT.max_step_rad

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from snakesim_hal.safety.authority import COMMANDS_KEPT
-from snakesim_hal.wire.messages import LeaseRequest, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS
-from tests.unit.hal.safety.authority_rig import CLEAR, ESTOP, JOINTS, Rig, armed, modes
+from snakesim_hal.wire.messages import Mode
+from snakesim_testing.hal.authority_rig import CLEAR, ESTOP, JOINTS, armed, modes
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
 
 # --- lockstep: what counts is told by ticks --------------------------------------------------------------------
 
@@ -72,29 +72,6 @@ def test_refused_commands_neither_keep_the_lease_nor_reach_a_motor(wrong: dict[s
     assert sum(rig.authority.rejected_counts.values()) == 5
 
 
-def test_asking_to_renew_is_not_commanding() -> None:
-    """A process whose controller hangs but whose lease thread lives must not keep the last setpoints going."""
-    rig = armed()
-    rig.send(0.1)
-    for _ in range(10):
-        renew = LeaseRequest(action="renew", holder="control", epoch=rig.authority.lease.epoch)
-        rig.authority.on_lease(renew, rig.now_ns)
-        rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.faults[0].what == "lease_expired"
-
-
-def test_disarmed_the_lease_can_be_kept_by_asking_and_simply_runs_out() -> None:
-    rig = Rig()
-    rig.observe()
-    rig.acquire()
-    for _ in range(20):
-        answer = rig.authority.on_lease(LeaseRequest(action="renew", holder="control", epoch=1), rig.now_ns)
-        assert answer.ok and answer.epoch == 1
-        rig.pass_tick(3)
-    rig.pass_tick(3)
-    assert rig.authority.lease.holder is None and rig.authority.state == "disarmed" and not rig.authority.faults
-
-
 def test_preemption_stops_the_robot_and_voids_what_the_old_holder_sends() -> None:
     rig = armed()
     rig.tick_with(0.1)
@@ -106,14 +83,6 @@ def test_preemption_stops_the_robot_and_voids_what_the_old_holder_sends() -> Non
     assert rig.arm().reason == "no commands from teleop yet"
     rig.send(0.1, sequence=1)  # a new holder counts from its own beginning
     assert rig.arm().ok
-
-
-def test_a_released_lease_stops_the_robot_without_a_fault() -> None:
-    rig = armed()
-    rig.send(0.1)
-    rig.authority.on_lease(LeaseRequest(action="release", holder="control", epoch=1), rig.now_ns)
-    assert rig.authority.state == "disarmed" and not rig.authority.faults
-    assert modes(rig.pass_tick()) == {Mode.PASSIVE}
 
 
 def test_a_holder_that_is_gone_frees_the_lease_but_explains_nothing_away() -> None:

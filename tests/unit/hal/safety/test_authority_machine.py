@@ -19,8 +19,7 @@ from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, power, state
-from tests.unit.hal.safety.authority_model import (
+from snakesim_testing.hal.authority_model import (
     ALL,
     ANGLE,
     DERATE_FROM,
@@ -37,6 +36,7 @@ from tests.unit.hal.safety.authority_model import (
     Model,
     within,
 )
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, command, description, power, state
 
 SEQUENCES = int(os.environ.get("SNAKESIM_SEQUENCES", "200"))
 PER_TEST = 200
@@ -333,15 +333,15 @@ class Everything(Model):
         self.check(answer, ready)
         assert answer.refusal == next((word for word, right in reported.items() if not right), None)
 
-    @rule(action=st.sampled_from(["disarm", "finish", "clear"]))
+    @rule(action=st.sampled_from(["disarm", "finish", "reset"]))
     def ask_for_less(self, action: Any) -> None:
         ok = action == "finish" or self.state in (("armed", "disarmed") if action == "disarm" else ("fault", "estop"))
-        if action == "clear" and self.state == "disarmed":
+        if action == "reset" and self.state == "disarmed":
             ok = True
         answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self.now_ns)
         if ok and (action != "finish" or self.state == "armed"):
             self.leave_for("disarmed")
-        if ok and action == "clear":
+        if ok and action == "reset":
             self.faults = 0
             if self.aside:
                 self.aside, self.doubt = set(), None
@@ -349,7 +349,7 @@ class Everything(Model):
 
     @rule(who=st.text(min_size=1, max_size=64))
     def estop(self, who: str) -> None:
-        answer = self.authority.on_estop(EstopRequest(who=who), self.tick)
+        answer = self.authority.on_estop(EstopRequest(requester=who), self.tick)
         self.leave_for("estop")
         self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
         self.check(answer, True)
@@ -382,7 +382,7 @@ class Everything(Model):
     def set_up_and_arm(self, angle: float) -> None:
         self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, LONG_NS)
         if self.state in ("fault", "estop"):
-            self.ask_for_less("clear")
+            self.ask_for_less("reset")
         if not self.live:
             self.ask_for_the_lease("control", "acquire", 100, 0)
         self.end_a_tick(0)

@@ -8,8 +8,8 @@ import pytest
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD, REPORT_TIMEOUT_NS, Derating
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
-from tests.unit.hal.rig import description, power
-from tests.unit.hal.safety.gate_rig import JOINTS
+from snakesim_testing.hal.limiter_rig import JOINTS
+from snakesim_testing.hal.small_robots import description, power
 
 MS = 1_000_000
 S = 1000 * MS

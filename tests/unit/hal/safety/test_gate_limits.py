@@ -19,8 +19,7 @@ from snakesim_hal.safety.limiter import (
     velocity_bounds_at_ends,
 )
 from snakesim_hal.wire.messages import JointCommand, Mode
-from tests.unit.hal.rig import command, description
-from tests.unit.hal.safety.gate_rig import (
+from snakesim_testing.hal.limiter_rig import (
     ANGLE_STEP,
     COOL,
     JOINTS,
@@ -36,6 +35,7 @@ from tests.unit.hal.safety.gate_rig import (
     limited,
     words,
 )
+from snakesim_testing.hal.small_robots import command, description
 
 
 def ends(mode: Mode, measured: Measured, i: int) -> tuple[float, float]:

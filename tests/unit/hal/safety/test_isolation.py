@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire.messages import Fault, Mode
-from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
+from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
 
@@ -130,13 +130,13 @@ def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
     rig = lame()
     answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)  # not while it moves
     assert answer.refusal == "wrong_state"
-    assert answer.reason == "nothing to clear in state armed; disarm first, then a clear ends the isolation of joint_2"
+    assert answer.reason == "nothing to reset in state armed; disarm first, then a reset ends the isolation of joint_2"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
     assert rig.authority.isolated_joints == [] and rig.authority.faults == []
     rig.send(0.1)
-    assert "no joint state since the clear" in rig.arm().reason
+    assert "no joint state since the reset" in rig.arm().reason
     rig.observe(0.1)
     rig.send(0.1)
     assert rig.arm().ok
@@ -186,7 +186,7 @@ def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid", "power_unknown"]
 
 
-@pytest.mark.parametrize("kept", ["faults_since_clear", "faults_since_start"])
+@pytest.mark.parametrize("kept", ["faults_since_reset", "faults_since_start"])
 @pytest.mark.parametrize("before", [0, 3, 20, 50])
 def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None:
     rig = armed(safety__max_isolated_joints=1)

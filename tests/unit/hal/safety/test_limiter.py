@@ -11,8 +11,8 @@ from snakesim_hal.safety.lease import Lease
 from snakesim_hal.safety.limiter import Refusal, find_refusal, make_safe_setpoints
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
-from tests.unit.hal.rig import LEASE_NS, command, description
-from tests.unit.hal.safety.gate_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
+from snakesim_testing.hal.limiter_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
+from snakesim_testing.hal.small_robots import LEASE_NS, command, description
 
 
 def judge(given: JointCommand, **changes: Any) -> Refusal | None:

@@ -13,8 +13,8 @@ from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask
 from snakesim_hal.safety.plausibility import PlausibilityCheck, replace_unreadable
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointState, Mode
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
-from tests.unit.hal.safety.gate_rig import JOINTS, LIMITS, ROBOT
+from snakesim_testing.hal.limiter_rig import JOINTS, LIMITS, ROBOT
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, description, state
 
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
@@ -373,6 +373,7 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied 
         yield seen, targets(target) if rng.random() < 0.9 else None
 
 
+@pytest.mark.slow
 def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
     rng = random.Random(5)
     for _ in range(300):

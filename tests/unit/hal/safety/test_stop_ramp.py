@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import Mode
-from tests.unit.hal.rig import description
-from tests.unit.hal.safety.gate_rig import ANGLE_STEP, JOINTS, TINY, before, every
+from snakesim_testing.hal.limiter_rig import ANGLE_STEP, JOINTS, TINY, before, every
+from snakesim_testing.hal.small_robots import description
 
 ROBOT = description(motor__damping_nm_s_per_rad=2.0)
 LIMITS = JointLimits.from_description(ROBOT)

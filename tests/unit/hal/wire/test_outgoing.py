@@ -15,7 +15,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, Message, Trajectory
 from snakesim_hal.wire.outgoing import encode_checked
-from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
+from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 STREAMED = {row.message: row.key for row in keys.SPACE if row.kind == "stream" and row.message and "*" not in row.key}
 each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: message.__name__)

@@ -4,7 +4,8 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.commissioning.jog import KEY_HOLD_S, MAX_LEAD_RAD, JogRequest, JogTarget
-from tests.unit.hal.rig import description
+from snakesim_testing.hal.small_robots import description
+from snakesim_testing.messages import raises_error
 
 PERIOD_S = 0.01
 JOINT = description().joints[0]
@@ -41,5 +42,5 @@ def test_it_stays_within_travel_limits_and_near_a_joint_that_is_blocked() -> Non
 
 
 def test_too_fast_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"--speed 2: give more than 0, and at most 0.5 rad/s"):
+    with raises_error(ConfigError, code="command/invalid-option", field="--speed"):
         JogRequest(joint="joint_1", speed_rad_s=2.0)

@@ -97,7 +97,7 @@ def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_w
     lines = report_lines(rows)
     assert "0 of 3 joints are as the robot file says; 1 wrong; 2 unknown" in lines[JOINTS]
     assert lines[JOINTS + 1].startswith("unknown: gear of every joint: ")
-    assert "`snakesim joints gear`" in lines[JOINTS + 1]
+    assert "`snakesim robot calibrate gear`" in lines[JOINTS + 1]
 
 
 def test_zeros_are_unknown_until_the_robot_lies_straight_or_gravity_tells_them() -> None:

@@ -10,6 +10,7 @@ from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord
 from snakesim_hal.model.files import SHIPPED, decode, read_part
 from snakesim_hal.model.robot import RobotFile, with_modes
 from snakesim_operator.features.commissioning.robot_edit import change_joints, joints_on_drives, write_checked
+from snakesim_testing.messages import raises_error
 
 
 @pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])
@@ -39,7 +40,7 @@ def test_a_change_that_is_not_valid_leaves_the_file_as_it_was(tmp_path: Path) ->
     path = tmp_path / "snake.toml"
     path.write_text('extends = "planar13"\nname = "snake"\n')
     before = path.read_bytes()
-    with pytest.raises(ConfigError, match="gear"):
+    with raises_error(ConfigError, code="config/out-of-range"):
         change_joints(path, {"joint_1": {"gear": -1.0}}, "by mistake")
     assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
 

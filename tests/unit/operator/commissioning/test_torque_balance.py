@@ -5,6 +5,7 @@ import pytest
 
 from snakesim_operator.features.commissioning.smoothing import smooth, smooth_derivative, smooth_second_derivative
 from snakesim_operator.features.commissioning.torque_balance import JointRecord, TorqueBalance, fit_torque_balance
+from snakesim_testing.messages import raises_error
 
 TRUTH = {"dry_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005}
 INERTIA_KG_M2, WEIGHT_NM_PER_RAD, SCALE = 0.02, 1.5, 1.2
@@ -50,5 +51,5 @@ def test_a_joint_at_rest_tells_nothing() -> None:
     still = np.zeros(4000)
     moved = JointRecord(PERIOD_S, still, still, still, still, 7.0)
     none = smooth(still)
-    with pytest.raises(ValueError, match="too little motion"):
+    with raises_error(ValueError):
         fit_torque_balance(moved, still, none, none, fit_scale=True)

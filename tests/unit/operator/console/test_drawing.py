@@ -1,48 +1,17 @@
 """What is drawn is where the robot's kinematics put it."""
 
 import math
-from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
-from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
+from snakesim_hal.wire.messages import DepthImage, Obstacle
 from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import LONGEST_M, M_PER_N, draw
-from tests.unit.hal.rig import description, state
-
-ROBOT = description()
-COUNT = len(ROBOT.joints)
-
-
-def joints(*angles_rad: float) -> JointState:
-    return state(ROBOT, [*angles_rad, *[0.0] * (COUNT - len(angles_rad))])
-
-
-def contact(
-    force_w: tuple[float, float, float], obstacle: str = "peg", *, x_m: float = 0.1, body_s_m: float = 0.1
-) -> WorldContact:
-    return WorldContact(
-        link=0, obstacle=obstacle, body_s_m=body_s_m, position_w=(x_m, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
-        tangent_w=(1.0, 0.0, 0.0), force_w=force_w,
-    )  # fmt: skip
-
-
-def pushing(points: list[WorldContact], desired_force_n: list[float], **more: Any) -> ControlState:
-    return ControlState(
-        tick=1, timestamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
-        desired_force_n=desired_force_n, **more,
-    )  # fmt: skip
-
-
-def world(contacts: list[WorldContact], obstacles: list[Obstacle]) -> World:
-    return World(
-        tick=1, timestamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-        base_confidence=1.0, contacts=contacts, obstacles=obstacles,
-    )  # fmt: skip
+from snakesim_testing.operator.drawn_samples import COUNT, ROBOT, contact, joints, pushing, world
 
 
 def test_links_and_hinges_follow_base_and_angles():

@@ -9,6 +9,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.card import CARD, card_lines, compare, holm, make_card, mcnemar, read_card
 from snakesim_operator.features.evaluate.case import CaseOutcome
 from snakesim_operator.features.evaluate.suite import Suite, make_cases
+from snakesim_testing.messages import raises_error
 
 
 def test_p_as_tabulated() -> None:
@@ -51,5 +52,5 @@ def test_a_card_on_disk_is_the_card(tmp_path: Path) -> None:
     card = make_card("mine", cases, {cases[0].id: CaseOutcome(numbers={"crossed": False})})
     (tmp_path / CARD).write_bytes(msgspec.json.encode(card))
     assert read_card(tmp_path) == card
-    with pytest.raises(ConfigError, match="no score card"):
+    with raises_error(ConfigError, code="file/not-readable"):
         read_card(tmp_path / "nowhere")

@@ -11,6 +11,7 @@ from snakesim_operator.cli import main
 from snakesim_operator.features.lab.certificates import issue, make_authority, read_certificate, write_certificates
 from snakesim_operator.features.lab.identities import identities
 from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
+from snakesim_testing.messages import raises_error
 
 LAB = load_lab(EXAMPLE)
 
@@ -21,7 +22,7 @@ def states(folder: Path, *, rotate: bool = False) -> dict[str, str]:
 
 
 def test_private_keys_are_their_owners_and_never_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["deploy", "certs", str(EXAMPLE), "--out", str(tmp_path)]) == 0
+    assert main(["lab", "certs", str(EXAMPLE), "--out", str(tmp_path)]) == 0
     keys = list(tmp_path.rglob("*.key"))
     assert len(keys) == len(list(identities(LAB))) + 1
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
@@ -54,5 +55,5 @@ def test_certificates_of_another_authority_are_replaced(tmp_path: Path) -> None:
 def test_an_authority_without_its_key_is_not_replaced_in_silence(tmp_path: Path) -> None:
     states(tmp_path)
     (tmp_path / "authority" / "authority.key").unlink()
-    with pytest.raises(ConfigError, match=r"authority\.key"):
+    with raises_error(ConfigError, code="certificate/invalid-authority", field="authority.key"):
         states(tmp_path)

@@ -28,14 +28,14 @@ from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.state_messages import StateMessages
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
-from tests.unit.hal.rig import description
-from tests.unit.hal.rig import state as joint_state
-from tests.whole.command import run_to_summary
+from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import state as joint_state
+from snakesim_testing.runs.in_process_command import run_to_summary
 
 ROBOT = "/planar13_camera"
 LAYOUT = Path(__file__).parents[4] / "docs" / "foxglove-layout.json"
@@ -221,7 +221,7 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
 def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
     """As one that was killed: test_recording.py kills one."""
     torn = tmp_path / "torn.mcap"
-    recording = Recording(torn, "planar13_camera")
+    recording = RecordingWriter(torn, "planar13_camera")
     for number, one in enumerate(RecordingReader(run / RECORDING).read_messages()):
         recording.write_arrival(Arrival(one.key, one.payload, one.encoding, one.wall_ns))
         if number % 100 == 0:
@@ -237,7 +237,7 @@ def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_image
     whole = shown(tmp_path / "whole.mcap")
     assert count > 500 and len(whole[f"{ROBOT}/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
-    assert len(alone.time_s) > 20 and alone.lacks == [f"recording: before it was copied: {lacks[0]}"]
+    assert len(alone.time_s) > 20 and alone.missing == [f"recording: before it was copied: {lacks[0]}"]
 
 
 def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:

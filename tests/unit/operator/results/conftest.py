@@ -2,8 +2,8 @@
 
 import pytest
 
-from snakesim_operator.results.record import RunRecord
-from tests.unit.operator.results.recorded import triplet
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.operator.recorded_triplet import triplet
 
 
 @pytest.fixture(scope="session")

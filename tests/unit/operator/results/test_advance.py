@@ -44,12 +44,14 @@ def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
     assert reported.stalled_s == 0
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_not() -> None:
     reported = ran("path_following", goal="too far").summary
     assert reported.crossed is False and reported.crossed_s is None and reported.goal_m == 50
     assert reported.advance_m is not None and 0.4 < reported.advance_m < 1
 
 
+@pytest.mark.slow
 def test_the_wrong_way_is_no_advance() -> None:
     reported = ran("path_following", goal="backward").summary
     assert (
@@ -59,6 +61,7 @@ def test_the_wrong_way_is_no_advance() -> None:
     )
 
 
+@pytest.mark.slow
 def test_points_are_passed_by_the_head() -> None:
     result = ran("path_following", goal="points")
     reported, nodes = result.summary, result.record.nodes_w(0)
@@ -70,6 +73,7 @@ def test_points_are_passed_by_the_head() -> None:
     assert last is not None and np.hypot(1.9 - last[-1, 0], last[-1, 1]) < 0.06
 
 
+@pytest.mark.slow
 def test_who_stands_has_stalled_all_the_time() -> None:
     reported = ran("hold", goal="heading").summary
     assert reported.stalled_s == pytest.approx(2.5 - 1.0, abs=0.2) and reported.crossed is False
@@ -89,6 +93,7 @@ def test_the_work_of_torque_joints_is_told_apart() -> None:
     assert pushed.energy_j is not None and pushed.energy_j > pushed.torque_joints_j
 
 
+@pytest.mark.slow
 def test_a_run_may_end_at_its_goal_with_the_same_numbers() -> None:
     whole = ran("path_following", goal="heading")
     short = simulate(whole.record.config, until_goal=True)

@@ -21,8 +21,9 @@ from snakesim_operator.results.compare.difference import Difference, differ
 from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
-from snakesim_operator.results.record import RunRecord
-from tests.unit.operator.results.recorded import finished
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.messages import raises_error
+from snakesim_testing.operator.recorded_triplet import finished
 
 JOINTS = 13
 SPEED_M_S = 0.1
@@ -134,7 +135,7 @@ ODD: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("odd", ODD)
 def test_a_black_box_with_odd_arrays_is_one_error(odd: str) -> None:
-    with pytest.raises(ConfigError, match="blackbox") as caught:
+    with raises_error(ConfigError, code="recording/not-readable") as caught:
         differ(made_up(), dataclasses.replace(made_up(), **ODD[odd]))
     assert f"`{next(iter(ODD[odd]))}`" in str(caught.value) and "\n" not in str(caught.value)
 
@@ -312,7 +313,7 @@ def test_settings_that_differ_are_named_with_both_values() -> None:
 def test_a_run_that_never_armed_is_not_compared() -> None:
     a = made_up()
     empty = dataclasses.replace(a, folder=Path("idle"), time_s=np.zeros(0))
-    with pytest.raises(ConfigError, match=r"idle/blackbox.rows.*never armed"):
+    with raises_error(ConfigError, code="recording/never-armed", field="blackbox.rows"):
         differ(a, empty)
 
 
@@ -321,19 +322,19 @@ def test_a_single_common_tick_is_enough() -> None:
 
 
 def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nowhere: no such folder; give the folder that `snakesim run` left"):
+    with raises_error(ConfigError, code="recording/not-a-run"):
         compare(tmp_path / "nowhere", tmp_path)
-    with pytest.raises(ConfigError, match=r"not the folder of a run: config\.json is missing"):
+    with raises_error(ConfigError, code="recording/not-a-run", field="config.json"):
         compare(tmp_path, tmp_path)
     for name in ("config.json", "blackbox.rows", "host.json", "description.json"):
         (tmp_path / name).write_text("{")
-    with pytest.raises(ConfigError, match=r"config\.json: not valid JSON"):
+    with raises_error(ConfigError, code="file/invalid-syntax", field="config.json"):
         compare(tmp_path, tmp_path)
     write_config(configured(), tmp_path / "config.json")
-    with pytest.raises(ConfigError, match="the record of this run is damaged"):
+    with raises_error(ConfigError, code="recording/not-readable"):
         compare(tmp_path, tmp_path)
     (tmp_path / "description.json").write_bytes(msgspec.json.encode(describe_of(configured())))
-    with pytest.raises(ConfigError, match=r"blackbox\.rows cannot be read as the black box of a run"):
+    with raises_error(ConfigError, code="recording/not-readable", field="blackbox.rows"):
         compare(tmp_path, tmp_path)
-    with pytest.raises(ConfigError, match="--within -1: give a percentage"):
+    with raises_error(ConfigError, code="command/invalid-option", field="--within"):
         compare(tmp_path, tmp_path, within_percent=-1)

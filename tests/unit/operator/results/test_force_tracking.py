@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_hal.wire.messages import ControlState, WorldContact
 from snakesim_operator.results.metrics.force_tracking import force_tracking
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 
 EVERY_NS = 50_000_000
@@ -48,6 +48,7 @@ def test_empty_push_points_count_and_what_nobody_can_judge_does_not():
     assert force_tracking([state(k, [4.0], [None]) for k in range(20)]) is None
 
 
+@pytest.mark.slow
 def test_the_summary_of_a_run_tells_how_well_its_forces_came_true(record: RunRecord):
     assert any(one.measured_force_n and max(n or 0.0 for n in one.measured_force_n) > 1.0 for one in record.control)
     summary = summarise(record, "complete")

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_operator.results.metrics.motion import motion_of
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.motion import measure_motion
 from snakesim_operator.results.report.verdict import verdict
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import print_summary
-from tests.unit.operator.results.recorded import SECONDS, changed
+from snakesim_testing.operator.recorded_triplet import SECONDS, changed
 
 
 def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
@@ -25,25 +25,25 @@ def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
 def test_a_stop_in_between_and_a_rest_at_the_end_are_found_where_they_are(record: RunRecord) -> None:
     time_s = record.time_s - record.time_s[0]
     goes = moved_as(record, 0.1 * np.interp(time_s, [0, 2, 4.5, 7, 10], [0, 2, 2, 4.5, 4.5]))
-    motion = motion_of(goes)
+    motion = measure_motion(goes)
     assert motion is not None
-    spans = [(span.start_s, span.end_s) for span in motion.standing]
+    spans = [(span.start_s, span.end_s) for span in motion.stops]
     assert np.array(spans) == pytest.approx(np.array([[2.0, 4.5], [7.0, SECONDS]]), abs=0.15)
     assert motion.moving_fraction == pytest.approx(4.5 / SECONDS, abs=0.03)
-    assert motion.final_stop == motion.standing[-1]
+    assert motion.final_stop == motion.stops[-1]
     assert [span.what for span in motion.spans] == ["moving", "standing still"] * 2
 
 
 @pytest.mark.parametrize(("amplitude_m", "moves"), [(0.004, False), (0.06, True)])
 def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, amplitude_m: float, moves: bool) -> None:
     time_s = record.time_s - record.time_s[0]
-    motion = motion_of(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
+    motion = measure_motion(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
     assert motion is not None and motion.moving_fraction == (1.0 if moves else 0.0)
 
 
 def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
     blind = changed(record, position_w=record.position_w * np.nan, worlds=[])
-    assert motion_of(blind) is None
+    assert measure_motion(blind) is None
     reported = summarise(blind, "complete")
     assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
     assert reported.reported_state == "NotLocomoting"

@@ -21,14 +21,15 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
 from snakesim_operator.playback.export import arrays
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.compare import page as compare_page
 from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.table import table
-from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import page
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import CONFIG
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.results.recorded import Reader, triplet
+from snakesim_testing.operator.recorded_triplet import Reader, triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST
@@ -75,7 +76,7 @@ def write_record(folder: Path, record: RunRecord) -> None:
 def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int) -> None:
     """A recording with these messages, and the setpoints of so many ticks, of which only the number is read."""
     (folder / RECORDING).unlink(missing_ok=True)
-    recording = Recording(folder / RECORDING)
+    recording = RecordingWriter(folder / RECORDING)
     for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
         message = keys.find_message(key)
         assert message is not None
@@ -98,7 +99,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     )
     write_record(folder, record)
     loaded = RunRecord.load(folder)
-    assert loaded.lacks == [] and "lacks something" not in summary_and_page(loaded)[1].text
+    assert loaded.missing == [] and "is incomplete" not in summary_and_page(loaded)[1].text
     return loaded
 
 
@@ -123,7 +124,7 @@ def compared(a: RunRecord, b: RunRecord) -> str:
         reader = Reader(compare_page.page(difference))
     assert not re.search(r"\b(nan|inf)\b", text + reader.text)
     for record in (a, b):
-        for lack in record.lacks:
+        for lack in record.missing:
             assert lack in text and lack in reader.text
     return text
 
@@ -150,7 +151,7 @@ def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
     write_record(tmp_path, dataclasses.replace(base, **corrupted))
     record = RunRecord.load(tmp_path)
     assert np.allclose(record.time_s, base.time_s)
-    said = {line.partition(":")[0]: line for line in record.lacks}
+    said = {line.partition(":")[0]: line for line in record.missing}
     for name, values in corrupted.items():
         bad = ~(np.abs(values) < 1e9)
         if name in ("position_w", "orientation_wxyz") or not bad.any():
@@ -159,7 +160,7 @@ def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
         counts = zip(JOINTS, bad.sum(axis=0), strict=True) if values.ndim > 1 else [("", bad.sum())]
         assert all(f"{joint} {n}" in said[name] for joint, n in counts if n)
     summary, reader = summary_and_page(record)
-    assert summary.lacks == record.lacks and all(lack in reader.text for lack in record.lacks)
+    assert summary.missing == record.missing and all(lack in reader.text for lack in record.missing)
     compared(base, record)
     compared(record, record)
 
@@ -172,6 +173,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [path] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
+@pytest.mark.slow  # the black box is read with the same checks
 @given(data=st.data())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
@@ -195,10 +197,10 @@ def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
     record = RunRecord.load(tmp_path)
     assert len(record.control) + len(record.worlds) == len(payloads) - refused
     lacking = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)
-            for lack in record.lacks]  # fmt: skip
+            for lack in record.missing]  # fmt: skip
     assert sum(int(found[1]) for found in lacking if found) == refused and all(lacking)
     _, reader = summary_and_page(record)
-    assert all(lack in reader.text for lack in record.lacks)
+    assert all(lack in reader.text for lack in record.missing)
     compared(record, base)
 
 
@@ -213,7 +215,7 @@ def test_a_pose_that_is_not_known_yet_or_never_is_lacking_only_where_there_is_a_
         write_record(tmp_path, dataclasses.replace(base, config=config, position_w=position))
         record = RunRecord.load(tmp_path)
         summary_and_page(record)
-        return record.lacks
+        return record.missing
 
     sensors = base.config.robot.sensors
     assert lacks(sensors, slice(0, 5)) == []

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set, place_obstacles
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.report.pushing import pushing
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.in_process import simulate
-from tests.unit.operator.results.recorded import Reader, changed
+from snakesim_testing.operator.recorded_triplet import Reader, changed
 
 SECONDS = 1.5
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")
@@ -21,6 +21,7 @@ def record() -> RunRecord:
     return simulate(load("surveyed_clutter", [parse_set(f"duration_s={SECONDS}")]).config).record
 
 
+@pytest.mark.slow
 def test_forces_are_told_along_the_body(record: RunRecord) -> None:
     reported = pushing(record)
     assert reported is not None and reported.map_errors is None  # the map was known

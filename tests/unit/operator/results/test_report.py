@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.metrics.propulsion import propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, find_events
 from snakesim_operator.results.report.instants import balanced_instants
@@ -23,8 +22,9 @@ from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
 from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.results.recorded import LOST, SECONDS, Reader, changed, read
+from snakesim_testing.operator.recorded_triplet import LOST, SECONDS, Reader, changed, read
 
 HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
 INTERVALS_S = {9 - k: interval for k, interval in enumerate(itertools.pairwise(HAND_OVERS_S))}  # 9 is joint_10
@@ -145,7 +145,7 @@ def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(page: Reader
     classes = {found for svg in drawings for found in re.findall(r'class="((?:solved|resultant)[^"]*)"', svg)}
     assert {"solved asked shaft", "solved asked head", "resultant asked shaft"} <= classes
     assert not {"solved shaft", "solved head", "resultant shaft", "resultant head"} & classes
-    assert "asked for, and no contact felt there" in pages[1].text
+    assert "desired, but no contact was measured there" in pages[1].text
 
 
 def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(page: Reader) -> None:
@@ -201,7 +201,7 @@ def test_the_page_says_how_to_repeat_the_run(page: Reader, record: RunRecord) ->
 
 
 def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
-    intervals = propulsion_intervals(record)
+    intervals = find_propulsion_intervals(record)
     assert [one.joint for one in intervals] == list(INTERVALS_S)
     for one in intervals:
         assert (one.start_s, one.end_s) == pytest.approx(INTERVALS_S[one.joint], abs=0.051)

@@ -14,14 +14,14 @@ from snakesim_hal.model.scenario import Start
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
-from snakesim_operator.results.metrics.propulsion import propulsion_intervals
-from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.verdict import Verdict, verdict
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
-from tests.unit.operator.results.recorded import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
+from snakesim_testing.operator.recorded_triplet import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
 
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 
@@ -98,6 +98,7 @@ def test_a_controller_without_push_points(record: RunRecord) -> None:
     assert re.search("measured contacts?, in sum", page.text)
 
 
+@pytest.mark.slow
 def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
     lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
@@ -132,12 +133,14 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
     assert [mark["line"].get("color") for mark in marks].count("--bad") == 2 + 12 + 3
 
 
+@pytest.mark.slow
 def test_a_run_that_jammed(record: RunRecord) -> None:
     page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
     assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
     assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
 
 
+@pytest.mark.slow
 def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
     stuck = [
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
@@ -265,7 +268,7 @@ def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecor
     config_ = msgspec.structs.replace(record.config, scene=scene)
     hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_)
     page = report_page(hurt, summarise(hurt, "complete"))
-    assert propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
+    assert find_propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
     assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page
 
 

@@ -1,4 +1,4 @@
-"""What time it is in ROS. What `snakesim ros2` refuses is in tests/whole/refusals.toml."""
+"""What time it is in ROS. What `snakesim start ros2` refuses is in tests/system/runs/refusals.toml."""
 
 import time
 

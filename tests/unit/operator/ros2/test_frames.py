@@ -8,8 +8,8 @@ from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion,
 from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, make_ros_name
 from snakesim_operator.features.ros2.messages import Transform
 from snakesim_operator.features.ros2.urdf import make_urdf
-from tests.unit.hal.rig import pose, state
-from tests.unit.operator.ros2.rig import of_robot
+from snakesim_testing.hal.small_robots import pose, state
+from snakesim_testing.operator.ros2_rig import of_robot
 
 Pair = tuple[np.ndarray, np.ndarray]
 

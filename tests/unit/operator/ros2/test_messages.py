@@ -17,8 +17,8 @@ from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import Marker, Transform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
-from tests.unit.hal.strategies import messages_of
-from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
+from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
+from snakesim_testing.hal.strategies import messages_of
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 12_345_678_901
@@ -199,7 +199,7 @@ def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
 def test_diagnostics(status: m.Status) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
-    assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.why}")
+    assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.reason}")
     assert {"lifecycle", "backend", "lease holder"} <= {value.key for value in seen.values}
 
 

@@ -14,8 +14,8 @@ from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token
 from snakesim_operator.features.ros2.joint_commands import VALID_NS, RosJointTargets
 from snakesim_operator.features.ros2.parameters import NOT_SET, _encode_value, _make_descriptor
 from snakesim_operator.robot_commands.parameters import Parameter
-from tests.unit.hal import rig
-from tests.unit.operator.ros2.rig import SERVICE_HASHES, of_robot
+from snakesim_testing.hal import small_robots as rig
+from snakesim_testing.operator.ros2_rig import SERVICE_HASHES, of_robot
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 # From docs/design.md of ros2/rmw_zenoh.

@@ -7,7 +7,7 @@ import pytest
 from snakesim_hal.programs import host_program as host_process
 from snakesim_hal.programs import router_program as router_process
 from snakesim_hal.programs import service_program as serve
-from snakesim_operator.recording import process as recorder
+from snakesim_operator.recording import recorder_process as recorder
 
 
 @pytest.mark.parametrize(

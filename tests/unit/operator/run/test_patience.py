@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.run.patience import StartupTimeout
-from tests.unit.hal import rig
+from snakesim_testing.hal import small_robots as rig
 
 ALL = ("guidance", "control")
 

@@ -4,11 +4,11 @@ import pytest
 
 from snakesim_hal.wire.messages import LifecycleState, Status
 from snakesim_operator.run.progress import Progress
-from tests.unit.hal.rig import run_config, status
+from snakesim_testing.hal.small_robots import run_config, status
 
 
 def at(tick: int, lifecycle: LifecycleState = "armed") -> Status:
-    return status(tick=tick, timestamp_ns=tick * 10**7, lifecycle=lifecycle, why=lifecycle)
+    return status(tick=tick, timestamp_ns=tick * 10**7, lifecycle=lifecycle, reason=lifecycle)
 
 
 def shown(progress: Progress, found: Status, capsys: pytest.CaptureFixture[str]) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_operator.run import run_files as under_test
 from snakesim_operator.run.run_files import RunFiles
-from tests.harness.wait import wait_until
+from snakesim_testing.harness.wait import wait_until
 
 
 class Disk:

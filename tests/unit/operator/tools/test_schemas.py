@@ -19,7 +19,7 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, Message
 from snakesim_operator.this_computer.schemas import contract, write_schemas
-from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
+from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 REPOSITORY = Path(__file__).parents[4]
 PUBLISHED = REPOSITORY / "schemas"

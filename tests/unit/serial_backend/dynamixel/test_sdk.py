@@ -20,7 +20,7 @@ from snakesim_serial_backend.dynamixel.emulator import FIRMWARE, MODEL, Emulated
 from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.wire import Pty
-from tests.unit.hal.rig import run_config
+from snakesim_testing.hal.small_robots import run_config
 
 SDK = Protocol2PacketHandler()
 JOINTS = 3

@@ -1,0 +1,112 @@
+"""Arguments of the commands for drives on CAN. They can be imported without the extra `can`."""
+
+import argparse
+from pathlib import Path
+
+from snakesim_can_backend.protocol.definitions import LAST_NODE
+from snakesim_drivers.kit.commands import add_channel, add_channels, add_pose
+from snakesim_hal.programs.arguments import (
+    add_duration,
+    add_json,
+    add_out,
+    add_parent,
+    add_scenario_name,
+    add_seed,
+    add_set,
+    number_type,
+)
+
+DEFAULT_CHANNEL = "vcan0"
+DEFAULT_POSE = "127.0.0.1:7450"
+EXPANDED = "snakesim-expanded.dbc"
+MIN_RATE_HZ = 20.0
+MAX_RATE_HZ = 5000.0  # of a scenario
+CHANNEL_ABOUT = "SocketCAN interface such as can0, or INTERFACE:CHANNEL such as slcan:/dev/ttyACM0"
+
+
+def add_scan(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of a scan of a CAN bus."""
+    add_channels(parser, CHANNEL_ABOUT)
+    parser.add_argument(
+        "--bit-rate",
+        type=number_type(10_000, 1_000_000, "bit/s"),
+        default=1_000_000,
+        metavar="BIT/S",
+        help="of an adapter (default: 1000000)",
+    )
+    add_duration(parser, "seconds to listen on each bus (default: 1)", number_type(0.001, 3600, "s"), 1.0)
+    parser.add_argument("--anyway", action="store_true", help="send requests also where others use the bus")
+
+
+def add_module_load(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the bus load of joint modules."""
+    add_scenario_name(parser)
+    add_set(parser)
+    parser.add_argument(
+        "--joints",
+        type=number_type(1, LAST_NODE, "joints"),
+        nargs="+",
+        metavar="N",
+        help="print a table: for a robot with this many joints",
+    )
+    parser.add_argument(
+        "--hz",
+        type=number_type(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
+        nargs="+",
+        metavar="HZ",
+        help="print a table: for these control rates",
+    )
+    add_json(parser)
+
+
+def add_load(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the bus load of drives."""
+    add_scenario_name(parser)
+    add_channel(parser, f"bus of the drives (default: {DEFAULT_CHANNEL})")
+    add_set(parser)
+    add_json(parser)
+
+
+def add_replay(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that read a log of the bus of joint modules."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run, with config.json and its black box")
+    parser.add_argument(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="log of its bus: .log (candump; backends.can.log of a run), .asc, .blf",
+    )
+
+
+def add_dbc(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that write the DBC file."""
+    add_out(parser, f"the DBC file (default: {EXPANDED})")
+
+
+def add_module_emulation(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of emulated joint modules."""
+    add_scenario_name(parser)
+    add_channel(parser, f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})")
+    parser.add_argument(
+        "--physics-model", metavar="NAME", help="body that the motors move: mujoco, inertia, or ./file.py:Class"
+    )
+    add_set(parser)
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="inject a fault, as KIND:JOINT@START[-END] in seconds; may be repeated",
+    )
+    parser.add_argument(
+        "--interactive", action="store_true", help="read `KIND joint_N` and `KIND joint_N off` from the terminal"
+    )
+    parser.add_argument(
+        "--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep"
+    )
+    add_pose(parser, f"or none; default: {DEFAULT_POSE}", DEFAULT_POSE)
+    add_duration(parser, "end after this many seconds")
+    add_seed(parser, "of noise and serial numbers; default: the scenario's")
+    parser.add_argument("--stats", action="store_true", help="print the load of every bus once a second")
+    parser.add_argument("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
+    add_parent(parser)

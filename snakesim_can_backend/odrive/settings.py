@@ -1,0 +1,46 @@
+"""Settings of the backend `odrive`."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from msgspec import Meta
+
+from snakesim_can_backend.can_drives.backend import CanDriveSettings
+from snakesim_drivers.emulation.mounted import Mounted
+
+Amperes = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "A"})]
+Seconds = Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})]
+TurnsPerSecond = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "turns/s"})]
+
+
+class MountedAxis(Mounted, frozen=True, kw_only=True):
+    """How an emulated axis is mounted and configured, where that is not what the robot file needs."""
+
+    current_soft_max_a: Amperes | None = None
+    """Current limit that the emulated axis is configured with; none: what the robot file needs."""
+
+    watchdog_timeout_s: Seconds | None = None
+    """Time of the axis's watchdog; 0: it is off; none: `watchdog_s` of the backend."""
+
+    vel_limit_turns_s: TurnsPerSecond | None = None
+    """Speed limit that the emulated axis is configured with; none: what the robot file needs."""
+
+
+class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
+    """The scenario's `[backends.odrive]` section. `watchdog_s` is what the axes have in `watchdog_timeout`."""
+
+    # Files flat_endpoints.json that ODrive publishes with each firmware: one for each firmware and hardware on the bus.
+    # With them the driver reads watchdog, current and speed limits of every axis at the start. Empty: they are unknown.
+    endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
+    """Files flat_endpoints.json of every firmware on the bus, to read watchdog, current and speed limits at the start;
+    empty: they are unknown.
+    """
+
+    # The driver never sets a higher current limit. Default: what each axis is configured for; 1 A where it is unknown.
+    max_current_a: Amperes | None = None
+    """Current limit above which the driver never sets an axis; none: what each axis is configured for, or 1 A where
+    that is unknown.
+    """
+
+    mounted: Mapping[str, MountedAxis] = {}
+    """For joints of emulated axes, how each is really mounted and configured."""

@@ -1,0 +1,104 @@
+"""The base class of emulated drives of any type, and a loop that runs them as a process."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol, TypeVar
+
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
+from snakesim_hal.base.process import on_stop_signal, tune_garbage_collector
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.fault_kinds import Injection
+
+POLL_S = 0.001  # longest wait for frames or bytes, of drives in a process of their own
+
+
+def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callable[[float], object]) -> None:
+    """Run emulated drives until this process gets a stop signal.
+
+    Args:
+        ready: The line to print once they run.
+        emulator: Handles what has arrived, and simulates up to the present time.
+        wait: Waits for frames or bytes, at most so many seconds.
+    """
+    running = [True]
+    on_stop_signal(running.clear)
+    tune_garbage_collector()
+    print_line(ready)
+    while running:
+        emulator()
+        wait(POLL_S)
+
+
+class BusEnd(Protocol):
+    """The drives' end of a bus."""
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+BusEndT = TypeVar("BusEndT", bound=BusEnd)
+
+
+class DriveEmulator(ABC, Generic[BusEndT]):
+    """Emulated drives of one type on their body. In all methods `i` is the index of a drive, from tail to head.
+
+    A driver type implements the abstract methods. The thread that calls the emulator calls them while it holds the
+    lock of the body.
+    """
+
+    def __init__(self, body: EmulatedBody, bus_ends: Sequence[BusEndT], clock_ns: Callable[[], int]) -> None:
+        """Begin to simulate at the present time of the clock.
+
+        Args:
+            body: The body that these drives move.
+            bus_ends: The drives' end of every drive's bus; drives of one bus have the same object. `close` closes them.
+            clock_ns: A steady time, with any origin.
+        """
+        self.body = body
+        self._clock_ns = clock_ns
+        self._start_ns = clock_ns()
+        self._bus_ends: list[BusEndT] = list({id(end): end for end in bus_ends}.values())  # each once
+        body.add_step_callback(self.on_step)
+
+    @abstractmethod
+    def restart(self, i: int) -> None:
+        """Put a drive into the state in which it is switched on."""
+
+    @abstractmethod
+    def on_step(self, now_us: float) -> None:
+        """Let the drives act at a time of their own: watchdogs, heat, and reports that are due."""
+
+    def catch_up(self) -> None:
+        """Simulate a pause of this process before anything that was sent since then is handled.
+
+        Real drives do not pause with the computer: their watchdogs expire.
+        """
+        clock_us = self._read_clock_us()
+        if self.body.is_late(clock_us):
+            self.body.advance_to(clock_us)
+
+    def pass_time(self) -> None:
+        """Simulate up to the present time."""
+        self.body.advance_to(self._read_clock_us())
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Begin or end an injected fault of a drive.
+
+        Raises:
+            ConfigError: There is no such fault, or no such joint.
+        """
+        with self.body.lock:
+            restarted = self.body.inject(injection, begins=begins)
+            if restarted is not None:
+                self.restart(restarted)
+
+    def close(self) -> None:
+        """Leave the body and close the buses."""
+        self.body.remove_step_callback(self.on_step)
+        for end in self._bus_ends:
+            end.close()
+
+    def _read_clock_us(self) -> float:
+        """Return the time since these drives began."""
+        return (self._clock_ns() - self._start_ns) / 1000

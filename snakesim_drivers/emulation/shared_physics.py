@@ -1,0 +1,159 @@
+"""What all emulated drives of a robot share: physics model, motors, heat and camera, on one clock that is passed in."""
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import msgspec
+
+from snakesim_drivers.emulation.mounted import Mounted, build_config, build_joints
+from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
+from snakesim_hal.model.plugins import PHYSICS_MODELS, find_plugin, plugin_settings, require_base_class
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.backlash import BacklashModel, without_rotors
+from snakesim_hal.physics.motors import Motors
+from snakesim_hal.physics.physics_model import PhysicsModel
+from snakesim_hal.physics.thermal import Thermal
+
+HEAT_DECIMATION = 10  # physics steps from one step of the windings' heat to the next: they heat up slowly
+MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process the drives skip the rest of it
+STEP_ROUNDING = 0.49  # a step is simulated as soon as all of it but so much has passed: clocks are rounded
+POSE_SLACK_US = 1.0  # a pose is captured so long before it is due at the earliest: clocks are rounded
+
+
+class PhysicsSettings(Protocol):
+    """The settings of a backend that concern the physics of its emulated drives."""
+
+    @property
+    def physics_model(self) -> str:
+        """Name of the physics model: an entry point in the group `snakesim.physics_models`."""
+        ...
+
+    @property
+    def physics_model_settings(self) -> dict[str, Any]:
+        """Settings of the physics model, as the scenario has them."""
+        ...
+
+    @property
+    def mounted(self) -> Mapping[str, Mounted]:
+        """How drives are mounted in truth, where that differs from the robot file; by the joint's name."""
+        ...
+
+
+def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: str) -> PhysicsModel:
+    """Create the physics model that a backend's settings name, moved by motors as they are in truth.
+
+    Args:
+        config: The run.
+        settings: The backend's settings.
+        backend: Name of the backend, for messages.
+
+    Raises:
+        ConfigError: There is no such physics model, or it does not accept its settings.
+    """
+    model_type = find_plugin(PHYSICS_MODELS, settings.physics_model)
+    label = f"physics_model {settings.physics_model!r}"
+    require_base_class(model_type, PhysicsModel, label)
+    section = f"backends.{backend}.physics_model_settings"
+    model_settings = plugin_settings(model_type, settings.physics_model_settings, label, section)
+    true_config = build_config(config, settings.mounted)
+    backlash_rad = {name: mounted.backlash_rad for name, mounted in settings.mounted.items() if mounted.backlash_rad}
+    if not backlash_rad:
+        return model_type(true_config, model_settings)
+    joints = build_joints(config.robot, settings.mounted)
+    links = model_type(without_rotors(true_config, joints, backlash_rad), model_settings)
+    return BacklashModel(links, joints, backlash_rad, config.seed)
+
+
+class SharedPhysics:
+    """The physics of a robot, with the injected faults of its emulated drives. Indices are those of the robot."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        physics_model: PhysicsModel,
+        mounted: Mapping[str, Mounted],
+        send_pose: Callable[[bytes], None] | None,
+    ) -> None:
+        """Begin at time 0, with all motors passive.
+
+        Args:
+            config: The run.
+            physics_model: The physics model that the motors move.
+            mounted: How drives are mounted in truth, where that differs from the robot file; by the joint's name.
+            send_pose: Gets a datagram of motion capture in every control period; None: no motion capture.
+        """
+        # Physics.
+        self.physics_model = physics_model
+        self.joints = build_joints(config.robot, mounted)
+        self.motors = Motors(build_config(config, mounted).robot, physics_model.step_s)
+        self.thermal = Thermal(self.joints)
+
+        # Time.
+        self.now_us = 0.0  # since the start
+        self.step_callbacks: list[Callable[[float], None]] = []
+        self._step_us = physics_model.step_s * 1e6
+        self._steps = 0
+        self._skipped_us = 0.0  # by which the clock is ahead of the physics
+
+        # Injected faults.
+        self.boots_until_us = [0.0] * len(self.joints)
+        self.muted: set[int] = set()
+        self.undervolted: set[int] = set()
+        self.duplicated: set[int] = set()
+
+        # Held by emulators while they act, because those of several buses may be in threads.
+        self.lock = threading.RLock()
+
+        # Motion capture.
+        self._send_pose = send_pose
+        self._period_us = config.period_ns / 1000
+        self._next_pose_us = 0.0
+        self._camera: PoseCamera | None = None
+        pose_sensor = config.robot.sensors.pose
+        if pose_sensor is not None and send_pose is not None:
+            seed = (config.seed, len(self.joints))
+            self._camera = PoseCamera(pose_sensor, physics_model, seed, config.period_ns)
+
+    def measure_lag_us(self, clock_us: float) -> float:
+        """Return how far the physics is behind the clock."""
+        return clock_us - self._skipped_us - self.now_us
+
+    def advance_to(self, clock_us: float) -> None:
+        """Simulate up to a time of the clock. After a long delay of this process, a part of it is skipped."""
+        if self.measure_lag_us(clock_us) > MAX_AT_ONCE_US:
+            self._skipped_us = clock_us - self.now_us - MAX_AT_ONCE_US
+        until_us = clock_us - self._skipped_us
+        due_steps = round(until_us / self._step_us - STEP_ROUNDING)
+        for _ in range(due_steps - self._steps):
+            self._step()
+        self._capture_pose()
+
+    def _step(self) -> None:
+        model = self.physics_model
+        model.advance(self.motors.step(model.angle_rad, model.velocity_rad_s))
+        self._steps += 1
+        self.now_us = self._steps * self._step_us
+        if self._steps % HEAT_DECIMATION == 0:
+            self._warm_windings()
+        for callback in self.step_callbacks:
+            callback(self.now_us)
+
+    def _warm_windings(self) -> None:
+        """Let the heat of the last steps act, and derate hot motors."""
+        duration_s = HEAT_DECIMATION * self.physics_model.step_s
+        self.thermal.pass_time(duration_s, self.motors.pop_mean_square_torque())
+        remaining_fraction = self.thermal.remaining_fraction()
+        if remaining_fraction is not None:
+            self.motors.derate(remaining_fraction)
+
+    def _capture_pose(self) -> None:
+        """Capture and send a pose if one is due."""
+        if self._camera is None or self._send_pose is None:
+            return
+        if self.now_us < self._next_pose_us - POSE_SLACK_US:
+            return
+        self._next_pose_us += self._period_us
+        sample = self._camera.capture(round(self.now_us * 1000))
+        if sample is not None:
+            self._send_pose(msgspec.json.encode(sample))

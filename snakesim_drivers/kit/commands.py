@@ -1,0 +1,39 @@
+"""The nouns of `snakesim drive`, below which driver types register their commands, and arguments that these share."""
+
+import argparse
+
+from snakesim_hal.programs.arguments import add_json, add_parent, add_scenario_name, add_set
+from snakesim_hal.programs.commands import Commands, Noun
+
+DRIVE_NOUNS: Commands = (
+    Noun(name="drive", heading="robot", help="Scan, emulate and examine the drives of a robot, by driver type."),
+    Noun(name="drive scan", help="List the drives that answer on a bus; it moves nothing."),
+    Noun(name="drive emulate", help="Emulate the drives of a robot, as a process on a bus."),
+    Noun(name="drive load", help="Print how much of a bus the drives of a scenario use."),
+    Noun(name="drive replay", help="Read the log of a bus as the driver does."),
+)
+
+
+def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add `--channel`, the bus of emulated drives. about: for the help."""
+    parser.add_argument("--channel", action="append", metavar="CHANNEL", help=f"{about}; may be repeated")
+
+
+def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add the buses to scan. about: for the help."""
+    parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=about)
+    add_json(parser)
+
+
+def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
+    """Add `--pose`, for emulated motion capture. about: what else the help says."""
+    parser.add_argument("--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})")
+
+
+def add_emulation(parser: argparse.ArgumentParser, channel_about: str) -> None:
+    """Add the arguments of an emulator of drives. channel_about: for the help of `--channel`."""
+    add_scenario_name(parser)
+    add_channel(parser, channel_about)
+    add_set(parser)
+    add_pose(parser, "default: nowhere")
+    add_parent(parser)

@@ -1,0 +1,57 @@
+"""The JSON Schema of a Struct, with the description, the default and the unit of every field."""
+
+import re
+from inspect import cleandoc
+from typing import Any
+
+import msgspec
+from msgspec import inspect
+
+from snakesim_hal.model.field_docs import describe_fields, type_info_of
+from snakesim_hal.model.field_types import alternatives
+from snakesim_hal.model.field_words import find_unit, get_default, item_types, unit_of_type
+
+
+def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the JSON Schema of a Struct, with the description, default and unit of every field."""
+    schema = msgspec.json.schema(struct)
+    definitions: dict[str, Any] = schema.get("$defs", {})
+    for definition in definitions.values():
+        if "description" in definition:  # without its indentation, as Python itself removes it from 3.13 on
+            definition["description"] = cleandoc(definition["description"])
+    for part in list_structs(struct):
+        full_name = re.sub(r"[^a-zA-Z0-9.\-_]", "_", f"{part.__module__}.{part.__qualname__}")
+        name = full_name if full_name in definitions else part.__name__  # msgspec uses full names if two are equal
+        _complete_definition(definitions[name], part)
+    return schema
+
+
+def _complete_definition(definition: dict[str, Any], struct: type[msgspec.Struct]) -> None:
+    """Add descriptions, defaults and units to the properties of one Struct."""
+    descriptions = describe_fields(struct)
+    for field in type_info_of(struct).fields:
+        name = field.encode_name
+        added = definition["properties"][name]
+        if name in descriptions:
+            added["description"] = descriptions[name]
+        if not field.required and "default" not in added:
+            added["default"] = get_default(field)
+        unit = find_unit(name, field.type)
+        if unit and not unit_of_type(field.type):
+            added["unit"] = unit
+
+
+def list_structs(struct: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
+    """Return a Struct and all Structs inside of it, each once."""
+    found: dict[type[msgspec.Struct], None] = {}
+    waiting: list[inspect.Type] = [type_info_of(struct)]
+    while waiting:
+        option = waiting.pop()
+        if isinstance(option, inspect.StructType):
+            if option.cls in found:
+                continue
+            found[option.cls] = None
+            waiting += [alternative for field in option.fields for alternative in alternatives(field.type)]
+        for inner in item_types(option):
+            waiting += alternatives(inner)
+    return list(found)

@@ -1,0 +1,192 @@
+"""Writes one MCAP file: every message as it was on the wire, with its schema, in the order of arrival.
+
+A channel is a key. Its messages are the payloads without change (encoding `msgpack`), its schema is the published JSON
+Schema, its metadata has the encoding on the wire. `log_time` is robot time, `publish_time` is the wall clock at the
+recorder, `sequence` counts the arrivals at a key. A chunk is written at least every FLUSH_S, so that a recorder that
+is killed loses no more than that.
+"""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.model.files import SCHEMAS
+from snakesim_hal.network.session import Arrival
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
+from snakesim_operator.recording.disk import GrowingFile
+from snakesim_operator.recording.foxglove import FoxgloveChannels
+from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, make_schema
+from snakesim_operator.recording.mcap_file import McapFile
+from snakesim_operator.recording.robot_time import MessageClock
+
+FLUSH_S = 0.5
+MAX_EARLY_SAMPLES = 1000  # of custom sensors before the description; further ones get no schema of their own
+MAX_ENCODING_NAME = 200  # characters; it comes from the network
+ABOUT = "snakesim"  # the name of the metadata record
+COPIED = "lacked_before_copy"  # entry of that record: what the recording lacked that this one was copied from
+
+Show = Callable[[FoxgloveMessage, int], None]  # gets a message for viewers, and its robot time in ns
+
+
+class RecordingWriter:
+    """A file that is being written. A full disk ends it (see `failure`), and raises nothing."""
+
+    def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:
+        """Create the file and write its beginning.
+
+        Args:
+            path: The new file.
+            shown_as: The robot's name in topics for viewers; None: record the messages as on the wire alone.
+            show: Gets each message that is made for viewers.
+
+        Raises:
+            OSError: The file cannot be created; FileExistsError if it exists.
+        """
+        self.path = path
+        self._show = show
+        self.failure = ""  # why nothing is written any more
+        self.time = MessageClock()
+        self._wall_offset_ns = time.time_ns() - time.monotonic_ns()  # wall clock minus monotonic clock
+
+        # The file.
+        self._file = GrowingFile(path)
+        self._mcap = McapFile(self._file)
+        self._channels: dict[str, int] = {}  # channel numbers, by key and by topic
+        self._schemas: dict[str, int] = {}  # schema numbers, by the schema's name or text
+        self._next_flush_s = 0.0
+
+        # The robot's messages.
+        self.counts: Counter[str] = Counter()  # messages written, by key
+        self._custom_types: dict[str, CustomMessage] = {}  # messages of custom sensors, by key
+        self._early_samples: list[Arrival] | None = []  # of custom sensors; None once the description is known
+
+        # Messages made for viewers.
+        self._foxglove: FoxgloveChannels | None = None
+        if shown_as is not None:
+            self._foxglove = FoxgloveChannels(shown_as)
+        self._shown_counts: Counter[str] = Counter()  # by topic
+
+        self.flush()
+
+    def write_arrival(self, arrival: Arrival) -> None:
+        """Write one message, unless its key is not in the key space.
+
+        A custom sensor's sample waits until the robot's description has said what it means.
+        """
+        if self.failure:
+            return
+        early = self._early_samples
+        if early is not None and keys.find_row_key(arrival.key) == keys.OWN_ALL and len(early) < MAX_EARLY_SAMPLES:
+            early.append(arrival)
+            return
+        self._write(arrival)
+        if arrival.key == keys.DESCRIPTION:
+            self._write_early_samples()
+
+    def flush_when_due(self) -> None:
+        """Give the waiting messages to the disk, if the last time is FLUSH_S ago."""
+        if not self.failure and time.monotonic() >= self._next_flush_s:
+            self.flush()
+
+    def flush(self) -> None:
+        """Give the waiting messages to the disk."""
+        self._next_flush_s = time.monotonic() + FLUSH_S
+        try:
+            self._mcap.flush()
+        except OSError as error:
+            self._set_failure(error)
+
+    def close(self, about: dict[str, object]) -> None:
+        """Write metadata and index, and close the file. about: metadata of the recording itself, kept as JSON."""
+        self._write_early_samples()
+        if not self.failure:
+            self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
+            try:
+                self._mcap.finish()
+            except OSError as error:
+                self._set_failure(error)
+        self._file.close()
+
+    def _set_failure(self, error: OSError) -> None:
+        self.failure = f"{self.path}: {error.strerror or error}"
+
+    def _write_early_samples(self) -> None:
+        early = self._early_samples or []
+        self._early_samples = None
+        for arrival in early:
+            self._write(arrival)
+
+    def _write(self, arrival: Arrival) -> None:
+        """Write one message, and what is made of it for viewers."""
+        if arrival.key == keys.DESCRIPTION:
+            with suppress(*UNDECODABLE):
+                self._custom_types = find_custom_messages(msgspec.msgpack.decode(arrival.payload, type=Description))
+        channel = self._channels.get(arrival.key)
+        if channel is None:
+            channel = self._open_channel(arrival)
+        if channel is None:
+            return
+        robot_ns = self.time.date(arrival.key, arrival.payload)
+        wall_ns = arrival.monotonic_ns + self._wall_offset_ns
+        self.counts[arrival.key] += 1
+        self._mcap.add(channel, robot_ns, wall_ns, self.counts[arrival.key], arrival.payload)
+        if self._foxglove is not None:
+            for message in self._foxglove.convert(arrival.key, arrival.payload, robot_ns):
+                self._write_shown(message, robot_ns, wall_ns)
+
+    def _write_shown(self, message: FoxgloveMessage, robot_ns: int, wall_ns: int) -> None:
+        """Write one message for viewers, and show it."""
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._open_shown_channel(message)
+        self._shown_counts[message.topic] += 1
+        self._mcap.add(channel, robot_ns, wall_ns, self._shown_counts[message.topic], message.payload)
+        if self._show is not None:
+            self._show(message, robot_ns)
+
+    def _open_shown_channel(self, message: FoxgloveMessage) -> int:
+        """Return the number of a new channel for a topic of viewers."""
+        schema = make_schema(message.message_type)
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._mcap.add_schema(schema.name, schema.schema_encoding, schema.data)
+        channel = self._mcap.add_channel(message.topic, schema.message_encoding, self._schemas[schema.name])
+        self._channels[message.topic] = channel
+        return channel
+
+    def _open_channel(self, arrival: Arrival) -> int | None:
+        """Return the number of a new channel for a key, or None if the key is not in the key space."""
+        message_type = keys.find_message(arrival.key)
+        if message_type is None:
+            return None
+        custom_type = self._custom_types.get(arrival.key)
+        if custom_type is None:
+            schema = self._add_published_schema(message_type.__name__)
+        else:
+            schema = self._add_custom_schema(custom_type)
+        metadata = {"encoding": arrival.encoding[:MAX_ENCODING_NAME]}
+        channel = self._mcap.add_channel(arrival.key, "msgpack", schema, metadata)
+        self._channels[arrival.key] = channel
+        return channel
+
+    def _add_published_schema(self, name: str) -> int:
+        """Return the number of a message's published schema; it is added when it is first needed."""
+        if name not in self._schemas:
+            content = (SCHEMAS / "messages" / f"{name}.json").read_bytes()
+            self._schemas[name] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
+        return self._schemas[name]
+
+    def _add_custom_schema(self, custom_type: CustomMessage) -> int:
+        """Return the number of a custom message's schema. Its text identifies it: two authors may choose one name."""
+        text = custom_type.schema
+        if text not in self._schemas:
+            name = f"snakesim.own.{custom_type.message.__name__}"
+            self._schemas[text] = self._mcap.add_schema(name, "jsonschema", text.encode())
+        return self._schemas[text]

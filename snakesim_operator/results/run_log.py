@@ -1,0 +1,167 @@
+"""The log of a run as arrays: a row for each tick, and what guidance, navigation and control published."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.kinematics import find_nodes_w
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scenario import RunConfig, place_obstacles
+from snakesim_hal.model.scene import Placed, make_route
+from snakesim_hal.run_log.host_record import HostRecord
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
+from snakesim_operator.results.missing_data import describe_unwritten, replace_invalid_numbers
+from snakesim_operator.results.run_ending import COMPLETE
+from snakesim_operator.results.run_reader import MessageHandler, RunReader, open_run
+
+DAMAGED = (*UNDECODABLE, OSError, MemoryError)
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """The log of one run. Every array has one row a tick, since the first arming."""
+
+    # What was run.
+    folder: Path  # the run's folder, or the recording
+    config: RunConfig
+    description: Description
+    host: HostRecord
+
+    # What the services published.
+    control: list[ControlState]  # in time order, a few a second and at every change
+    worlds: list[World]  # in time order, a few a second
+    trajectories: list[Trajectory]  # in time order, one for each path
+
+    # The ticks. NaN is unknown.
+    time_s: Floats  # (n,) robot time
+    angle_rad: Floats  # (n, joints)
+    velocity_rad_s: Floats  # (n, joints)
+    torque_nm: Floats  # (n, joints)
+    mode: NDArray[np.int8]  # (n, joints), values of messages.Mode
+    target: Floats  # (n, joints), in the unit of the mode
+    torque_limit_nm: Floats  # (n, joints)
+    position_w: Floats  # (n, 3) of the base
+    orientation_wxyz: Floats  # (n, 4)
+    contact_peak_n: Floats  # (n,) strongest contact, mean over 50 ms
+    contact_count: Floats  # (n,) obstacles touched
+
+    # More of the recording.
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
+    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns of custom sensors, (n,)
+    replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
+
+    # How much of the run is known.
+    ending: str = COMPLETE  # COMPLETE, or a sentence that says how the run ended
+    missing: list[str] = field(default_factory=list[str])  # sentences about missing data
+    unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
+
+    # Files.
+    config_path: Path | None = None  # None: there is no such file
+    recording_path: Path | None = None
+
+    @staticmethod
+    def load(path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None) -> "RunRecord":
+        """Read a run's folder, also of a run that was killed, or a recording.
+
+        Args:
+            path: The folder or the recording.
+            host: The host's statistics, if known from elsewhere; None: from the store.
+            on_message: Called with every message of the recording.
+
+        Raises:
+            ConfigError: It is neither of both, or damaged.
+        """
+        reader = open_run(path, host, on_message)
+        try:
+            return RunRecord.read(reader)
+        except ConfigError:
+            raise
+        except DAMAGED as error:
+            why = f"{type(error).__name__}: {error}"[:300]
+            raise ConfigError(
+                f"{path}: the record of this run is damaged ({why}); run it again", code="recording/not-readable"
+            ) from None
+
+    @staticmethod
+    def read(reader: RunReader) -> "RunRecord":
+        """Read everything from one store, remove invalid numbers, and collect what is missing."""
+        config = reader.read_config()
+        description = reader.read_description()
+        has_pose = config.robot.sensors.pose is not None
+        columns, invalid = replace_invalid_numbers(reader.read_ticks(), description, has_pose=has_pose)
+        outputs = reader.read_outputs(columns["time_s"])
+        host = reader.read_host_record()
+        lost_ticks = max(host.lost_ticks, host.ticks - len(columns["tick"]))
+        host = msgspec.structs.replace(host, lost_ticks=lost_ticks)
+        del columns["tick"]
+        return RunRecord(
+            folder=reader.path,
+            config=config,
+            description=description,
+            host=host,
+            control=outputs.control,
+            worlds=outputs.worlds,
+            trajectories=outputs.trajectories,
+            **columns,
+            searched_nodes=outputs.searched_nodes,
+            custom=outputs.custom,
+            replay_of=outputs.replay_of,
+            ending=reader.describe_ending(),
+            missing=[*invalid, *describe_unwritten(host), *outputs.missing],
+            unreached=outputs.unreached,
+            config_path=reader.config_path,
+            recording_path=reader.recording_path,
+        )
+
+    @cached_property
+    def route(self) -> Route | None:
+        """The route through the scene; None if it has none."""
+        return make_route(self.config.scene)
+
+    @cached_property
+    def placed(self) -> list[Placed]:
+        """The obstacles, each at its place in the scene."""
+        return place_obstacles(self.config)
+
+    @cached_property
+    def feels_contacts(self) -> bool:
+        """Whether the robot had contact sensors; its file may list some that its drives do not have."""
+        return any(sensor.key == keys.CONTACTS for sensor in self.description.sensors)
+
+    @cached_property
+    def ticks(self) -> NDArray[np.int64]:
+        """The tick of each row, (n,)."""
+        return np.rint(self.time_s * 1e9 / self.description.period_ns).astype(np.int64)
+
+    @cached_property
+    def stretches(self) -> list[NDArray[np.int64]]:
+        """The row numbers between the record's gaps: within a stretch every tick follows the one before."""
+        rows = np.arange(len(self.ticks))
+        if not len(rows):
+            return []
+        after_a_gap = np.flatnonzero(np.diff(self.ticks) > 1) + 1
+        return np.split(rows, after_a_gap)
+
+    def row_at(self, time_s: float) -> int:
+        """Return the row whose time is nearest."""
+        return int(np.argmin(np.abs(self.time_s - time_s)))
+
+    @cached_property
+    def posed(self) -> NDArray[np.bool_]:
+        """A mask of the rows in which the pose and all angles are known, (n,)."""
+        signals = (self.position_w, self.orientation_wxyz, self.angle_rad)
+        return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in signals])
+
+    def nodes_w(self, row: int) -> Floats | None:
+        """Return tail end, joints and head end in the world, (joints + 2, 3), or None if the pose is unknown."""
+        if len(self.time_s) == 0 or not self.posed[row]:
+            return None
+        return find_nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])

@@ -1,0 +1,110 @@
+"""The commands `snakesim sim`. Importable without Zenoh."""
+
+import argparse
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.programs.arguments import add_network
+from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
+
+MAX_TICKS = 1_000_000  # this and the speeds are the limits of SimulatorRequest
+MIN_SPEED = 0.1  # robot time per wall time
+MAX_SPEED = 10.0
+
+
+def _add_step(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("number", nargs="?", type=float, metavar="TICKS", help="number of ticks (default: 1)")
+    add_network(parser)
+
+
+def _add_speed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("number", type=float, metavar="X", help="robot time over wall time, from 0.1 to 10")
+    add_network(parser)
+
+
+def _pause(arguments: argparse.Namespace) -> int:
+    return _send(SimulatorOrder("pause"), arguments)
+
+
+def _resume(arguments: argparse.Namespace) -> int:
+    return _send(SimulatorOrder("resume"), arguments)
+
+
+def _step(arguments: argparse.Namespace) -> int:
+    return _send(SimulatorOrder("step", ticks=_check_ticks(arguments.number)), arguments)
+
+
+def _speed(arguments: argparse.Namespace) -> int:
+    return _send(SimulatorOrder("speed", speed=_check_speed(arguments.number)), arguments)
+
+
+def _reset(arguments: argparse.Namespace) -> int:
+    return _send(SimulatorOrder("reset"), arguments)
+
+
+def _send(order: SimulatorOrder, arguments: argparse.Namespace) -> int:
+    """Send a request to the simulator that the arguments address. Returns the exit code."""
+    from snakesim_operator.base.robot_selection import select_robots
+    from snakesim_operator.robot_commands.command import simulator
+
+    return simulator(order, select_robots(arguments))
+
+
+def _check_ticks(number: float | None) -> int:
+    """Return the number of ticks, by default 1. Raises ConfigError unless it is a whole number in its range."""
+    ticks = 1 if number is None else number
+    if not 1 <= ticks <= MAX_TICKS or ticks != int(ticks):  # in this order: NaN and infinity have no int()
+        raise ConfigError(
+            f"sim step {ticks:g}: give a whole number of ticks from 1 to {MAX_TICKS}", code="command/invalid-option"
+        )
+    return int(ticks)
+
+
+def _check_speed(speed: float) -> float:
+    """Return the speed. Raises ConfigError if it is outside its range."""
+    if not MIN_SPEED <= speed <= MAX_SPEED:
+        raise ConfigError(
+            f"sim speed {speed:g}: give a number from {MIN_SPEED:g} to {MAX_SPEED:g}; 1 is as the wall clock",
+            code="command/invalid-option",
+        )
+    return speed
+
+
+SIMULATOR_COMMANDS: Commands = (
+    Noun(name="sim", heading="robot", help="Pause, step, speed up, slow down or reset a simulator."),
+    Command(
+        name="sim pause",
+        help="Pause a simulator: robot time is paused, also for leases and ages.",
+        add=add_network,
+        run=_pause,
+        examples=("sim pause", "sim pause --namespace planar13"),
+    ),
+    Command(
+        name="sim resume",
+        help="Resume a simulator that is paused.",
+        add=add_network,
+        run=_resume,
+        examples=("sim resume", "sim resume --namespace planar13"),
+    ),
+    Command(
+        name="sim step",
+        help="Advance a simulator by some ticks, and pause it then.",
+        add=_add_step,
+        run=_step,
+        examples=("sim step", "sim step 100"),
+    ),
+    Command(
+        name="sim speed",
+        help="Set the speed of a simulator in real time.",
+        add=_add_speed,
+        run=_speed,
+        examples=("sim speed 0.5", "sim speed 2 --namespace planar13"),
+    ),
+    Command(
+        name="sim reset",
+        help="Set a simulator back to its start; the robot is disarmed then.",
+        add=add_network,
+        run=_reset,
+        examples=("sim reset", "sim reset --namespace planar13"),
+    ),
+)

@@ -1,0 +1,150 @@
+"""`snakesim config SCENARIO --explain KEY`: what a key means, what it may be, and what it is in a scenario."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from snakesim_hal.base.errors import ConfigError, find_nearest_word, shorten
+from snakesim_hal.base.terminal import align_columns, print_json, print_line
+from snakesim_hal.model.field_words import format_value
+from snakesim_hal.model.scenario import CHOSEN, Loaded, RunConfig
+from snakesim_hal.programs.preflight import check_plugins
+from snakesim_operator.this_computer.scenario_keys import Key, list_keys
+
+MAX_VALUE_CHARACTERS = 40  # of a value in the list of a table's keys
+MAX_KEYS_IN_ERROR = 400  # characters
+COLUMNS = ("key", "value", "unit", "description")
+
+
+def explain_key(loaded: Loaded, name: str, *, as_json: bool) -> int:
+    """Print type, unit, range, default, meaning, value and origin of a key; for a table also one line for each key.
+
+    Args:
+        loaded: the scenario.
+        name: dotted key; `control.KEY` and `backend.KEY` are those of the chosen controller and backend.
+        as_json: print JSON.
+
+    Raises:
+        ConfigError: The scenario is not valid, or there is no such key.
+    """
+    check_plugins(loaded.config, loaded.table, run_files=False)
+    full_name = _expand_chosen(loaded.config, name)
+    keys = list_keys(loaded, named=full_name)
+    if full_name not in keys:
+        raise _unknown_key_error(keys, name, full_name)
+    key = keys[full_name]
+    inner_keys = _find_inner_keys(keys, full_name)
+    if as_json:
+        print_json(_as_json(key, inner_keys))
+        return 0
+    for line in _as_text(key, inner_keys):
+        print_line(line)
+    return 0
+
+
+def _expand_chosen(config: RunConfig, name: str) -> str:
+    """Return the key in the section of the chosen controller or backend, for `control.KEY` or `backend.KEY`."""
+    control_prefix, backend_prefix = CHOSEN
+    if f"{name}." == control_prefix:
+        return config.control_section
+    if name.startswith(control_prefix):
+        return f"{config.control_section}.{name.removeprefix(control_prefix)}"
+    if name.startswith(backend_prefix):
+        return f"{config.backend_section}.{name.removeprefix(backend_prefix)}"
+    return name
+
+
+def _find_inner_keys(keys: Mapping[str, Key], table: str) -> list[Key]:
+    """Return the keys directly inside of a table."""
+    prefix = f"{table}."
+    return [key for name, key in keys.items() if name.startswith(prefix) and "." not in name.removeprefix(prefix)]
+
+
+def _unknown_key_error(keys: Mapping[str, Key], name: str, full_name: str) -> ConfigError:
+    """Return the error for a key that does not exist, with a similar key or those of the same table."""
+    problem = f"--explain {shorten(name)}: there is no such key"
+    *parents, last = full_name.split(".")
+    while parents and ".".join(parents) not in keys:
+        parents.pop()
+    table = ".".join(parents)
+    siblings = _find_inner_keys(keys, table) if table else [key for key in keys.values() if "." not in key.name]
+    nearest = _find_nearest_key(last, siblings) if table else None
+    if nearest is None:
+        nearest = _find_nearest_key(last, list(keys.values()))
+    if nearest is None and not table:
+        nearest = keys.get(find_nearest_word(full_name, keys) or "")
+    if nearest is not None:
+        return ConfigError(f"{problem}; did you mean `{nearest.name}`?")
+    known = ", ".join(key.doc.name for key in siblings)
+    where = f"`{table}` has" if table else "the tables and keys at the top are"
+    return ConfigError(f"{problem}; {where} {shorten(known, MAX_KEYS_IN_ERROR)}")
+
+
+def _find_nearest_key(last_part: str, keys: Sequence[Key]) -> Key | None:
+    """Return the key whose last part is most similar; None if none is similar."""
+    nearest = find_nearest_word(last_part, [key.doc.name for key in keys])
+    return next((key for key in keys if key.doc.name == nearest), None)
+
+
+def _as_json(key: Key, inner_keys: Sequence[Key]) -> dict[str, Any]:
+    described = _describe_as_json(key)
+    if key.is_table:
+        described["keys"] = {inner.doc.name: _describe_as_json(inner) for inner in inner_keys}
+    return described
+
+
+def _describe_as_json(key: Key) -> dict[str, Any]:
+    return {
+        "key": key.name,
+        "type": key.doc.type_words,
+        "unit": key.doc.unit,
+        "default": key.doc.default,
+        "range": key.doc.range_words,
+        "description": key.doc.description,
+        "value": key.value,
+        "origin": key.origin,
+    }
+
+
+def _as_text(key: Key, inner_keys: Sequence[Key]) -> Iterator[str]:
+    """Yield the lines that explain a key."""
+    yield key.name
+    yield f"  {key.doc.description}"
+    rows = _describe_table(key) if key.is_table else _describe_value(key)
+    for name, text in rows.items():
+        yield f"  {name:<8} {text}"
+    if inner_keys:
+        yield "keys"
+        yield from (f"  {line}" for line in align_columns(COLUMNS, [_as_row(inner) for inner in inner_keys]))
+
+
+def _describe_table(key: Key) -> dict[str, str]:
+    rows = {"type": key.doc.type_words}
+    if key.doc.range_words:
+        rows["range"] = key.doc.range_words
+    return rows
+
+
+def _describe_value(key: Key) -> dict[str, str]:
+    rows = {
+        "type": key.doc.type_words,
+        "unit": key.doc.unit or "none",
+        "range": key.doc.range_words or "any",
+        "default": "none, the key is required" if key.doc.default is None else key.doc.default,
+    }
+    if key.is_pattern:
+        rows["value"] = "one for each entry"
+    else:
+        rows["value"] = format_value(key.value)
+        rows["from"] = key.origin
+    return rows
+
+
+def _as_row(key: Key) -> dict[str, str]:
+    """Return one line of the keys of a table, by column."""
+    value = "" if key.is_pattern or (key.is_table and key.value) else format_value(key.value)
+    return {
+        "key": key.doc.name,
+        "value": shorten(value, MAX_VALUE_CHARACTERS),
+        "unit": key.doc.unit,
+        "description": key.doc.description,
+    }

@@ -1,0 +1,64 @@
+"""The commands `snakesim drive` for Dynamixel servos. Importable without the extra `dynamixel`."""
+
+import argparse
+
+from snakesim_drivers.kit.commands import DRIVE_NOUNS, add_channels, add_emulation
+from snakesim_hal.programs.arguments import add_json
+from snakesim_hal.programs.commands import Command, Commands
+from snakesim_serial_backend.dynamixel.registers import RATE
+
+
+def _add_scan(parser: argparse.ArgumentParser) -> None:
+    add_channels(parser, "serial port, such as /dev/ttyUSB0")
+    parser.add_argument(
+        "--baud", type=int, action="append", choices=list(RATE), help="may be repeated, to try several (default: all)"
+    )
+
+
+def _add_emulation(parser: argparse.ArgumentParser) -> None:
+    add_emulation(parser, "a name for the port, which is made (default: ./servos)")
+
+
+def _scan(arguments: argparse.Namespace) -> int:
+    from snakesim_serial_backend.serial_command import scan_ports
+
+    return scan_ports(arguments)
+
+
+def _emulate(arguments: argparse.Namespace) -> int:
+    from snakesim_serial_backend.dynamixel.command import emulate
+
+    return emulate(arguments)
+
+
+def _load(arguments: argparse.Namespace) -> int:
+    from snakesim_serial_backend.dynamixel.command import print_load
+
+    return print_load(arguments)
+
+
+COMMANDS: Commands = (
+    *DRIVE_NOUNS,
+    Command(
+        name="drive scan dynamixel",
+        help="List every Dynamixel that answers; reads only, and moves nothing.",
+        add=_add_scan,
+        run=_scan,
+        details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
+        examples=("drive scan dynamixel /dev/ttyUSB0", "drive scan dynamixel /dev/ttyUSB0 --baud 1000000 --json"),
+    ),
+    Command(
+        name="drive emulate dynamixel",
+        help="Emulate the Dynamixel servos of a robot, as a process at the other end of pseudo terminals.",
+        add=_add_emulation,
+        run=_emulate,
+        examples=("drive emulate dynamixel triplet", "drive emulate dynamixel triplet --channel tail --channel head"),
+    ),
+    Command(
+        name="drive load dynamixel",
+        help="Print bytes, time and rate of a cycle with Dynamixel servos for every baud rate.",
+        add=add_json,
+        run=_load,
+        examples=("drive load dynamixel", "drive load dynamixel --json"),
+    ),
+)

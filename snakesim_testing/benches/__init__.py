@@ -1,0 +1,1 @@
+"""Our benches for the contract suite, and backends that break it."""

@@ -1,0 +1,156 @@
+"""The backend that docs/backends.md shows, taken from there, and one like it that behaves as a robot on a bus does."""
+
+import dataclasses
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from snakesim_drivers.kit.braking import AT_REST_RAD_S
+from snakesim_drivers.kit.drive_backend import LATCHED_STATES
+from snakesim_hal.backend import SafeSetpoints, Samples
+from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
+
+DOCS = Path(__file__).parents[2] / "docs" / "backends.md"
+
+
+def text_of_the_example() -> str:
+    """The Python file in the documentation."""
+    found = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+example: Any = ModuleType("workbench_of_the_docs")
+sys.modules[example.__name__] = example  # where its annotations are looked up
+exec(compile(text_of_the_example(), str(DOCS), "exec"), example.__dict__)
+Workbench: Any = example.Workbench
+mute: Any = example.mute
+
+
+class DrivesWorkbench(Workbench):
+    """With drives that stop by a watchdog of their own, and are enabled by an arming alone."""
+
+    WATCHDOG_S = 0.1
+
+    def __init__(self, config: Any, settings: Any) -> None:
+        super().__init__(config, settings)
+        joints = len(self.angle)
+        self.enabled = np.zeros(joints, dtype=bool)
+        self.tripped = np.zeros(joints, dtype=bool)  # by the watchdog, until a reset
+        self.reported = np.zeros(joints, dtype=bool)
+        self.braked_s = 0.0
+        self.was: LifecycleState = "disarmed"
+
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
+        was_latched, self.was = self.was in LATCHED_STATES, lifecycle
+        if was_latched and lifecycle not in LATCHED_STATES:
+            self.tripped[:] = self.reported[:] = False
+        match lifecycle:
+            case "armed":
+                self.enabled, self.braked_s = self.may_be_enabled(), 0.0
+            case "fault":
+                self.enabled = self.still_brakes()
+            case _:
+                self.enabled[:] = False
+        modes = [mode if on else Mode.PASSIVE for mode, on in zip(setpoints.mode, self.enabled, strict=True)]
+        super().enact(dataclasses.replace(setpoints, mode=modes), lifecycle)
+
+    def may_be_enabled(self) -> Any:
+        return ~self.tripped
+
+    def still_brakes(self) -> Any:
+        moves = np.abs(self.velocity) > AT_REST_RAD_S
+        return self.enabled & moves & (self.braked_s < self.WATCHDOG_S)
+
+    def advance(self) -> None:
+        super().advance()
+        self.braked_s += self.steps * example.STEP_S
+
+    def faults(self) -> list[Fault]:
+        fresh = self.tripped & ~self.reported
+        self.reported |= fresh
+        names = [joint.name for joint, is_fresh in zip(self.description.joints, fresh, strict=True) if is_fresh]
+        return [Fault(tick=0, what="drive_fault", cause=f"{name}: its watchdog", joint=name) for name in names]
+
+
+class WorkbenchDrives:
+    """The drives of a `DrivesWorkbench`."""
+
+    def __init__(self, backend: Any) -> None:
+        self._backend = backend
+
+    def enabled(self) -> list[bool]:
+        return self._backend.enabled.tolist()
+
+    def freeze_driver(self, seconds: float, sleep: Any) -> None:
+        backend = self._backend
+        sleep(seconds)
+        if seconds > backend.WATCHDOG_S:
+            backend.tripped |= backend.enabled
+            backend.enabled &= False
+            backend.mode[:] = Mode.PASSIVE
+        for _ in range(round(seconds / example.STEP_S)):
+            backend.step()
+
+
+class BusWorkbench(DrivesWorkbench):
+    """As late, coarse and slow to wake as a robot on a bus may be, and at rest by itself when it is not armed."""
+
+    WAKES_AFTER = 4  # periods until joint 0 is armed; each further joint takes one more
+    KNOWN_AT_ONCE = True  # in lockstep time stands still until arming, and arming needs to know every joint
+
+    def __init__(self, config: Any, settings: Any) -> None:
+        super().__init__(config, settings)
+        joints = len(self.angle)
+        self.on_its_way: SafeSetpoints | None = None
+        self.lifecycle: LifecycleState = "disarmed"
+        self.armed_for = 0
+        self.samples = 0
+        self.old = (np.zeros(joints), np.zeros(joints), np.zeros(joints))
+
+    def sample(self, tick: int, timestamp_ns: int) -> Samples:
+        """The synchronisation: what was handed over acts from here on. Odd joints answer a period late."""
+        if self.on_its_way is not None:
+            self.armed_for = self.armed_for + 1 if self.lifecycle == "armed" else 0
+            asleep = np.arange(len(self.angle)) + self.WAKES_AFTER > self.armed_for
+            super().enact(self.on_its_way, self.lifecycle)
+            self.mode = np.where(asleep, int(Mode.PASSIVE), self.mode)
+            self.limit = np.round(self.limit, 2)
+        fresh = super().sample(tick, timestamp_ns).joints
+        now = np.round(fresh.angle_rad, 4), np.round(fresh.velocity_rad_s, 3), np.round(fresh.torque_nm, 3)
+        late = np.arange(len(self.angle)) % 2 == 1
+        if self.samples == 0 and self.KNOWN_AT_ONCE:
+            self.old = now
+        angle, velocity, torque = (np.where(late, old, new).tolist() for old, new in zip(self.old, now, strict=True))
+        age_ns = [
+            age + self.description.period_ns * int(is_late) for age, is_late in zip(fresh.age_ns, late, strict=True)
+        ]
+        known = [self.KNOWN_AT_ONCE or not is_late or self.samples > 0 for is_late in late]
+        self.old, self.samples = now, self.samples + 1
+        return Samples(
+            msgspec.structs.replace(
+                fresh, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, age_ns=age_ns, valid=known
+            )
+        )
+
+    def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
+        """Put it on the bus."""
+        if not self.open:
+            super().enact(setpoints, lifecycle)
+        self.on_its_way, self.lifecycle = setpoints, lifecycle
+
+
+class RealTimeWorkbench(BusWorkbench):
+    """And its time does not wait, nor does it know all joints at once."""
+
+    KNOWN_AT_ONCE = False
+
+    @classmethod
+    def check(cls, config: Any, settings: Any) -> Any:
+        """As a real robot."""
+        return ("realtime",)

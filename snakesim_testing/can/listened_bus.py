@@ -1,0 +1,234 @@
+"""A robot on a kernel's CAN bus, and a listener on it."""
+
+import os
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.definitions import (
+    CommandAction,
+    Frame,
+    ModuleState,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
+from snakesim_hal.model.scenario import Override, RunConfig, load, write_config
+from snakesim_testing.can.interface import FRAME
+from snakesim_testing.hal.small_robots import write_files
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import Ended, environment
+from snakesim_testing.runs.in_process_command import snakesim
+
+JOINTS = 3
+
+
+NODES = range(1, JOINTS + 1)
+
+
+RATE_HZ = 25.0
+
+
+IN_GUEST = os.environ.get("SNAKESIM_VCAN") == "guest"
+
+
+# An emulated machine is slow, and wakes up late.
+START_LIMIT_S, LATE_MS = (110.0, 150.0) if IN_GUEST else (30.0, 20.0)
+
+
+SO_TIMESTAMPNS = 35  # asm-generic/socket.h
+
+
+SCENARIO = f"""\
+title = "Killed"
+robot = "worm.toml"
+scene = "bend.toml"
+backend = "can"
+controller = "hold"
+clock_mode = "realtime"
+rate_hz = {RATE_HZ}
+[start]
+tail_s_m = 0.1
+[services.control]
+[controllers.hold]
+[backends.can]
+channels = ["CHANNEL"]
+physics_model = "inertia"
+bring_up_limit_s = 60.0
+[backends.can.physics_model_settings]
+timestep_s = 0.01
+"""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A frame, and when it was on the bus by the kernel's clock."""
+
+    at_ns: int
+    frame: Frame
+
+    @property
+    def opcode(self) -> int:
+        return parse_opcode(self.frame.id)
+
+    def says(self) -> Mapping[str, float]:
+        return load_layouts()[Opcode(self.opcode)].decode(self.frame.data)
+
+
+class Listener:
+    """Hears everything on a bus; the kernel keeps it until somebody asks."""
+
+    def __init__(self, channel: str) -> None:
+        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        self._socket.bind((channel,))
+        self._socket.setblocking(False)
+        self.heard: list[Heard] = []
+
+    def listen(self) -> list[Heard]:
+        """Take in what has come; everything heard since the last `forget`."""
+        while True:
+            try:
+                data, extra, _, _ = self._socket.recvmsg(FRAME.size, socket.CMSG_SPACE(16))
+            except BlockingIOError:
+                return self.heard
+            number, length, content = FRAME.unpack(data)
+            seconds, nanoseconds = struct.unpack("=qq", extra[0][2])
+            self.heard.append(Heard(seconds * 10**9 + nanoseconds, Frame(number, content[:length])))
+
+    def forget(self) -> None:
+        self.listen()
+        self.heard = []
+
+    def of(self, opcode: Opcode) -> list[Heard]:
+        return [heard for heard in self.listen() if heard.opcode == opcode]
+
+    def states(self) -> list[ModuleState]:
+        """The state that each module told last, in whatever frame."""
+        reported = dict.fromkeys(NODES, ModuleState.BOOT)
+        for heard in self.listen():
+            if heard.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE):
+                reported[parse_node(heard.frame.id)] = ModuleState(int(heard.says()["state"]))
+        return list(reported.values())
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@dataclass
+class Bench:
+    """The processes of one robot on a bus; `start` and kill any."""
+
+    folder: Path
+    config: RunConfig
+    endpoint: str
+    listener: Listener
+    running: ExitStack
+
+    def start(self, name: str, *module_and_arguments: str) -> subprocess.Popen[bytes]:
+        log = self.running.enter_context((self.folder / f"{name}.log").open("a"))
+        process = subprocess.Popen(
+            [sys.executable, "-m", *module_and_arguments, "--parent", str(os.getpid())],
+            env=environment(self.folder),
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+        self.running.enter_context(process)
+        self.running.callback(process.kill)
+        return process
+
+    def modules(self) -> None:
+        self.start("modules", "snakesim_can_backend.emulator.command", self._saved, "--pose", "none")
+        self.until(lambda: "modules ready" in self.said("modules"), "modules ready")
+
+    def control(self) -> subprocess.Popen[bytes]:
+        return self.start(
+            "control", "snakesim_hal.programs.service_program", "control", self._saved, "--endpoint", self.endpoint
+        )
+
+    @property
+    def host_arguments(self) -> Sequence[str]:
+        return (self._saved, "--endpoint", self.endpoint, "--out", str(self.folder))
+
+    @property
+    def _saved(self) -> str:
+        return str(self.folder / "config.json")
+
+    def said(self, name: str) -> str:
+        return (self.folder / f"{name}.log").read_text()
+
+    def until(self, condition: Callable[[], bool], what: str, limit_s: float = START_LIMIT_S) -> None:
+        try:
+            wait_until(condition, what, limit_s)
+        except AssertionError as error:
+            logs = "\n".join(f"{log.name}: {log.read_text()}" for log in self.folder.glob("*.log"))
+            raise AssertionError(f"{error}\n{logs}") from None
+
+    def tell(self, *arguments: str) -> Ended:
+        """One of the operator's tools, told where the robot is."""
+        return snakesim(*arguments, "--endpoint", self.endpoint, cwd=self.folder)
+
+    def _is_armed(self) -> bool:
+        """Once what there is has been cleared."""
+        if self.tell("robot", "arm", self.config.robot.name, self.config.backend).code == 0:
+            return True
+        print(self.tell("robot", "reset").said)
+        return False
+
+    def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+        """Start modules, host and control, and wait until every module is armed. Returns the latter two processes."""
+        self.modules()
+        host = self.start("host", "snakesim_hal.programs.host_program", *self.host_arguments)
+        self.until(lambda: len(self.listener.of(Opcode.SYNC)) > 20, "the driver's Syncs")
+        control = self.control()
+        self.until(self._is_armed, "ready to arm")
+        self.listener.forget()
+        armed = [ModuleState.ARMED] * JOINTS
+        self.until(lambda: self.listener.states() == armed, "every module armed")
+        self.until(lambda: len(self.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "setpoints")
+        return host, control
+
+
+@contextmanager
+def bench(folder: Path, channel: str) -> Iterator[Bench]:
+    scenario = write_files(folder, scenario=SCENARIO.replace("CHANNEL", channel))
+    config = load(scenario, [Override("robot.chain.modules", JOINTS, "test")]).config
+    write_config(config, folder / "config.json")
+    with ExitStack() as running, closing(Listener(channel)) as listener:
+        yield Bench(folder, config, free_endpoint(), listener, running)
+
+
+def stop_commands(heard: Sequence[Heard]) -> list[Heard]:
+    return [h for h in heard if h.opcode == Opcode.COMMAND and h.says()["action"] == CommandAction.STOP]
+
+
+def first_in(heard: Sequence[Heard], states: set[ModuleState], since_ns: int) -> dict[int, Heard]:
+    """Each module's first frame after a time that tells one of these states."""
+    found: dict[int, Heard] = {}
+    for h in heard:
+        if h.at_ns >= since_ns and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE) and h.says()["state"] in states:
+            found.setdefault(parse_node(h.frame.id), h)
+    return found
+
+
+def uptimes_ms(heard: Sequence[Heard], node: int) -> list[tuple[int, float]]:
+    """(kernel's time, module's uptime) of its heartbeats."""
+    beats = [h for h in heard if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node]
+    return [(h.at_ns, 1e3 * h.says()["uptime"]) for h in beats]
+
+
+def passed_for_module_ms(heard: Sequence[Heard], node: int, from_ns: int, to_ns: int) -> float:
+    """How long a stretch of the kernel's time took in a module's own; heartbeats around it give both."""
+    at_ns, uptime_ms = zip(*uptimes_ms(heard, node), strict=True)
+    from_ms, to_ms = np.interp([from_ns - at_ns[0], to_ns - at_ns[0]], [ns - at_ns[0] for ns in at_ns], uptime_ms)
+    return float(to_ms - from_ms)

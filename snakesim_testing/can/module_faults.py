@@ -1,0 +1,15 @@
+"""Faults that modules report."""
+
+MODULE_FAULTS = [
+    # asked for, what the driver calls it, seen within so many periods
+    ("mute", "module_silent", 4),
+    ("freeze", "module_frozen", 5),
+    ("reboot", "module_restarted", 14),
+    ("counter", "wrong_counter", 4),
+    ("checksum", "bad_checksum", 4),
+    ("duplicate", "duplicate_node", 4),
+    ("overheat", "module_overheat", 3),
+    ("leak", "module_leak", 3),
+    ("undervoltage", "module_voltage", 3),
+    ("babble", "module_babbling", 3),
+]

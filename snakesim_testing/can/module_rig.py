@@ -1,0 +1,139 @@
+"""One module, and whole chains, for the tests of the emulators."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from snakesim_can_backend.emulator.bus_time import Traffic
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.emulator.frames import ModuleReadings
+from snakesim_can_backend.emulator.parameters import ParameterStore, make_factory_defaults
+from snakesim_can_backend.protocol.codec import load_layouts
+from snakesim_can_backend.protocol.commands import make_command, make_sync
+from snakesim_can_backend.protocol.definitions import (
+    CommandAction,
+    Frame,
+    ModuleParameter,
+    ModuleState,
+    Opcode,
+    ParameterOperation,
+    parse_node,
+    parse_opcode,
+)
+from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.thermal import HeatLimits
+from snakesim_hal.wire.messages import Mode
+from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.frames import read
+
+NODE = 3
+SERIAL = 0xC0FFEE
+MS = 1000.0
+BOOTED = 100 * MS
+HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
+QUIET = ModuleReadings(0, 0, 0)
+
+
+def setpoint(count: int, mode: Mode = Mode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE) -> Frame:
+    signal = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque", Mode.PASSIVE: "torque"}[mode]
+    values: dict[str, float] = {"mode": mode, "count": count % 16, signal: target, "torque_limit": limit}
+    return load_layouts()[Opcode.SET_POINT].encode(node, **values)
+
+
+def parameter(index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node: int = NODE) -> Frame:
+    frame = load_layouts()[Opcode.PARAMETER_REQUEST].encode(node, index=index, value=value)
+    return Frame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])  # also operations that there are not
+
+
+def only(frames: Sequence[Frame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
+    return [read(f) for f in frames if parse_opcode(f.id) == opcode and node in (None, parse_node(f.id))]
+
+
+def new_module(**flash: float) -> ModuleFirmware:
+    values = make_factory_defaults(5.0, 6.0) | {ModuleParameter[name.upper()]: value for name, value in flash.items()}
+    return ModuleFirmware(NODE, SERIAL, ParameterStore(values), HEAT)
+
+
+def booted(**flash: float) -> ModuleFirmware:
+    module = new_module(**flash)
+    module.poll(BOOTED)
+    module.frames.clear()
+    assert module.state == ModuleState.DISARMED
+    return module
+
+
+def armed(**flash: float) -> ModuleFirmware:
+    module = booted(**flash)
+    module.receive(make_command(CommandAction.ARM), BOOTED)
+    module.frames.clear()
+    assert module.state == ModuleState.ARMED
+    return module
+
+
+def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -> ModuleChain:
+    """On the inertia physics model, with the robot's gains in every flash."""
+    run = run or config()
+    physics_model = given.pop("physics_model", None) or InertiaModel(run, InertiaSettings())
+    settings = CanSettings(**{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__})
+    made = ModuleChain(run, settings, physics_model, stepped=stepped, **given)
+    motor = run.robot.motor
+    for slot in made.slots:
+        slot.module.parameters.values |= {
+            ModuleParameter.STIFFNESS: motor.stiffness_nm_per_rad,
+            ModuleParameter.DAMPING: motor.damping_nm_s_per_rad,
+            ModuleParameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
+        }
+    return made
+
+
+class Host:
+    """Ticks of a stepped chain with one bus: Sync, answers, setpoints."""
+
+    def __init__(self, made: ModuleChain) -> None:
+        self.chain, self.count = made, -1
+        made.take_frames(0)
+
+    def arm(self) -> None:
+        self.tick()
+        self.chain.receive(0, make_command(CommandAction.ARM))
+
+    def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+        self.count += 1
+        self.chain.receive(0, make_sync(self.count, self.count * 10_000))
+        frames = self.chain.take_frames(0)
+        if target is not None:
+            for node in range(1, self.chain.module_count + 1):
+                self.chain.receive(0, setpoint(self.count, mode, target, 4.0, node))
+        return frames
+
+    def ticks(self, count: int, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+        """So many; the frames of the last."""
+        return [self.tick(target, mode) for _ in range(count)][-1]
+
+    def states(self) -> list[ModuleState]:
+        return [slot.module.state for slot in self.chain.slots[: self.chain.module_count]]
+
+
+def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], Traffic, Traffic, int]:
+    """A whole bus for some time; how late each joint state came, in periods, and the traffic."""
+    emulators = chain(config(joints, rate_hz=rate_hz), stepped=False)
+    emulators.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
+    for slot in emulators.slots:
+        slot.module.parameters.values |= {ModuleParameter.CONTACT_EVERY: 1.0, ModuleParameter.IMU_EVERY: 20.0}
+    emulators.advance_to(110_000.0)
+    emulators.receive(0, make_command(CommandAction.ARM))
+    period_us, before = 1e6 / rate_hz, emulators.traffic()[0]
+    late: list[int] = []
+    backlog = 0
+    for tick in range(round(seconds * rate_hz)):
+        emulators.advance_to(110_000.0 + tick * period_us)
+        for answer in emulators.take_frames(0):
+            if parse_opcode(answer.id) == Opcode.JOINT_STATE:
+                late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
+        emulators.receive(0, make_sync(tick, 0))
+        for node in range(1, joints + 1):
+            emulators.receive(0, setpoint(tick, node=node, target=0.0))
+        backlog = max(backlog, sum(map(len, emulators.buses[0]._waiting.values())))
+    return late, before, emulators.traffic()[0], backlog

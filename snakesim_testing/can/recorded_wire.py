@@ -1,0 +1,92 @@
+"""A driver on a bus that keeps what went over it, and what its modules are doing."""
+
+from collections.abc import Callable
+
+from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire
+from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    CommandAction,
+    Frame,
+    ModuleState,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
+from snakesim_hal.wire.messages import LifecycleState
+from snakesim_testing.can.driver_loop import Loop, chain_of
+from snakesim_testing.can.frames import read
+
+ARMED, DISARMED, EMERGENCY = ModuleState.ARMED, ModuleState.DISARMED, ModuleState.EMERGENCY
+Which = Callable[[Frame], bool]
+
+
+def none(_frame: Frame) -> bool:
+    return False
+
+
+class RecordedWire(VirtualWire):
+    """A virtual bus that keeps what went over it, and does not take, or loses, what a test says."""
+
+    def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
+        super().__init__(channel, peer)
+        self.sent: list[Frame] = []
+        self.all: list[Frame] = []
+        self.refuses: Which = none
+        self.loses: Which = none
+        self.deaf_to: Which = none
+        self.closed = 0
+        WIRES.append(self)
+
+    def send(self, frame: Frame) -> bool:
+        if self.refuses(frame):
+            return False
+        self.sent.append(frame)
+        self.all.append(frame)
+        return self.loses(frame) or super().send(frame)
+
+    def receive(self) -> list[Frame]:
+        frames = [frame for frame in super().receive() if not self.deaf_to(frame)]
+        self.all += frames
+        return frames
+
+    def close(self) -> None:
+        self.closed += 1
+        super().close()
+
+
+WIRES: list[RecordedWire] = []
+
+
+def is_action(frame: Frame, *actions: CommandAction) -> bool:
+    return parse_opcode(frame.id) == Opcode.COMMAND and read(frame)["action"] in actions
+
+
+def is_set_point(frame: Frame) -> bool:
+    return parse_opcode(frame.id) == Opcode.SET_POINT
+
+
+def words(frames: list[Frame]) -> list[str]:
+    """What the host said beside Syncs and setpoints."""
+    found = []
+    for frame in frames:
+        opcode = Opcode(parse_opcode(frame.id))
+        if opcode == Opcode.COMMAND:
+            who = "" if parse_node(frame.id) == BROADCAST else f" {parse_node(frame.id)}"
+            found.append(CommandAction(int(read(frame)["action"])).name.lower() + who)
+        elif opcode == Opcode.EMERGENCY:
+            found.append("emergency")
+    return found
+
+
+def module_of(run: Loop, node: int) -> ModuleFirmware:
+    return chain_of(run.backend).slots[node - 1].module
+
+
+def go(run: Loop, lifecycle: LifecycleState, ticks: int = 1) -> list[Frame]:
+    """So many ticks in a state, whatever is found; what was sent meanwhile."""
+    before = len(WIRES[0].sent)
+    for _ in range(ticks):
+        run.lifecycle = lifecycle
+        run.run(1)
+    return WIRES[0].sent[before:]

@@ -1,0 +1,1 @@
+"""Drivers and emulated drives, one tick after the other."""

@@ -1,0 +1,1 @@
+"""Robots, paths and truth for tests of guidance, navigation and control."""

@@ -1,0 +1,1 @@
+"""Robots, hosts and networks of the HAL, small enough for tests."""

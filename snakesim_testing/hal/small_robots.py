@@ -1,0 +1,216 @@
+"""Small robots, configurations and files for the tests of the HAL."""
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.model.robot import RobotFile, describe_robot
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Clock, Contact, Description, JointCommand, JointState, Mode, Pose, Power, Status
+
+PERIOD_NS = 10_000_000
+LEASE_NS = 50_000_000
+
+ROBOT_TOML = """\
+name = "worm"
+[chain]
+modules = 3
+axes = ["yaw"]
+[module]
+length_m = 0.1
+radius_m = 0.03
+mass_kg = 0.2
+[limits]
+angle_rad = 1.5
+speed_rad_s = 5.0
+acceleration_rad_s2 = 100.0
+torque_nm = 4.0
+torque_rate_nm_s = 80.0
+[motor]
+stiffness_nm_per_rad = 40.0
+damping_nm_s_per_rad = 1.0
+velocity_gain_nm_s_per_rad = 1.0
+response_time_s = 0.01
+armature_kg_m2 = 0.005
+[sensors.pose]
+rate_hz = 50.0
+"""
+ROBOT: dict[str, Any] = {**tomllib.loads(ROBOT_TOML), "safety": {"action": "damp", "max_step_rad": 0.3}}
+del ROBOT["sensors"]
+SCENE: dict[str, Any] = {"name": "plain", "ground": {"friction": 0.1}}
+RUN: dict[str, Any] = {
+    "name": "crawl",
+    "robot": ROBOT,
+    "scene": SCENE,
+    "backend": "lag",
+    "controller": "hold",
+    "clock_mode": "lockstep",
+    "services": {"control": {}},
+    "start": {"on_route": False},
+}
+
+SCENE_TOML = """\
+name = "bend"
+[ground]
+friction = 0.1
+[route]
+kind = "sine"
+amplitude_m = 0.05
+wavelength_m = 0.8
+length_m = 2.0
+[[cylinder]]
+position_m = [1.0, 1.0]
+radius_m = 0.05
+[[cylinder]]
+position_m = [1.5, 1.0]
+radius_m = 0.05
+"""
+SCENARIO_TOML = """\
+title = "A test"
+robot = "worm.toml"
+scene = "bend.toml"
+controller = "hold"
+rate_hz = 100
+[start]
+tail_s_m = 0.1
+[services.control]
+[services.guidance]
+decimation = 2
+[controllers.hold]
+"""
+
+
+def changed(base: dict[str, Any], **dotted: Any) -> dict[str, Any]:
+    """A copy with other values; `__` in a name stands for the dot: limits__torque_nm=0.1."""
+    copied = copy.deepcopy(base)
+    for name, value in dotted.items():
+        *parents, last = name.split("__")
+        place = copied
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = value
+    return copied
+
+
+def robot_file(**dotted: Any) -> RobotFile:
+    """The test robot, with changes."""
+    return msgspec.convert(changed(ROBOT, **dotted), RobotFile)
+
+
+def run_config(**dotted: Any) -> RunConfig:
+    """The test run, with changes."""
+    return msgspec.convert(changed(RUN, **dotted), RunConfig)
+
+
+def description(*, simulated_time: bool = False, **dotted: Any) -> Description:
+    """The test robot as a HAL publishes it."""
+    reported = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
+    return describe_robot(robot_file(**dotted), simulated_time=simulated_time, **reported)
+
+
+def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any) -> JointState:
+    """A joint state; single numbers stand for all joints."""
+    count = len(robot.joints)
+
+    def column(value: Any) -> list[Any]:
+        return list(value) if isinstance(value, list | tuple) else [value] * count
+
+    values: dict[str, Any] = {"tick": 0, "timestamp_ns": 0, "valid": [True] * count, "age_ns": [0] * count, **other}
+    return JointState(angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values)
+
+
+def command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> JointCommand:
+    """A command, good unless changed; a single target or mode stands for all joints."""
+    count = len(robot.joints)
+    values: dict[str, Any] = {
+        "tick": 0,
+        "sequence": 1,
+        "lease_epoch": 1,
+        "layout": robot.layout,
+        "valid_for_ns": LEASE_NS,
+        "mode": mode if isinstance(mode, list) else [mode] * count,
+        "target": list(target) if isinstance(target, list | tuple) else [target] * count,
+        **other,
+    }
+    return JointCommand(**values)
+
+
+def power(
+    motor_c: Any = 20.0, voltage_v: Any = 24.0, leak: Any = False, valid: Any = True, *, joints: int = 3, **other: Any
+) -> Power:
+    """What modules tell of their health; a single value stands for all joints."""
+
+    def column(value: Any) -> list[Any]:
+        return value if isinstance(value, list) else [value] * joints
+
+    values: dict[str, Any] = {"motor_c": motor_c, "voltage_v": voltage_v, "leak": leak, "valid": valid, **other}
+    columns = {name: column(value) for name, value in values.items()}
+    return Power(tick=0, timestamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
+
+
+def pose(tick: int = 0, timestamp_ns: int = 0, **other: Any) -> Pose:
+    """A body at rest at the origin, unless configured otherwise."""
+    still = (0.0, 0.0, 0.0)
+    values = {"position_w": still, "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
+    values |= {"velocity_w": still, "angular_velocity_w": still, **other}
+    return Pose(tick=tick, timestamp_ns=timestamp_ns, **values)
+
+
+def contact(link: int = 0, **other: Any) -> Contact:
+    """A touch from the left that presses nothing, unless configured otherwise."""
+    still = (0.0, 0.0, 0.0)
+    values = {"position_l": still, "normal_l": (0.0, -1.0, 0.0), "force_l": still, "torque_l": still}
+    values |= {"tangent_1_l": (1.0, 0.0, 0.0), "tangent_2_l": (0.0, 0.0, 1.0)}
+    return Contact(link=link, **{"obstacle": None, **values, **other})
+
+
+def clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:
+    """A clock of 100 Hz in lockstep, armed if it names an arming."""
+    values = {
+        "clock_mode": "lockstep",
+        "lifecycle": "armed" if arm_session else "disarmed",
+        "lease_epoch": 1,
+        "newest": {},
+    }
+    return Clock(
+        tick=tick, timestamp_ns=tick * PERIOD_NS, period_ns=PERIOD_NS, arm_session=arm_session, **{**values, **other}
+    )
+
+
+def write_files(
+    folder: Path, *, robot: str = ROBOT_TOML, scene: str = SCENE_TOML, scenario: str = SCENARIO_TOML
+) -> str:
+    """A scenario with its robot and scene beside it; returns the scenario's path."""
+    (folder / "worm.toml").write_text(robot)
+    (folder / "bend.toml").write_text(scene)
+    (folder / "crawl.toml").write_text(scenario)
+    return str(folder / "crawl.toml")
+
+
+def status(**reported: Any) -> Status:
+    """What a host of the worm tells, with these values."""
+    values: dict[str, Any] = {
+        "tick": 0,
+        "timestamp_ns": 0,
+        "robot": "worm",
+        "backend": "lag",
+        "clock_mode": "realtime",
+        "rate_hz": 100.0,
+        "lifecycle": "armed",
+        "reason": "armed",
+        "lease_holder": None,
+        "lease_epoch": 0,
+        "overruns": 0,
+        "commands_accepted": 0,
+        "commands_standby": 0,
+        "commands_rejected": {},
+        "commands_limited": {},
+        "faults": [],
+        "alive": [],
+        "waiting_for": [],
+        "ready_to_arm": False,
+    }
+    return Status(**{**values, **reported})

@@ -1,0 +1,127 @@
+"""A connection to a console as its page opens one, that says what it likes; and plain HTTP."""
+
+import contextlib
+import http.client
+import threading
+import time
+from importlib.metadata import version
+from typing import Any
+
+import msgspec.msgpack
+import zstandard
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
+
+from snakesim_testing.harness.wait import LIMIT_S, wait_until
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, 3.0],
+    "fov": 0.75,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 600,
+    "image_width": 800,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+STOP = "EMERGENCY STOP  (Esc)"
+
+
+class Page:
+    """One viewer. A context manager."""
+
+    def __init__(self, address: str, origin: str | None = None, *, draws: bool = True) -> None:
+        """address: http://...; origin: of the page. Raises InvalidStatus when it is refused.
+
+        draws: whether it has a scene; one without WebGL does not say where its camera is.
+        """
+        self._socket = connect(
+            address.replace("http", "ws"),
+            origin=None if origin is None else Origin(origin),
+            subprotocols=[Subprotocol(f"viser-v{version('viser')}")],
+            compression=None,
+            max_size=None,
+            proxy=None,
+            open_timeout=LIMIT_S,
+        )
+        self.controls: dict[str, dict[str, Any]] = {}  # by their id
+        self.closed_by: int | None = None
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        if draws:
+            self.say(CAMERA)
+
+    def __enter__(self) -> "Page":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def say(self, message: Any) -> None:
+        """Send a message; bytes and text as they are."""
+        raw = message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message)
+        with contextlib.suppress(ConnectionClosed):
+            self._socket.send(raw)
+
+    def find(self, label: str) -> str:
+        """The id of the control with a label, once it is there."""
+        return wait_until(lambda: self._found(label), f"{label!r} on the page", 60.0)
+
+    def change(self, control: str, updates: Any) -> None:
+        """Say that a control, by its id, has other values."""
+        self.say({"type": "GuiUpdateMessage", "uuid": control, "updates": updates})
+
+    def click(self, label: str) -> None:
+        """Press a button."""
+        self.change(self.find(label), {"value": True})
+
+    def ended(self) -> int | None:
+        """The code with which the console suspended up, if it has."""
+        self._reader.join(10.0)
+        return self.closed_by
+
+    def _found(self, label: str) -> str | None:
+        return next((uuid for uuid, props in list(self.controls.items()) if props.get("label") == label), None)
+
+    def _read(self) -> None:
+        unzip = zstandard.ZstdDecompressor()
+        try:
+            while True:
+                data = self._socket.recv()
+                assert isinstance(data, bytes)
+                size, packed = int.from_bytes(data[:8], "little"), int.from_bytes(data[8:16], "little")
+                for message in msgspec.msgpack.decode(unzip.decompress(data[16 : 16 + packed], size))["messages"]:
+                    self._take(message)
+        except ConnectionClosed as closed:
+            self.closed_by = None if closed.rcvd is None else closed.rcvd.code
+
+    def _take(self, message: dict[str, Any]) -> None:
+        if "props" in message and "uuid" in message:
+            self.controls[message["uuid"]] = dict(message["props"])
+        elif message["type"] == "GuiUpdateMessage":
+            self.controls.setdefault(message["uuid"], {}).update(message["updates"])
+        elif message["type"] == "LocalStorageGetItemRequestMessage":
+            answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
+            self.say({"type": "LocalStorageGetItemResponseMessage", **answer})
+
+
+def ask(address: str, method: str, path: str = "/stop", **headers: str) -> tuple[int, str]:
+    """Status and text of an HTTP request."""
+    connection = http.client.HTTPConnection(address.removeprefix("http://"), timeout=20.0)
+    with contextlib.closing(connection):
+        connection.request(method, path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode()
+
+
+def flood(address: str, message: Any, seconds: float) -> int:
+    """Send one message over and over; how often it went."""
+    sent, end_s = 0, time.monotonic() + seconds
+    with Page(address) as page:
+        while time.monotonic() < end_s:
+            page.say(message)
+            sent += 1
+    return sent

@@ -1,0 +1,46 @@
+"""The processes of a run, as the system knows them."""
+
+import contextlib
+import re
+from pathlib import Path
+
+from snakesim_testing.harness.wait import wait_until
+
+SERVICE = re.compile(r"snakesim_hal\.programs\.service_program\0(\w+)\0")
+PROGRAMS = {
+    "snakesim_hal.programs.host_program": "host",
+    "snakesim_hal.programs.router_program": "router",
+    "snakesim_operator.recording.recorder_process": "recorder",
+    "snakesim_can_backend.emulator": "emulators",
+}
+
+
+def processes_with(file: str, content: str) -> list[tuple[int, str]]:
+    """(pid, NUL-separated command line) of every live process with a content in its `cmdline`, `environ` or so."""
+    found: list[tuple[int, str]] = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError, IndexError):  # gone in the meantime, or somebody else's
+            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+            if state != "Z" and content.encode() in (entry / file).read_bytes():
+                found.append((int(entry.name), (entry / "cmdline").read_bytes().decode(errors="replace")))
+    return found
+
+
+def processes_of(out: Path) -> list[tuple[int, str]]:
+    """Those that were started for a run's folder."""
+    return processes_with("cmdline", f"{out}/config.json")
+
+
+def parts_of(out: Path) -> dict[str, int]:
+    """Process ids of a run's parts, by name; a second process of the same name is `NAME again`."""
+    found: dict[str, int] = {}
+    for pid, line in sorted(processes_of(out)):
+        service = SERVICE.search(line)
+        name = service[1] if service else next((name for module, name in PROGRAMS.items() if module in line), "run")
+        found[f"{name} again" if name in found else name] = pid
+    return found
+
+
+def nothing_left(out: Path, limit_s: float = 10.0) -> None:
+    """Fail unless every process of a run is gone soon."""
+    wait_until(lambda: not processes_of(out), f"no process of {out} left", limit_s)

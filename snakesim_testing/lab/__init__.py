@@ -1,0 +1,1 @@
+"""A lab on loopback, with certificates and a router."""

@@ -1,0 +1,1 @@
+"""Recorded runs, browsers and viewers for tests of the operator package."""

@@ -1,0 +1,13 @@
+"""Clock samples for recordings."""
+
+import time
+
+from snakesim_hal.network.session import Arrival
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode, format_encoding
+from snakesim_hal.wire.messages import Clock
+from snakesim_testing.hal import small_robots as rig
+
+
+def clock(tick: int) -> Arrival:
+    return Arrival(keys.CLOCK, encode(rig.clock(tick)), format_encoding(Clock), time.monotonic_ns())

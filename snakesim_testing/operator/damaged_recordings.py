@@ -1,0 +1,68 @@
+"""A recording of many chunks, and copies of it that are damaged in one known way."""
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.recording import mcap_file, writer
+from snakesim_operator.recording.chunks import HEAD
+from snakesim_operator.run.in_process import simulate
+
+
+@dataclass(frozen=True)
+class Span:
+    """A record of the file."""
+
+    opcode: int
+    begin: int
+    end: int
+
+
+def spans(content: bytes | bytearray, magic: int = 8) -> list[Span]:
+    """All records of a whole file; or of a chunk, which has no magic bytes around them."""
+    found, at = list[Span](), magic
+    while at < len(content) - magic:
+        opcode, length = HEAD.unpack_from(content, at)
+        found.append(Span(opcode, at, at + HEAD.size + length))
+        at = found[-1].end
+    return found
+
+
+def chunks(content: bytes) -> list[Span]:
+    """The chunks of a whole file, without their indices."""
+    return [span for span in spans(content) if span.opcode == Opcode.CHUNK]
+
+
+def flipped(content: bytes, at: int) -> bytes:
+    """With one bit changed."""
+    return content[:at] + bytes([content[at] ^ 0x10]) + content[at + 1 :]
+
+
+def recorded(out: Path, duration_s: float, chunk_bytes: int) -> Path:
+    """A short run, in many small chunks as a long recording has them."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(mcap_file, "CHUNK_BYTES", chunk_bytes)
+        patched.setattr(writer, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
+        simulate(load("peg_row", [parse_set(f"duration_s={duration_s}")]).config, out)
+    return out
+
+
+def packed(content: bytes, compression: str = "zstd", data: bytes | None = None) -> bytes:
+    """A chunk record. data: in place of the compressed content."""
+    builder = RecordBuilder()
+    body = zstandard.compress(content) if data is None else data
+    Chunk(compression, body, 0, 0, zlib.crc32(content), len(content)).write(builder)
+    return builder.end()
+
+
+def written(path: Path, content: bytes) -> Path:
+    """The file."""
+    path.write_bytes(content)
+    return path

@@ -1,0 +1,1 @@
+"""The `snakesim` command and whole runs, in processes or in one."""

@@ -1,0 +1,33 @@
+"""A lab's folder with a robot, a scenario and a backend of its own, and the host that it runs there."""
+
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from snakesim_hal.model.files import SHIPPED
+from snakesim_testing.runs.command import SNAKESIM, environment
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.in_process_command import snakesim
+
+
+def lab_folder(folder: Path, joints: int, scenario: str, files: Mapping[str, str]) -> Path:
+    """A shorter `planar13` as snake.toml, its bench.toml, and more files by their names."""
+    snake = (SHIPPED / "robots" / "planar13.toml").read_text().replace("modules = 13", f"modules = {joints}")
+    for name, text in {"snake.toml": snake, "bench.toml": scenario, **files}.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+@contextmanager
+def host(home: Path, backend: str) -> Iterator[str]:
+    """A host, disarmed; its endpoint."""
+    endpoint = free_endpoint()
+    program = [*SNAKESIM, "start", "host", "bench.toml", "--backend", backend, "--endpoint", endpoint]
+    with subprocess.Popen(program, cwd=home, env=environment(home), stdin=subprocess.DEVNULL) as process:
+        try:
+            wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")
+            yield endpoint
+        finally:
+            process.terminate()

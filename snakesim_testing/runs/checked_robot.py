@@ -1,0 +1,52 @@
+"""A robot with serial numbers whose joints can be checked."""
+
+from pathlib import Path
+import pytest
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.runs.bench import lab_folder
+from snakesim_testing.runs.command import Ended, snakesim
+
+
+REAL = '''
+from pathlib import Path
+
+import msgspec
+
+from snakesim_sim_backend.backend import SimBackend
+
+
+class Real(SimBackend):
+    """The simulator, which says that it is a robot, and whose drives say their serial numbers."""
+
+    def describe(self):
+        described = super().describe()
+        serials = Path("serials").read_text().split()
+        joints = [
+            msgspec.structs.replace(joint, serial=serial)
+            for joint, serial in zip(described.joints, serials, strict=True)
+        ]
+        return msgspec.structs.replace(described, backend="real", hardware="can0", emulated=False, joints=joints)
+'''
+
+
+SCENARIO = """
+robot = "./snake.toml"
+scene = "flat"
+controller = "hold"
+clock_mode = "lockstep"
+rate_hz = 100
+seed = 1
+
+[start]
+on_route = false
+
+[services.control]
+latency_ticks = 2
+"""
+
+
+JOINTS = 3
+
+
+def make_checked_folder(folder: Path) -> Path:
+    return lab_folder(folder, JOINTS, SCENARIO, {"real.py": REAL, "serials": "A1 B2 C3"})

@@ -1,0 +1,74 @@
+"""A robot whose emulated drives a test turns as a person would by hand."""
+
+import json
+import subprocess
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+import numpy as np
+import pytest
+from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.robot import RobotFile
+from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.bench import host, lab_folder
+from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.in_process_command import snakesim
+
+
+JOINTS = 4
+
+
+BACKEND = "./held.py:Held"
+
+
+HELD = '''
+
+import json
+from pathlib import Path
+
+from snakesim_drivers.mounting import Mounting
+
+
+class Held(Workbench):
+    """Drives that somebody turns by hand: their angles stand in a file."""
+
+    def sample(self, tick, timestamp_ns):
+        drives = np.array(json.loads(Path("drives.json").read_text()))
+        self.angle = Mounting(self.robot.joint_table).to_joint_angle_rad(drives)
+        return super().sample(tick, timestamp_ns)
+'''
+
+
+SCENARIO = """
+robot = "./snake.toml"
+scene = "flat"
+controller = "hold"
+clock_mode = "realtime"
+rate_hz = 50
+
+[start]
+on_route = false
+
+[services.control]
+"""
+
+
+def make_hand_turned_folder(folder: Path) -> Path:
+    """A lab's folder: robot file with a comment, scenario, backend."""
+    return lab_folder(folder, JOINTS, SCENARIO, {"held.py": text_of_the_example() + HELD})
+
+
+def robot(home: Path) -> RobotFile:
+    """The robot file as it stands."""
+    return decode(read_part(str(home / "snake.toml"), "robots"), RobotFile)
+
+
+def seen(home: Path, endpoint: str, angle_rad: float) -> None:
+    """Wait until the host publishes an angle of joint_1."""
+
+    def published() -> bool:
+        said = snakesim("echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
+        return abs(json.loads(said)["message"]["angle_rad"][0] - angle_rad) < 1e-3
+
+    wait_until(published, f"joint_1 at {angle_rad} rad")

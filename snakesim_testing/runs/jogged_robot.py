@@ -1,0 +1,54 @@
+"""A robot that claims to be real and was not checked, and what its backend received."""
+
+import json
+import os
+import pty
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+import pytest
+from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.bench import host, lab_folder
+from snakesim_testing.runs.command import background
+from snakesim_testing.runs.in_process_command import snakesim
+from snakesim_testing.runs.hand_turned_robot import JOINTS, SCENARIO
+
+
+BACKEND = "./told.py:Told"
+
+
+TOLD = """
+
+import json
+from pathlib import Path
+
+
+class Told(Workbench):
+    \"\"\"What it is told stands in a file.\"\"\"
+
+    ticks = 0
+
+    def enact(self, setpoints, lifecycle):
+        super().enact(setpoints, lifecycle)
+        self.ticks += 1
+        told = {"tick": self.ticks, "lifecycle": lifecycle, "mode": setpoints.mode, "target": setpoints.target}
+        Path("new.json").write_text(json.dumps({**told, "limit_nm": setpoints.torque_limit_nm}))
+        Path("new.json").replace("told.json")
+"""
+
+
+def make_jogged_folder(folder: Path) -> Path:
+    real = text_of_the_example().replace("emulated=True", "emulated=False")
+    return lab_folder(folder, JOINTS, SCENARIO, {"told.py": real + TOLD})
+
+
+def told(home: Path) -> dict[str, Any]:
+    return json.loads((home / "told.json").read_text())
+
+
+def stopped(home: Path) -> bool:
+    return told(home)["lifecycle"] == "fault"

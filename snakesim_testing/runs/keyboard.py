@@ -1,0 +1,73 @@
+"""An operator at the keyboard of `snakesim teleop`."""
+
+import contextlib
+import math
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+import pytest
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import SNAKESIM, Running, environment, running
+
+
+UP, LEFT = b"\x1b[A", b"\x1b[D"
+
+
+class Terminal:
+    """A pseudo-terminal with teleop in it."""
+
+    def __init__(self, run: Running, cwd: Path) -> None:
+        self.ours, self._theirs = pty.openpty()
+        self.before = termios.tcgetattr(self._theirs)
+        self._said = b""
+        self.process = subprocess.Popen(
+            [*SNAKESIM, "teleop", "--endpoint", run.endpoint, "--fastest", "0.2"],
+            stdin=self._theirs,
+            stdout=self._theirs,
+            stderr=self._theirs,
+            cwd=cwd,
+            env=environment(cwd),
+            start_new_session=True,
+        )
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError):
+            while data := os.read(self.ours, 4096):
+                self._said += data
+
+    def type(self, data: bytes) -> None:
+        os.write(self.ours, data)
+
+    def shows(self, words: str) -> None:
+        wait_until(lambda: words in self.said, f"{words!r} in the terminal")
+
+    @property
+    def said(self) -> str:
+        return self._said.decode(errors="replace")
+
+    @property
+    def given_back(self) -> bool:
+        """Whether the terminal is as it was before."""
+        return termios.tcgetattr(self._theirs) == self.before
+
+
+@contextlib.contextmanager
+def at_the_keyboard(run: Running, cwd: Path) -> Iterator[Terminal]:
+    terminal = Terminal(run, cwd)
+    try:
+        terminal.shows("SPACE: EMERGENCY STOP")
+        yield terminal
+    finally:
+        if terminal.process.poll() is None:
+            terminal.process.kill()
+        terminal.process.wait(10)

@@ -1,0 +1,1 @@
+"""Small robots and scenes in the simulator."""

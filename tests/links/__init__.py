@@ -1,6 +1,0 @@
-"""A lab of network namespaces: links that are cut, lose and delay packets, and routers that die.
-
-`relay`     a link that loses and delays, packet by packet
-`lab`       the programs of a robot on three machines
-`__main__`  `python -m tests.links --write` writes docs/lab-links.md
-"""

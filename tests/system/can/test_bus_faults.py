@@ -1,0 +1,201 @@
+"""What goes wrong with a bus, as the driver sees it on a kernel interface: what it says, and what the modules do.
+
+Times are the modules' and the driver's periods of 10 ms, not this machine's: see `shared_bus`.
+"""
+
+import socket
+
+import pytest
+
+from snakesim_can_backend.driver.module_monitor import IN_A_ROW
+from snakesim_can_backend.protocol.definitions import ModuleState, Opcode, frame_id, parse_opcode
+from snakesim_testing.can.driver_loop import cleared_and_armed_again
+from snakesim_testing.can.interface import frame, ip, must, tc
+from snakesim_testing.can.shared_bus import SharedBus, shared_bus
+
+NODES = [1, 2, 3, 4]
+PERIOD_MS, WATCHDOG_MS, LEASE_MS = 10, 100, 50
+CAN_ERR_FLAG, CAN_EFF_FLAG, CAN_RTR_FLAG = 0x20000000, 0x80000000, 0x40000000
+ACK, BUSOFF = 0x20, 0x40  # classes of linux/can/error.h
+
+
+def moves_again(run: SharedBus) -> None:
+    """Once a person has cleared the fault and armed."""
+    cleared_and_armed_again(run)
+    assert max(run.true_speed_rad_s[-10:]) > 0.1
+
+
+def set_points_out(run: SharedBus) -> int:
+    return sum(parse_opcode(sent.id) == Opcode.SET_POINT for sent in run.wire.sent)
+
+
+# --- the interface -----------------------------------------------------------------------------------------
+
+
+def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_channel: str) -> None:
+    with shared_bus(spare_channel) as run:
+        must(ip("link", "set", spare_channel, "down"))
+        start = run.tick
+        run.run(WATCHDOG_MS // PERIOD_MS + 3, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "interface_down" and fault.cause.startswith(f"{spare_channel}: the interface is down")
+        assert run.lifecycle == "fault" and fault.tick - start <= 1
+        assert run.true_states() == [ModuleState.FAULT] * 4, "the modules' own watchdogs"
+        stopped_ms = PERIOD_MS * next(n for n in range(1, 20) if run.true_state_at[start + n] == {ModuleState.FAULT})
+        assert stopped_ms <= WATCHDOG_MS + PERIOD_MS
+        run.run(40)
+        assert run.at_rest() and len(run.faults) == 1
+        must(ip("link", "set", spare_channel, "up"))
+        run.run(10)
+        assert run.states() == [ModuleState.FAULT] * 4 and run.watch_seen("interface_up") == 1
+        reported = {f.what for f in run.faults[1:]}
+        assert reported and reported <= {"module_watchdog", "module_fault"}, "now they can tell"
+        moves_again(run)
+
+
+@pytest.mark.slow
+def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_channel: str) -> None:
+    with shared_bus(spare_channel) as run:
+        must(ip("link", "delete", spare_channel))
+        run.run(20, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "interface_down"
+        must(ip("link", "add", spare_channel, "type", "vcan"))
+        must(ip("link", "set", spare_channel, "up"))
+        run.wire.server.wires[0].errors()  # the modules were never unplugged; only on this bus do they need this
+        run.run(10)
+        assert run.watch_seen("interface_up") == 1
+        moves_again(run)
+
+
+# --- a transmit queue that stays full ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def slow_channel(spare_channel: str) -> str:
+    """An interface that can be told to let next to nothing out: a traffic limit stands in for nobody acknowledging."""
+    clog(spare_channel)
+    unclog(spare_channel)
+    return spare_channel
+
+
+def clog(channel: str, frames: int = 2) -> None:
+    queue = ("rate", "8bit", "burst", "16", "limit", str(16 * frames))
+    limited = tc("qdisc", "add", "dev", channel, "root", "tbf", *queue)
+    if limited.returncode:
+        pytest.skip(f"no traffic limit here: {limited.stderr.strip()}")
+
+
+def unclog(channel: str) -> None:
+    must(tc("qdisc", "del", "dev", channel, "root"))
+
+
+@pytest.mark.slow
+def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_sent_late(slow_channel: str) -> None:
+    with shared_bus(slow_channel) as run:
+        clog(slow_channel)
+        run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "bus_stuck" and "its transmit queue stays full" in fault.cause
+        run.run(20)
+        assert run.true_states() == [ModuleState.FAULT] * 4 and len(run.faults) == 1
+        assert run.watch_seen("queue_full") > 0
+        unclog(slow_channel)
+        before = set_points_out(run)
+        run.run(5)
+        assert set_points_out(run) == before, "no setpoint of before goes out"
+        moves_again(run)
+
+
+@pytest.mark.slow
+def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_goes_on(slow_channel: str) -> None:
+    with shared_bus(slow_channel) as run:
+        clog(slow_channel)
+        run.run(IN_A_ROW - 1, run.waving)
+        unclog(slow_channel)
+        full, out = run.watch_seen("queue_full"), set_points_out(run)
+        run.run(1, run.waving)
+        assert set_points_out(run) == out + 4, "one for each joint: the latest"
+        run.run(30, run.waving)
+        assert not run.faults and full > 0 and run.states() == [ModuleState.ARMED] * 4
+
+
+@pytest.mark.slow
+def test_a_long_queue_that_fills_this_sockets_share_of_it_is_a_full_queue_too(slow_channel: str) -> None:
+    must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
+    with shared_bus(slow_channel) as run:
+        run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the kernel makes it its minimum
+        clog(slow_channel, frames=1000)
+        run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
+        assert "bus_stuck" in [fault.what for fault in run.faults]
+
+
+# --- error frames --------------------------------------------------------------------------------------------
+
+
+def error_frame(kind: int) -> bytes:
+    return frame(CAN_ERR_FLAG | kind, bytes([0, 0, 0, 0, 0, 0, 130, 7]))
+
+
+def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_socket: socket.socket) -> None:
+    """All kinds are told apart in tests/system/can_bus/test_wire.py."""
+    with shared_bus(channel) as run:
+        raw_socket.send(error_frame(ACK))
+        run.run(5, run.waving)
+        assert run.watch_seen("not_acknowledged") == 1 and not run.faults
+        assert run.states() == [ModuleState.ARMED] * 4
+        raw_socket.send(error_frame(BUSOFF))
+        run.run(2, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "bus_off" and fault.cause.startswith(f"{channel}: transmit errors 130, receive errors 7; ")
+        out = set_points_out(run)
+        run.run(30, run.waving)
+        assert run.lifecycle == "fault" and set_points_out(run) == out, "not one setpoint more"
+        assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest() and len(run.faults) == 1
+        moves_again(run)
+
+
+# --- a reader that is too slow -------------------------------------------------------------------------------
+
+
+def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        ours = run.wire._socket
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel makes it its minimum
+        for _ in range(50):
+            raw_socket.send(frame(frame_id(Opcode.HEALTH, 1)))
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
+        run.run(2, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "receive_overflow"
+        dropped = int(fault.cause.partition("dropped ")[2].partition(" ")[0])
+        kept = run.backend.modules.reading.malformed
+        assert dropped > 0 and dropped + kept == 50
+        moves_again(run)
+
+
+# --- what others say -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        raw_socket.send(frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"))
+        run.run(1, run.waving)
+        assert run.true_states() == [ModuleState.EMERGENCY] * 4, "one frame"
+        run.run(20)
+        assert run.faults[0].what == "emergency" and run.lifecycle == "fault" and run.at_rest()
+        assert run.true_states() == [ModuleState.EMERGENCY] * 4
+        moves_again(run)
+
+
+def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        for number in (frame_id(Opcode.HEARTBEAT, 40), frame_id(Opcode.SYNC, 0), frame_id(Opcode.JOINT_STATE, 1)):
+            for _ in range(5):
+                raw_socket.send(frame(CAN_EFF_FLAG | number, bytes(8)))
+                raw_socket.send(frame(CAN_EFF_FLAG | 0x12340000 | number, bytes(8)))
+                raw_socket.send(frame(CAN_RTR_FLAG | number))
+        assert not [one for one in run.wire.receive() if one.data in (b"", bytes(8))]  # the modules' own are not zero
+        run.run(5, run.waving)
+        assert not run.faults and run.states() == [ModuleState.ARMED] * 4

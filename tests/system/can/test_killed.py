@@ -1,0 +1,119 @@
+"""Processes that are killed with SIGKILL while the robot is armed, as a listener on the bus sees it.
+
+Host, control and modules are the processes of `snakesim run` and `snakesim drive emulate can`. The listener has the
+kernel's time of every frame. `pytest -rP tests/system/can/test_killed.py` prints a row for each.
+"""
+
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_can_backend.can_command import COLUMNS
+from snakesim_can_backend.protocol.definitions import (
+    LastStop,
+    ModuleState,
+    Opcode,
+    parse_node,
+)
+from snakesim_testing.can.listened_bus import (
+    IN_GUEST,
+    JOINTS,
+    LATE_MS,
+    NODES,
+    RATE_HZ,
+    Bench,
+    bench,
+    first_in,
+    passed_for_module_ms,
+    stop_commands,
+    uptimes_ms,
+)
+from snakesim_testing.runs.in_process_command import snakesim
+
+# Several processes in real time are more than a busy emulated machine is sure to keep up with: ARGS="-m slow".
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+@pytest.fixture
+def robot(tmp_path: Path, channel: str) -> Iterator[Bench]:
+    with bench(tmp_path, channel) as made:
+        yield made
+
+
+def killed(process: subprocess.Popen[bytes]) -> int:
+    """SIGKILL; when, by the clock of the listener."""
+    now_ns = time.time_ns()
+    process.kill()
+    process.wait()
+    return now_ns
+
+
+def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: Bench) -> None:
+    _, control = robot.arm()
+    killed_ns = killed(control)
+    passive = {ModuleState.DISARMED}
+    robot.until(lambda: len(first_in(robot.listener.listen(), passive, killed_ns)) == JOINTS, "modules stopped")
+    robot.until(lambda: "lease of control expired" in robot.tell("status").said, "the fault in the status")
+    heard = list(robot.listener.listen())
+    last_ms = (max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT) - killed_ns) / 1e6
+    stop = next(h for h in stop_commands(heard) if h.at_ns > killed_ns)
+    stop_ms = (stop.at_ns - killed_ns) / 1e6
+    rest_ms = max((h.at_ns - stop.at_ns) / 1e6 for h in first_in(heard, passive, killed_ns).values())
+    lease_ms, period_ms = robot.config.lease_ns / 1e6, robot.config.period_ns / 1e6
+    assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
+    assert rest_ms <= 100 + period_ms + LATE_MS
+    print(
+        f"| control, SIGKILL | last setpoint {last_ms:.0f} ms after it, Stop {stop_ms:.0f} ms "
+        f"(lease {lease_ms:.0f} ms, {RATE_HZ:g} Hz) | all modules DISARMED {rest_ms:.0f} ms after Stop "
+        f"| kernel's clock{', emulated machine' if IN_GUEST else ''} |"
+    )
+
+
+def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, channel: str) -> None:
+    host, _ = robot.arm()
+    armed = [ModuleState.ARMED] * JOINTS
+    assert robot.listener.states() == armed, robot.said("host")
+    killed_ns = killed(host)
+    period_ms = robot.config.period_ns / 1e6
+    fault = {ModuleState.FAULT}
+    robot.until(lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS, "modules in fault")
+    beats = {node: len(uptimes_ms(robot.listener.listen(), node)) for node in NODES}
+    robot.until(
+        lambda: all(len(uptimes_ms(robot.listener.listen(), node)) > beats[node] + 1 for node in NODES),
+        "heartbeats",
+    )
+    heard = robot.listener.heard
+    stopped = first_in(heard, fault, killed_ns)
+    assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), "told at once, without a Sync"
+    assert {h.says()["last_stop"] for h in stopped.values()} == {LastStop.WATCHDOG}
+    assert all(h.says()["fault_watchdog"] and h.says()["mode"] == 0 for h in stopped.values())
+    last = {
+        node: max(h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node)
+        for node in NODES
+    }
+    from_host = [h.at_ns for h in heard if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)]
+    last_ms = (max(from_host) - killed_ns) / 1e6
+    took_ms = [(stopped[node].at_ns - last[node]) / 1e6 for node in NODES]
+    own_ms = [passed_for_module_ms(heard, node, last[node], stopped[node].at_ns) for node in NODES]
+    assert last_ms < LATE_MS
+    assert max(took_ms) <= 100 + period_ms + LATE_MS
+    assert max(own_ms) <= 100 + period_ms and min(own_ms) > 100 - period_ms
+    assert robot.listener.states() == [ModuleState.FAULT] * JOINTS
+    print(
+        f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
+        f"motor off, {max(took_ms):.0f} ms after their last setpoint by the kernel's clock, "
+        f"{min(own_ms):.0f} to {max(own_ms):.0f} ms by their own | watchdog 100 ms |"
+    )
+
+    # Whoever looks afterwards sees it.
+    scanned = snakesim("can", "scan", channel, "--seconds", "3", cwd=robot.folder)
+    lines = scanned.out.splitlines()
+    assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
+    rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]
+    assert [r["node"] for r in rows] == [str(node) for node in NODES]
+    assert all((r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows)
+    assert len({r["serial"] for r in rows}) == JOINTS
+    print(f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")

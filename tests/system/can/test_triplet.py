@@ -1,0 +1,48 @@
+"""The shipped scenario over the kernel's CAN bus, with every process of a real run.
+
+`pytest -rP tests/system/can/test_triplet.py` prints a row.
+"""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.runs.command import snakesim
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+ROBOT_TIME_S = "10"
+LIMIT_S = 400.0  # an emulated machine is slow
+
+
+def test_the_triplet_over_the_kernels_bus_is_the_triplet_over_the_virtual_one_to_the_bit(
+    tmp_path: Path, channel: str
+) -> None:
+    over_the_bus = (f'backend.channels=["{channel}"]', 'backend.emulators="process"')
+    records: dict[str, RunRecord] = {}
+    took_s: dict[str, float] = {}
+    for name, sets in (("virtual", ()), (channel, over_the_bus)):
+        began = time.monotonic()
+        arguments = ["triplet", "--backend", "can", "--duration", ROBOT_TIME_S, "--endpoint", free_endpoint()]
+        arguments += [argument for value in ("stall_limit_s=300", *sets) for argument in ("--set", value)]
+        ended = snakesim("run", *arguments, "--out", name, cwd=tmp_path, limit_s=LIMIT_S)
+        took_s[name] = time.monotonic() - began
+        assert ended.code == 0, ended.out + ended.err
+        records[name] = RunRecord.load(tmp_path / name)
+    virtual, real = records["virtual"], records[channel]
+    assert real.host.command_digest == virtual.host.command_digest
+    assert real.host.armed_ticks == virtual.host.armed_ticks == round(float(ROBOT_TIME_S) * 100)
+    for what in ("angle_rad", "mode", "target", "position_w"):
+        assert np.array_equal(getattr(real, what), getattr(virtual, what)), what
+    assert np.isfinite(real.position_w).all(), "the base too: it comes by UDP, as from motion capture"
+    moved_rad = float(np.abs(real.angle_rad[-1] - real.angle_rad[0]).max())
+    assert moved_rad > 0.01, "and it moved"
+    print(
+        f"| triplet, {ROBOT_TIME_S} s of robot time | command digest {real.host.command_digest[:16]} on {channel} and "
+        f"on the virtual bus | joint moved most: {moved_rad:.3f} rad, all angles equal to the bit "
+        f"| {took_s[channel]:.0f} s on {channel}, {took_s['virtual']:.0f} s on the virtual bus |"
+    )

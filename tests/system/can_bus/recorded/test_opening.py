@@ -1,0 +1,189 @@
+"""The whole driver on virtual buses with emulated joint modules: opening it, and a period."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from snakesim_can_backend.bus.bus import VirtualPeer
+from snakesim_can_backend.driver import modules
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.driver.modules import answer_limit_s
+from snakesim_can_backend.emulator.firmware import ModuleFirmware
+from snakesim_can_backend.emulator.server import InProcessEmulators, make_local_emulators
+from snakesim_can_backend.protocol.commands import make_command, make_emergency
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    CommandAction,
+    LastStop,
+    ModuleFault,
+    ModuleParameter,
+    ModuleState,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
+from snakesim_can_backend.settings import CanSettings
+from snakesim_hal.backend import SafeSetpoints
+from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.wire.messages import Mode
+from snakesim_testing.can.driver_loop import JOINTS, config, loop
+from snakesim_testing.can.frames import read
+from snakesim_testing.can.recorded_wire import (
+    DISARMED,
+    EMERGENCY,
+    WIRES,
+    RecordedWire,
+    go,
+    is_action,
+    is_set_point,
+    words,
+)
+from snakesim_testing.messages import raises_error
+
+# --- opening -----------------------------------------------------------------------------------------------
+
+
+def test_bring_up_enables_nothing() -> None:
+    with loop() as run:
+        sent = WIRES[0].sent
+        assert {parse_opcode(frame.id) for frame in sent} == {Opcode.COMMAND, Opcode.PARAMETER_REQUEST, Opcode.SYNC}
+        assert all(
+            is_action(f, CommandAction.IDENTIFY, CommandAction.DISARM)
+            for f in sent
+            if parse_opcode(f.id) == Opcode.COMMAND
+        )
+        disarm = next(i for i, frame in enumerate(sent) if is_action(frame, CommandAction.DISARM))
+        written = next(i for i, frame in enumerate(sent) if parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST)
+        assert disarm < written and parse_node(sent[disarm].id) == BROADCAST
+        assert run.states() == [DISARMED] * JOINTS
+        assert not any(is_set_point(frame) for frame in go(run, "disarmed", 30))
+        assert run.faults == [] and run.true_speed_rad_s == [0.0] * 30
+
+
+def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Deaf(RecordedWire):
+        def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
+            super().__init__(channel, peer)
+            self.deaf_to = lambda frame: parse_opcode(frame.id) == Opcode.JOINT_STATE and parse_node(frame.id) == 2
+
+    monkeypatch.setattr(modules, "VirtualWire", Deaf)
+    with raises_error(BackendError, code="drive/silent", field="joint_2"), loop():
+        pass
+    (wire,) = WIRES
+    assert wire.closed == 1 and words(wire.sent)[-1] == "disarm" and not any(map(is_set_point, wire.sent))
+
+
+def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]) -> None:
+    """When a driver opens its bus, one of the emulators is not as new."""
+
+    def emulators(*given: Any, **more: Any) -> InProcessEmulators:
+        end = make_local_emulators(*given, **more)
+        change(end.server.chain.slots[node - 1].module)
+        return end
+
+    monkeypatch.setattr(modules, "start_local_emulators", emulators)
+
+
+def left_behind(module: ModuleFirmware, kind: str) -> None:
+    """What a module is like whose driver was killed, or worse."""
+    if kind == "emergency":
+        module.receive(make_emergency(), 0.0)
+        return
+    module.receive(make_command(CommandAction.ARM), 0.0)
+    module._fail(ModuleFault.STREAM if kind == "stream" else ModuleFault.WATCHDOG, 0.0)
+    if kind == "leak":  # after the watchdog had stopped it, water came, and went
+        module.health.leak = True
+        module.poll(0.0)
+        module.health.leak = False
+        assert module.last_stop == LastStop.WATCHDOG
+
+
+@pytest.mark.parametrize(
+    ("kind", "state"),
+    [("watchdog", DISARMED), ("stream", DISARMED), ("leak", ModuleState.FAULT), ("emergency", EMERGENCY)],
+)
+def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
+    kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found_as(monkeypatch, 2, lambda module: left_behind(module, kind))
+    with loop() as run:
+        go(run, "disarmed", 2)
+        assert run.states() == [DISARMED, state, DISARMED, DISARMED]
+        assert words(WIRES[0].sent).count("clear 2") == (state == DISARMED)
+        found = [fault for _ in range(3) for fault in (go(run, "disarmed"), *run.faults)[1:]]
+        assert {fault.joint for fault in found} == (set() if state == DISARMED else {"joint_2"})
+
+
+def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    weak = {ModuleParameter.RATED_TORQUE: 1.0}
+    found_as(monkeypatch, 3, lambda module: module.parameters.values.update(weak))
+    with raises_error(BackendError, code="drive/unsupported-setting", field="joint_3"), loop():
+        pass
+
+
+def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert CanBackend.check(config(), CanSettings()) == ("lockstep", "realtime")
+    with raises_error(ConfigError, code="bus/not-available", field="nocan7"):
+        CanBackend.check(config(), CanSettings(channels=["nocan7"]))
+    asked: list[str] = []
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", asked.append)
+    assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
+    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], emulators="process")) == ("lockstep", "realtime")
+    assert asked == ["can0", "can1", "vcan0"]
+    with raises_error(ConfigError, code="bus/not-virtual"):
+        CanBackend.check(config(), CanSettings(emulators="none"))
+    with raises_error(ConfigError, code="drive/unsupported-setting"):
+        CanBackend.check(config(robot__safety__action="hold"), CanSettings())
+    assert WIRES == []
+
+
+def test_joints_are_described_with_the_serials_and_the_firmware_that_their_modules_say() -> None:
+    with loop() as run:
+        joints = run.backend.describe().joints
+        assert len({joint.serial for joint in joints}) == 4 and all(len(joint.serial) == 8 for joint in joints)
+        assert [joint.firmware for joint in joints] == ["1.0"] * 4
+
+
+def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
+    triplet = load_scenario("triplet", [parse_set("clock_mode=realtime")]).config
+    assert answer_limit_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
+    two = CanSettings(channels=["can0", "can1"])
+    assert answer_limit_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
+
+
+# --- a period ----------------------------------------------------------------------------------------------
+
+
+def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> None:
+    change_at = 15
+    speeds = []
+    for torque_nm in (0.0, 1.0):
+        with loop() as run:
+            run.wanted = SafeSetpoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
+            run.arm()
+
+            def wish(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
+                return SafeSetpoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
+
+            run.run(change_at + 5 - run.tick, wish)
+            speeds.append(np.array([samples.joints.velocity_rad_s for samples in run.samples]))
+    moved = (np.abs(speeds[1] - speeds[0]) > 1e-9).any(axis=1)
+    assert not moved[: change_at + 2].any(), "it waits for the next Sync"
+    assert moved[change_at + 2 :].all(), "and acts from then on"
+
+
+def test_a_period_has_one_sync_and_one_set_point_for_each_module() -> None:
+    with loop() as run:
+        run.arm()
+        for _ in range(20):
+            sent = go(run, "armed")
+            assert [parse_opcode(frame.id) for frame in sent] == [Opcode.SYNC, *[Opcode.SET_POINT] * JOINTS]
+            assert [parse_node(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
+        counts = [read(f)["count"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
+        assert counts == [i % 256 for i in range(len(counts))]
+        times = [read(f)["time"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
+        assert np.diff(times[-20:]).tolist() == [10_000] * 19

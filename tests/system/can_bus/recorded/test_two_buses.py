@@ -1,0 +1,134 @@
+"""The whole driver on two buses."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.driver import modules
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.emulator.chain import ModuleChain
+from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
+from snakesim_can_backend.protocol.commands import make_query
+from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Opcode, parse_node, parse_opcode
+from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
+from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_testing.can.driver_loop import Loop, config
+from snakesim_testing.can.recorded_wire import WIRES, RecordedWire, go, is_action, is_set_point, words
+from snakesim_testing.messages import raises_error
+
+# --- several buses -----------------------------------------------------------------------------------------
+
+
+class NoProcess:
+    """Instead of a child with the emulators in it."""
+
+    started: list[tuple[Any, ...]] = []
+    stopped = 0
+    ended: str | None = None
+
+    def __init__(self, run: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
+        self.started.append((settings.channels, pose, stepped))
+
+    def describe_exit(self) -> str | None:
+        return self.ended
+
+    def stop(self) -> None:
+        type(self).stopped += 1
+
+
+@pytest.fixture
+def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], Loop]]:
+    """Opens a driver for two buses with so many joints each, on emulators with three and one."""
+    run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
+    real = CanSettings(channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia")
+    chain = ModuleChain(run, real, InertiaModel(run, InertiaSettings()), stepped=True)
+    end = InProcessEmulators(EmulatorServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", lambda _channel: None)
+    monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
+    monkeypatch.setattr(modules, "EmulatorProcess", NoProcess)
+    opened: list[CanBackend] = []
+
+    def open_with(joints: list[int], **settings: Any) -> Loop:
+        asked = CanSettings(channels=channels, joints_per_channel=joints, emulators="process", **settings)
+        opened.append(CanBackend(run, asked))
+        return Loop(opened[-1], run)
+
+    yield open_with
+    for driver in opened:
+        driver.close()
+    end.close()
+
+
+def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]) -> None:
+    NoProcess.started.clear()
+    run = two_buses([3, 1])
+    ((channels, pose, stepped),) = NoProcess.started
+    assert channels == ["bus_a", "bus_b"] and pose.startswith("127.0.0.1:") and stepped
+    run.arm()
+    run.run(30, run.waving)
+    assert run.faults == []
+    a, b = WIRES
+    for wire, nodes in ((a, {1, 2, 3}), (b, {4})):
+        assert {parse_node(frame.id) for frame in wire.sent} == {0, *nodes}
+        assert {parse_node(frame.id) for frame in wire.sent if is_set_point(frame)} == nodes
+    counts = [[f.data for f in wire.sent if parse_opcode(f.id) == Opcode.SYNC] for wire in WIRES]
+    assert counts[0] == counts[1], "all are seen at one instant"
+    b.refuses = is_set_point
+    run.run(7, run.waving)
+    assert [fault.cause[:6] for fault in run.faults if fault.what == "bus_stuck"] == ["bus_b:"]
+    stopped = NoProcess.stopped
+    run.backend.close()
+    assert [words(wire.sent)[-1] for wire in WIRES] == ["disarm", "disarm"]
+    assert NoProcess.stopped == stopped + 1 and [wire.closed for wire in WIRES] == [1, 1]
+
+
+def test_in_lockstep_nothing_that_twins_said_is_still_on_its_way_when_a_tick_goes_on(
+    two_buses: Callable[..., Loop],
+) -> None:
+    run = two_buses([3, 1])
+    run.run(2)
+    for wire in WIRES:
+        wire.sent.clear()
+    run.run(20)
+    for wire, node in zip(WIRES, (1, 4), strict=True):
+        asked = [parse_opcode(f.id) for f in wire.sent if f == make_query(node) or parse_opcode(f.id) == Opcode.SYNC]
+        assert asked == [Opcode.SYNC, Opcode.PARAMETER_REQUEST] * 20
+    assert run.backend.modules.reading.answers_missing == 0
+    run.backend.close()
+
+
+def test_a_module_on_the_wrong_bus_is_found_before_anything_is_enabled(two_buses: Callable[..., Loop]) -> None:
+    with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
+        two_buses([2, 2], bring_up_limit_s=0.3)
+    assert [wire.closed for wire in WIRES] == [1, 1]
+    assert not any(is_action(frame, CommandAction.DISARM) for wire in WIRES for frame in wire.sent), (
+        "they are another's"
+    )
+
+
+def test_a_driver_whose_twins_have_died_ends(two_buses: Callable[..., Loop], monkeypatch: pytest.MonkeyPatch) -> None:
+    run = two_buses([3, 1])
+    run.run(1)
+    monkeypatch.setattr(NoProcess, "ended", "they died")
+    with raises_error(BackendError, code="backend/failed"):
+        run.run(1)
+
+
+def test_a_bus_that_fails_does_not_keep_the_other_from_hearing(two_buses: Callable[..., Loop]) -> None:
+    run = two_buses([3, 1])
+    run.arm()
+
+    def broken(frame: Frame) -> bool:
+        if frame.id == 0:
+            raise BackendError("the bus is broken")
+        return False
+
+    WIRES[0].refuses = broken
+    with raises_error(BackendError, code="backend/failed"):
+        go(run, "estop")
+    assert words(WIRES[1].sent)[-1] == "emergency"

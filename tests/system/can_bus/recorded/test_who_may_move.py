@@ -1,0 +1,181 @@
+"""The whole driver: who gets setpoints, and what is said again until everybody has heard."""
+
+from itertools import pairwise
+
+import pytest
+
+from snakesim_can_backend.protocol.commands import make_command
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    CommandAction,
+    Frame,
+    ModuleParameter,
+    ModuleState,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
+from snakesim_hal.backend import SafeSetpoints
+from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_testing.can.driver_loop import JOINTS, cleared_and_armed_again, loop
+from snakesim_testing.can.frames import read
+from snakesim_testing.can.recorded_wire import (
+    ARMED,
+    DISARMED,
+    EMERGENCY,
+    WIRES,
+    go,
+    is_action,
+    is_set_point,
+    module_of,
+    none,
+    words,
+)
+
+# --- who may move ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("lifecycle", "said", "state", "cleared"),
+    [
+        ("disarmed", ["disarm"], DISARMED, []),
+        ("fault", ["stop"], DISARMED, ["clear"]),
+        ("estop", ["emergency"], EMERGENCY, ["clear"]),
+    ],
+)
+def test_only_an_armed_robot_gets_set_points_and_what_stopped_it_stays_until_somebody_clears(
+    lifecycle: LifecycleState, said: list[str], state: ModuleState, cleared: list[str]
+) -> None:
+    with loop() as run:
+        run.arm()
+        run.run(20, run.waving)
+        assert max(run.true_speed_rad_s) > 0.3
+        sent = go(run, lifecycle, 40)
+        assert not any(map(is_set_point, sent))
+        assert words(sent)[:1] == said and len(words(sent)) <= 3, "a word, and not all the time"
+        assert run.states() == [state] * JOINTS and run.true_speed_rad_s[-1] < 0.05
+        assert words(go(run, "disarmed"))[:1] == cleared
+        cleared_and_armed_again(run)
+        assert run.faults == []
+
+
+@pytest.mark.parametrize("latched", ["estop", "fault"])
+def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) -> None:
+    with loop() as run:
+        run.arm()
+        go(run, latched, 25)
+        assert words(go(run, "armed"))[:2] == ["clear", "arm"]
+        run.arm()
+        run.run(20, run.waving)
+        assert run.faults == [] and max(run.true_speed_rad_s[-10:]) > 0.1
+
+
+def test_an_arming_and_a_stop_that_are_lost_are_said_again_to_those_who_need_it() -> None:
+    with loop() as run:
+        WIRES[0].loses = lambda frame: (
+            is_action(frame, CommandAction.ARM, CommandAction.STOP) and parse_node(frame.id) == BROADCAST
+        )
+        sent = go(run, "armed", 6)
+        assert words(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
+        assert run.states() == [ARMED] * JOINTS and run.faults == []
+        assert words(go(run, "fault", 3)) == ["stop", "stop 1", "stop 2", "stop 3", "stop 4"]
+        go(run, "fault", 20)
+        assert run.states() == [DISARMED] * JOINTS
+
+
+def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
+    with loop() as run:
+        go(run, "armed", 3)
+        assert run.states() == [ARMED] * JOINTS
+        module_of(run, 2).receive(make_command(CommandAction.DISARM), 0.0)
+        before = len(WIRES[0].sent)
+        run.run(5)
+        assert words(WIRES[0].sent[before:]) == ["stop"] and module_of(run, 2).state == DISARMED
+        assert [(fault.what, fault.joint) for fault in run.faults] == [("module_not_armed", "joint_2")]
+
+
+def test_an_emergency_that_is_lost_is_said_until_everybody_has_heard() -> None:
+    lost: list[Frame] = []
+
+    def lose_some(frame: Frame) -> bool:
+        lost.extend([frame] * (frame.id == 0))
+        return frame.id == 0 and len(lost) < 10
+
+    with loop() as run:
+        run.arm()
+        WIRES[0].loses = lose_some
+        go(run, "estop", 10)
+        assert run.states() == [EMERGENCY] * JOINTS
+        assert words(go(run, "estop", 10)) == []
+
+
+# --- frames that the bus does not take ---------------------------------------------------------------------
+
+
+def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
+    with loop() as run:
+        run.arm()
+        start = run.tick
+        refused = (start + 4, start + 5, start + 9)
+        WIRES[0].refuses = lambda frame: is_set_point(frame) and parse_node(frame.id) == 2 and run.tick in refused
+        by_tick: dict[int, list[dict[str, float]]] = {}
+        for _ in range(30):
+            tick = run.tick
+            before = len(WIRES[0].sent)
+            run.run(1, lambda tick: SafeSetpoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
+            mine = [f for f in WIRES[0].sent[before:] if is_set_point(f) and parse_node(f.id) == 2]
+            by_tick[tick] = [read(frame) for frame in mine]
+        assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
+        assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)
+        sent = {tick: frames[0] for tick, frames in by_tick.items() if frames}
+        assert all(f["position"] == pytest.approx(0.001 * (tick - start)) for tick, f in sent.items()), "the newest"
+        counts = [int(frame["count"]) for frame in sent.values()]
+        assert all((b - a) % 16 == 1 for a, b in pairwise(counts)), "a count is of what was sent"
+        assert run.faults == [] and run.states() == [ARMED] * JOINTS
+
+
+def test_a_bus_that_takes_no_sync_is_told_even_when_nothing_is_armed() -> None:
+    with loop() as run:
+        run.run(2)
+        WIRES[0].refuses = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
+        run.run(8)
+        assert [fault.what for fault in run.faults] == ["bus_stuck"], "and no module is blamed for it"
+        assert run.samples[-1].joints.valid == [False] * JOINTS
+
+
+# --- modules that restart ----------------------------------------------------------------------------------
+
+
+def test_a_restarted_module_is_not_armed_before_it_has_its_parameters() -> None:
+    with loop(faults=["reboot:joint_2@0.3"]) as run:
+        run.arm()
+        module = module_of(run, 2)
+        run.run(25 - run.tick)
+        assert module.state == ARMED
+        states: list[ModuleState] = []
+        for _ in range(60):
+            run.run(1)
+            states.append(module.state)
+        assert ARMED not in states[states.index(ModuleState.BOOT) :]
+        assert module.parameters.values[ModuleParameter.STIFFNESS] == 0.0
+        assert "module_restarted" in [fault.what for fault in run.faults] and run.lifecycle == "fault"
+        go(run, "armed", 8)  # cleared and armed between two ticks
+        assert run.states() == [ARMED] * JOINTS
+        assert module.parameters.values[ModuleParameter.STIFFNESS] == 40.0
+
+
+def test_a_robot_is_not_armed_while_a_module_does_not_take_its_parameters() -> None:
+    with loop(faults=["reboot:joint_2@0.3"]) as run:
+        WIRES[0].loses = lambda frame: parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
+        run.run(60)
+        assert run.lifecycle == "fault"
+        before = len(run.faults)
+        sent = go(run, "armed", 1) + go(run, "fault", 3)
+        assert "clear" in words(sent) and "arm" not in words(sent)
+        assert [(fault.what, fault.joint) for fault in run.faults[before:]] == [("module_not_configured", "joint_2")]
+        assert ARMED not in run.states()
+        WIRES[0].loses = none
+        before = len(run.faults)
+        go(run, "armed", 8)
+        assert run.states() == [ARMED] * JOINTS and run.faults[before:] == []
+        assert module_of(run, 2).parameters.values[ModuleParameter.STIFFNESS] == 40.0

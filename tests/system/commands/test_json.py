@@ -1,0 +1,74 @@
+"""What `status`, `scenarios` and `config` tell: `--json` is one line for scripts, with the table's content and code."""
+
+import json
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.model.files import list_shipped
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, Status
+from snakesim_operator.cli import main
+from snakesim_testing.hal.small_robots import description, status
+from snakesim_testing.harness.endpoint import free_endpoint
+
+
+def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", "list", "--json"]) == 0
+    reported = json.loads(capsys.readouterr().out)
+    assert sorted(reported["robots"]) == list_shipped("robots") and reported["scenarios"]["triplet"]
+    assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["robot.limits.torque_nm"] == {"value": 3, "origin": "--set robot.limits.torque_nm=3"}
+
+
+def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = free_endpoint()
+    assert main(["status", "--json", "--endpoint", endpoint]) == 1
+    assert json.loads(capsys.readouterr().out) == {"robots": [], "silent": []}
+    with open_session(Link(endpoint, "worm", listen=True)) as session:
+        session.latched_publisher(keys.STATUS, Status).put(status(lifecycle="disarmed"))
+        assert main(["status", "--json", "--endpoint", endpoint]) == 0
+    (robot,) = json.loads(capsys.readouterr().out)["robots"]
+    assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == ("worm", False, "disarmed")
+    assert robot["emulated"] is None  # its host has not described it
+
+
+@pytest.mark.parametrize(
+    ("described", "said"),
+    [
+        ({"emulated": True}, "  EMULATED: nothing real moves (backend lag)"),
+        ({"emulated": True, "hardware": "vcan0"}, "  EMULATED: nothing real moves (backend lag on vcan0)"),
+        ({"emulated": False, "hardware": "can0"}, "  REAL: motors move (backend lag on can0)"),
+        ({"emulated": True, "host": "another"}, "  UNKNOWN whether motors move: the host has not described the robot"),
+        (None, "  UNKNOWN whether motors move: the host has not described the robot"),
+    ],
+)
+def test_status_and_top_say_whether_something_real_moves(
+    capsys: pytest.CaptureFixture[str], described: dict[str, Any] | None, said: str
+) -> None:
+    """In the second line of a robot; a description of another host counts nothing."""
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as session:
+        session.latched_publisher(keys.STATUS, Status).put(status())
+        if described is not None:
+            robot = msgspec.structs.replace(description(), **described)
+            session.latched_publisher(keys.DESCRIPTION, Description).put(robot)
+        main(["status", "--endpoint", endpoint])
+        assert capsys.readouterr().out.splitlines()[1].startswith(said)
+        if described is None or "host" not in described:
+            assert main(["topic", "rate", "--once", "--endpoint", endpoint]) == 0
+            assert capsys.readouterr().out.startswith(f"worm: {said.strip()}")
+
+
+def test_a_joint_that_is_let_go_is_told_with_the_way_back(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as session:
+        lost = status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
+        session.latched_publisher(keys.STATUS, Status).put(lost)
+        assert main(["status", "--endpoint", endpoint]) == 0
+    said = capsys.readouterr().out
+    assert "isolated: joint_3; passive until a reset" in said and "to end the isolation of joint_3" in said
+    assert "or, without: `snakesim robot arm worm lag" in said

@@ -1,0 +1,74 @@
+"""`snakesim recording plot`: figures of a run as vector graphics, of any signals and of the paper."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from snakesim_testing.harness.command import snakesim as started
+from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
+
+pytest.importorskip("matplotlib", reason="needs the extra `report`")
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("plot") / "run"
+    ended, _ = run_to_summary(out, "triplet", "--duration", "3")
+    assert ended.code == 0, ended.err
+    return out
+
+
+def words(path: Path) -> list[str]:
+    return ["".join(text.itertext()) for text in ElementTree.parse(path).getroot().iter(f"{SVG}text")]
+
+
+def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
+    given = ["angle_rad.joint_7,target.joint_7", "torque_nm", "contact_count"]
+    out = run / "chosen.svg"
+    ended = snakesim("recording", "plot", str(run), *given, "--out", str(out), "--from", "1", "--to", "2.5", cwd=run)
+    assert ended.code == 0, ended.err
+    written = words(out)
+    assert {"[rad]", "torque_nm [N·m]", "contact_count", "time [s]"} <= set(written)
+    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.00", "2.50"} <= set(written)
+    light = out.read_text()
+    assert snakesim("recording", "plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
+    white = "fill: #ffffff"  # the ground, or all that is written on it
+    assert 0 < light.count(white) < out.read_text().count(white)
+
+
+@pytest.mark.slow
+def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Path) -> None:
+    """A notebook's window library, and TeX without a TeX."""
+    (run / "matplotlibrc").write_text("text.usetex: True\n")
+    inherited = {"MPLBACKEND": "module://of_a_notebook", "MATPLOTLIBRC": str(run), "PATH": "/nowhere"}
+    ended = started("recording", "plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, more=inherited)
+    assert ended.code == 0, ended.err
+    assert "joint_13" in words(run / "inherited.svg")
+
+
+@pytest.mark.slow
+def test_the_papers_figures_come_from_one_command(run: Path) -> None:
+    ended = snakesim("recording", "plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run)
+    assert ended.code == 0, ended.err
+    made = sorted(run.glob("figures/*"), key=lambda path: int(path.stem.removeprefix("figure-")))
+    assert [path.name for path in made] == [f"figure-{number}.pdf" for number in range(8, 14)]
+    assert all(path.read_bytes().startswith(b"%PDF") for path in made)
+    assert ended.out.count("written: ") == 6
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["angel_rad"], "no signal 'angel_rad'; did you mean `angle_rad`"),
+        (["angle_rad,torque_nm"], "have no axis in common"),
+        (["--from", "9"], "within the 0 to 2.99 s of this run"),
+        (["--out", "plot.docx"], "give a file that ends in .pdf, .svg, .png"),
+        (["--paper", "--out", "one.pdf"], "several files; give a folder"),
+        (["--paper", "--from", "2.98"], "at no time within it"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told(run: Path, words: list[str], why: str) -> None:
+    ended = snakesim("recording", "plot", str(run), *words, cwd=run)
+    assert ended.code == 2 and why in ended.err and "Traceback" not in ended.err, ended.err

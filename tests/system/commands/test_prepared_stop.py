@@ -1,0 +1,176 @@
+"""A stop whose means exist before they are needed: it opens nothing, survives any error, and tests itself."""
+
+import contextlib
+import errno
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from snakesim_hal.base.errors import NotConnectedError, RefusedError
+from snakesim_hal.network.session import Link
+from snakesim_hal.network.stop_port import Reply, StopRequester, open_stop_port, serve_stops
+from snakesim_operator.base.robot_selection import RobotSelection
+from snakesim_operator.robot_commands import prepared_stop
+from snakesim_operator.robot_commands.prepared_stop import WAITING, PreparedStop
+from snakesim_operator.robot_commands.stop_result import StopResult
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+
+LOOPBACK = "127.0.0.1"
+FULL = OSError(errno.EMFILE, "Too many open files")
+
+
+class Network:
+    """A session on which the robot's host answers, or does not."""
+
+    def __init__(self) -> None:
+        self.present_keys = ["alive/hal"]
+        self.error: Exception | None = None
+
+    def present(self, _pattern: str, _timeout_s: float) -> list[str]:
+        if self.error is not None:
+            raise self.error
+        return self.present_keys
+
+    def part(self) -> Any:
+        return SimpleNamespace(close=lambda: None)  # nothing is subscribed to
+
+
+class Bench:
+    """A robot with a stop port on this computer, and a prepared stop of it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, opened: socket.socket) -> None:
+        self.port: int = opened.getsockname()[1]
+        self.asked: list[str] = []
+        self.go_on = threading.Event()
+        self.go_on.set()
+        self.log: list[tuple[str, str]] = []
+        self.registry_error: OSError | None = None
+        serve_stops(opened, "worm", self._take)
+        robot = {(LOOPBACK, self.port): ("tcp/127.0.0.1:9", "worm")}
+
+        def registry(_where: RobotSelection) -> Any:
+            if self.registry_error is not None:
+                raise self.registry_error
+            return robot
+
+        monkeypatch.setattr(prepared_stop, "local_stop_ports", registry)
+        monkeypatch.setattr(prepared_stop, "ask_session", self._ask_session)
+        monkeypatch.setattr(prepared_stop, "estop", self._search)
+        self.network_error: Exception | None = None
+        self.searched = 0
+        self.stop = PreparedStop(RobotSelection("tcp/127.0.0.1:9", "worm"), Link("tcp/127.0.0.1:9", "worm"), self._note)
+
+    def _take(self, who: str, reply: Reply) -> None:
+        self.asked.append(who)
+        self.go_on.wait(10.0)
+        reply("emergency stop")
+
+    def _ask_session(self, _session: Any, _link: Link, _limit_s: float) -> list[StopResult]:
+        if self.network_error is not None:
+            raise self.network_error
+        return []
+
+    def _search(self, _where: RobotSelection, say: Callable[[str], None]) -> int:
+        self.searched += 1
+        raise FULL
+
+    def _note(self, who: str, text: str) -> None:
+        self.log.append((who, text))
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    with open_stop_port(LOOPBACK, 0) as opened:
+        made = Bench(monkeypatch, opened)
+        wait_until(lambda: made.stop._ports(), "the stop port", 5.0)
+        yield made
+        made.stop.close()
+
+
+def test_it_stops_with_a_full_file_table_and_whatever_the_network_does(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.stop.connect(Network())  # pyright: ignore[reportArgumentType]
+    bench.registry_error, bench.network_error = FULL, KeyError("unexpected")
+
+    def no_socket(*_: object, **__: object) -> socket.socket:
+        raise FULL
+
+    monkeypatch.setattr(socket, "socket", no_socket)
+    for _ in range(2):
+        assert bench.stop.stop("anna") == "worm: stopped: emergency stop (tcp/127.0.0.1:9)"
+    assert bench.searched == 0 and bench.log[0] == ("anna", "worm: stopped: emergency stop (tcp/127.0.0.1:9)")
+
+
+def test_who_asks_during_a_stop_gets_one_that_begins_after_it(bench: Bench) -> None:
+    bench.go_on.clear()
+    first = bench.stop.request("anna")
+    wait_until(lambda: bench.asked, "the first stop", 5.0)
+    later: list[Future[str]] = [bench.stop.request(f"viewer {number}") for number in range(100)]
+    assert not first.done() and len({id(future) for future in later}) == 1
+    assert bench.stop.readiness().text.startswith("a stop has been under way")
+    bench.go_on.set()
+    assert later[0].result(5.0).startswith("worm: stopped") and first.done()
+    assert len(bench.log) == 2 and bench.log[1][0].startswith("viewer 0, viewer 1, ")
+
+
+def test_a_robot_that_no_way_reaches_is_not_stopped_and_the_answer_says_why(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.stop.connect(Network())  # pyright: ignore[reportArgumentType]
+    bench.network_error = ValueError("no session")
+
+    def closed(*_: object) -> None:
+        raise NotConnectedError("closed")
+
+    monkeypatch.setattr(StopRequester, "request_stop", closed)
+    with raises_error(RefusedError, code="robot/not-confirmed"):
+        bench.stop.stop("anna")
+    monkeypatch.undo()
+    monkeypatch.setattr(prepared_stop, "ask_session", lambda *_: [])
+    assert bench.stop.stop("anna").startswith("worm: stopped"), "the next one is taken"
+
+
+def test_ready_is_the_result_of_a_test_that_was_made_just_now(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prepared_stop, "TEST_EVERY_S", 0.02)
+    assert bench.stop.readiness() == prepared_stop.StopReadiness(ready=True, text=WAITING)
+    network = Network()
+    bench.stop.connect(network)  # pyright: ignore[reportArgumentType]
+
+    def says(ready: bool, words: str) -> None:
+        def said() -> bool:
+            bench.stop.test_if_due()
+            found = bench.stop.readiness()
+            return found.ready == ready and words in found.text
+
+        wait_until(said, words, 5.0)
+
+    assert not bench.stop.readiness().ready, "not tested yet"
+    says(True, "ready")
+    assert bench.asked == [], "a test stops nothing"
+    network.present_keys = []
+    says(False, "the robot's host does not answer")
+    network.error = FULL
+    says(False, "OSError: [Errno 24] Too many open files")
+    network.error, network.present_keys = None, ["alive/hal"]
+    says(True, "ready")
+    monkeypatch.setattr(prepared_stop, "TEST_VALID_S", 0.05)
+    time.sleep(0.1)
+    assert "the last self-test that succeeded was" in bench.stop.readiness().text
+
+
+def test_a_test_of_a_closed_stop_port_says_so() -> None:
+    with contextlib.closing(StopRequester()) as requester, open_stop_port(LOOPBACK, 0) as opened:
+        address = (LOOPBACK, opened.getsockname()[1])
+        requester.prepare([address])
+        requester.test(address)
+        opened.close()
+        with raises_error(NotConnectedError, code="network/no-answer"):
+            requester.test(address)

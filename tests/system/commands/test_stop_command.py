@@ -1,0 +1,51 @@
+"""`snakesim estop`, `disarm`: who is asked, who is believed, and what is said when nobody is."""
+
+from pathlib import Path
+
+from snakesim_hal.base.errors import RefusedError
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer
+from snakesim_operator.base.targets import RobotSelection
+from snakesim_operator.robot_commands import command, stop
+from snakesim_testing.hal.local_network import Follower, following, running
+from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.messages import raises_error
+from snakesim_testing.runs.command import snakesim
+
+
+def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
+    with running(run_config()) as run:
+        at, said = run.link.endpoint, list[str]()
+        assert stop.estop(RobotSelection(at), said.append) == 0
+        assert said == [f"lab/worm: stopped: {run.status.reason} ({at})"] and run.status.lifecycle == "estop"
+        with open_session(Link(at, "lab/deaf")) as deaf:
+            deaf.declare_alive("hal")
+            said.clear()
+            assert stop.estop(RobotSelection(at), said.append) == 1
+            assert {line.split(": ")[1] for line in said if line.startswith("lab/worm")} == {"stopped"}
+            assert any(line.startswith("lab/deaf: NOT STOPPED: NO ANSWER") for line in said)
+            said.clear()
+            assert stop.estop(RobotSelection(at, "lab/nobody"), said.append) == 1
+            assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
+            assert [line.split()[2] for line in said[1:]] == ["lab/deaf,", "lab/worm,"], "those that are there"
+
+
+def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
+    ended = snakesim("estop", "--namespace", "nobody", cwd=tmp_path, more={"PYTHONPROFILEIMPORTTIME": "1"})
+    imported = [line.rpartition("|")[2].strip() for line in ended.err.splitlines()]
+    assert not {"numpy", "jinja2", "mujoco"} & set(imported)
+    assert imported.index("snakesim_hal.network.stop_port") < imported.index("msgspec") < imported.index("zenoh")
+
+
+def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
+    with running(run_config()) as run, following(run.link, Follower()):
+        run.arm()
+        with open_session(Link(run.link.endpoint, "lab/other")) as impostor:
+            impostor.declare_alive("hal")
+            impostor.on_query(
+                keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))
+            )
+            with raises_error(RefusedError, code="robot/not-confirmed"):
+                command.disarm(RobotSelection(run.link.endpoint, "lab/other"))
+        assert run.status.lifecycle == "armed"

@@ -1,0 +1,77 @@
+"""`snakesim topic rate`: what it makes of arrivals, of a stranger's too, and that nobody can make it grow."""
+
+import itertools
+import json
+import threading
+
+import pytest
+
+from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode, format_encoding
+from snakesim_hal.wire.messages import Clock, JointState, Message
+from snakesim_operator.base.targets import RobotSelection
+from snakesim_operator.monitoring.top import TrafficSnapshot, top
+from snakesim_operator.monitoring.traffic import KEPT, MAX_KEYS, Traffic
+from snakesim_testing.hal.small_robots import clock, command, description, state
+from snakesim_testing.harness.endpoint import free_endpoint
+
+MS = 1_000_000
+
+
+def arrival(key: str, message: Message, at_ms: float) -> Arrival:
+    return Arrival(key, encode(message), format_encoding(type(message)), round(at_ms * MS))
+
+
+def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
+    robot, traffic = description(), Traffic()
+    for tick in range(100):
+        traffic.add(arrival("lab/worm/sensor/joints", state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick))
+        traffic.add(arrival("lab/worm/hal/clock", clock(tick + 2), 10 * tick + 1))
+        answer = command(robot, tick=tick, sequence=tick)
+        traffic.add(arrival("lab/worm/actuator/joints", answer, 10 * tick + 3))
+    lines = {line.key: line for line in traffic.lines(1000 * MS)}
+    joints = lines[keys.JOINTS]
+    assert (joints.robot, joints.writer) == ("lab/worm", "HAL")
+    assert joints.rate_hz == pytest.approx(100.0) and joints.jitter_ms == pytest.approx(0.0, abs=1e-9)
+    assert joints.heard_ago_s == pytest.approx(0.01) and joints.age_ms == pytest.approx(20.0)
+    (latency,) = traffic.latencies()
+    assert (latency.heard_median_ms, latency.heard_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
+
+
+def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -> None:
+    traffic = Traffic("worm")
+    traffic.add(Arrival("sensor/joints", b"noise", format_encoding(JointState), 0))
+    for i in range(MAX_KEYS + 10):
+        traffic.add(Arrival(f"evil/{i}", b"x", "", i))
+    for i in range(2 * KEPT):
+        traffic.add(Arrival("evil/0", b"x", "", i * MS))
+    lines = traffic.lines(MS)
+    assert len(lines) == MAX_KEYS and traffic.keys_left_out == 11
+    assert lines[0].failure == "malformed" and lines[1].writer is None
+    text = "\n".join(TrafficSnapshot(lines, [], {}, {}, traffic.keys_left_out).format_table())
+    assert "UNKNOWN" in text and "11 messages on still more keys" in text
+
+
+def test_a_table_for_scripts_from_a_real_network() -> None:
+    endpoint, over = free_endpoint(), threading.Event()
+    lines: list[str] = []
+
+    def tell_time(session: Session) -> None:
+        publisher = session.publisher(keys.CLOCK, Clock)
+        for tick in itertools.count():
+            publisher.put(clock(tick))
+            if over.wait(0.02):
+                return
+
+    with open_session(Link(endpoint, "worm", listen=True)) as session:
+        teller = threading.Thread(target=tell_time, args=(session,))
+        teller.start()
+        try:
+            assert top(RobotSelection(endpoint), lines.append, once=True, as_json=True) == 0
+        finally:
+            over.set()
+            teller.join()
+    (line,) = json.loads(lines[0])["keys"]
+    assert (line["robot"], line["key"], line["writer"]) == ("worm", "hal/clock", "HAL")
+    assert 10 < line["rate_hz"] < 60

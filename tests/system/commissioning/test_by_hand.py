@@ -1,0 +1,111 @@
+"""`snakesim robot calibrate zero|direction|gear|limits`, on a host whose drives somebody turns by hand."""
+
+import json
+import subprocess
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.hand_turned_robot import BACKEND, JOINTS, make_hand_turned_folder, robot, seen
+from snakesim_testing.runs.in_process_command import snakesim
+
+SIGN, ZERO_RAD = np.array([1.0, -1.0, 1.0, 1.0]), np.array([0.3, -0.2, 0.0, 0.1])  # as it is really mounted
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    return make_hand_turned_folder(tmp_path)
+
+
+def hold(home: Path, joints_rad: Sequence[float]) -> None:
+    """Hold the joints at angles, which the drives show as they are mounted."""
+    drives = ZERO_RAD + SIGN * np.array(joints_rad)
+    (home / "new.json").write_text(json.dumps(drives.tolist()))
+    (home / "new.json").replace(home / "drives.json")
+
+
+def told(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """A command that somebody answers by moving joints and pressing Enter."""
+    return background(home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
+
+
+def line(process: subprocess.Popen[str]) -> str:
+    """The next that it says."""
+    assert process.stdout is not None
+    return process.stdout.readline()
+
+
+def enter(process: subprocess.Popen[str]) -> str:
+    """Press Enter; what it says then, to its end."""
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    return process.communicate(timeout=30)[0]
+
+
+def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
+    pose_rad = [0.0] * JOINTS
+    hold(home, pose_rad)
+    with host(home, BACKEND) as endpoint:
+        with told(home, endpoint, "direction", "snake.toml") as process:
+            for joint in range(JOINTS):
+                assert line(process).startswith(f"joint_{joint + 1}: turn what is ahead of it to the left")
+                pose_rad[joint] += 0.3
+                hold(home, pose_rad)
+                assert ("the other way round" if SIGN[joint] < 0 else "as the file says") in line(process)
+            assert "1 joints changed" in line(process) and process.wait(20) == 0
+        stale = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
+        assert stale.code == 2 and "restart the host with this file" in stale.err
+    hold(home, [0.0] * JOINTS)
+    with host(home, BACKEND) as endpoint:
+        with told(home, endpoint, "limits", "snake.toml", "joint_1") as process:
+            assert line(process).startswith("Move each joint")
+            for angle_rad in (-0.9, 1.2):
+                hold(home, [angle_rad, 0.0, 0.0, 0.0])
+                seen(home, endpoint, angle_rad + ZERO_RAD[0])
+            assert "1 joints changed" in enter(process)
+        assert "joint_2 reports the turn" in swapped(home, endpoint)
+        with told(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
+            assert line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
+            hold(home, [1.2, 0.4, np.pi / 4, 0.0])
+            assert "45 of 45 degrees: as the file says" in line(process) and process.wait(20) == 0
+        hold(home, [0.0] * JOINTS)
+        seen(home, endpoint, ZERO_RAD[0])
+        assert snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0
+    found = robot(home).joint_table
+    assert [joint.drive.sign for joint in found] == SIGN.tolist()
+    assert [joint.drive.zero_rad for joint in found] == pytest.approx(ZERO_RAD.tolist(), abs=1e-3)
+    ends = found[0].limits
+    assert (ends.lower_rad, ends.upper_rad) == pytest.approx((-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3)
+    text = (home / "snake.toml").read_text()
+    assert "# paper, section IV-A" in text and "sign = -1 # turned by hand, " in text
+
+
+def swapped(home: Path, endpoint: str) -> str:
+    """Turn joint_2 when joint_1 is asked for."""
+    with told(home, endpoint, "direction", "snake.toml", "joint_1") as process:
+        line(process)
+        hold(home, [1.2, 0.4, 0.0, 0.0])
+        said = line(process)
+        assert process.wait(20) == 1
+    return said
+
+
+def test_an_armed_robot_a_shipped_file_and_an_unknown_joint_are_refused(home: Path) -> None:
+    hold(home, [0.0] * JOINTS)
+    before = (home / "snake.toml").read_bytes()
+    with running(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
+        run.wait_for(" of 600 s")  # armed
+        for words, code, why in (
+            (("zero", "snake.toml", "--now"), 1, "snakesim robot disarm"),
+            (("zero", "planar13", "--now"), 2, "your own robot file"),
+            (("limits", "snake.toml", "joint_9"), 2, "joint_1 to joint_4"),
+        ):
+            refused = run.tell("robot", "calibrate", *words)
+            assert refused.code == code and why in refused.err, refused.said
+    assert (home / "snake.toml").read_bytes() == before

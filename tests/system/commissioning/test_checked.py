@@ -1,0 +1,48 @@
+"""A real robot is armed once its joints were checked, or by an explicit word; not after its file or drives changed."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.runs.checked_robot import JOINTS, make_checked_folder
+from snakesim_testing.runs.command import Ended, snakesim
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    return make_checked_folder(tmp_path)
+
+
+def run(home: Path, out: str, *words: str) -> Ended:
+    flags = ("--backend", "./real.py:Real", "--out", out, "--endpoint", free_endpoint())
+    return snakesim("run", "bench.toml", *flags, *words, cwd=home)
+
+
+def moves(home: Path, out: str, *words: str) -> bool:
+    return run(home, out, "--duration", "0.1", *words).code == 0
+
+
+@pytest.mark.slow
+def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) -> None:
+    refused = run(home, "never", "--duration", "0.1")
+    assert refused.code == 1 and "nobody has checked that its joints are as its file says" in refused.out
+    assert moves(home, "word", "--unchecked")
+
+    checking = run(home, "check", "--controller", "joint_check", "--duration", "4")
+    assert checking.code == 0, checking.out
+    judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
+    assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints are as the robot file says" in judged.out, judged.out
+    text = (home / "snake.toml").read_text()
+    assert "[checked]" in text and 'serials = ["A1", "B2", "C3"]' in text
+    assert moves(home, "checked") and moves(home, "slower", "--set", "robot.limits.speed_rad_s=1.0")
+
+    (home / "serials").write_text("A1 B9 C3")
+    other = run(home, "other", "--duration", "0.1")
+    assert other.code == 1 and "joint_2 has drive B9, and had B2" in other.out
+    (home / "serials").write_text("A1 B2 C3")
+    (home / "snake.toml").write_text(f"{text}\n[joints.joint_2]\nsign = -1\n")
+    changed = run(home, "changed", "--duration", "0.1")
+    assert changed.code == 1 and "how its joints are mounted was changed in its file since" in changed.out
+    again = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
+    assert again.code == 2 and "says otherwise how the joints are mounted" in again.err

@@ -1,0 +1,146 @@
+"""Commissioning in the console of a real robot, by what a page says and is shown: without a browser."""
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from snakesim_testing.harness.stalling_relay import StallingRelay
+from snakesim_testing.operator.console_wait import LIMIT_S, until
+from snakesim_testing.operator.viewer import Viewer, viewing
+from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.checked_robot import make_checked_folder
+from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.hand_turned_robot import robot
+from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, stopped, told
+
+pytestmark = pytest.mark.e2e
+REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
+RUN = (*REAL, "--stay", "--duration", "36000", "--console", "--no-record")
+FORWARDS, HOLD_HZ = "Hold: forwards (+)", 20.0
+HELD_IN_STALL, LIFTED_S = 40, 0.6  # messages, and more than a held button may be old
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    return make_checked_folder(tmp_path)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    return make_jogged_folder(tmp_path)
+
+
+def test_a_robot_that_nobody_checked_is_armed_by_the_page_by_an_explicit_word(home: Path) -> None:
+    with running(home / "run", *RUN) as run:
+        asyncio.run(asyncio.wait_for(arm_unchecked(run.console()), 2 * LIMIT_S))
+
+
+async def arm_unchecked(address: str) -> None:
+    async with viewing(address) as socket:
+        viewer = Viewer(socket)
+        await viewer.come()
+        watching = asyncio.create_task(viewer.watch())
+        await until(lambda: viewer.shows("armed by snakesim run"), "an armed robot")
+        await viewer.click("Take control")
+        await until(lambda: viewer.has("Release control"), "control")
+        await viewer.choose("Robot", "Disarm")
+        await until(lambda: viewer.shows(">DISARMED<"), "a disarmed robot")
+        await viewer.click("Arm it unchecked")  # nothing has been asked and refused yet
+        await viewer.choose("Robot", "Arm")
+        await until(lambda: viewer.visible("Arm it unchecked"), "the word")
+        assert viewer.shows("nobody has checked that its joints are as its file says") and viewer.shows(">DISARMED<")
+        await viewer.click("Arm it unchecked")
+        await until(lambda: viewer.shows(", unchecked, commanded by control"), "a robot armed by the word")
+        await until(lambda: not viewer.visible("Arm it unchecked"), "the end of the offer")
+        watching.cancel()
+
+
+@contextmanager
+def console(home: Path, endpoint: str) -> Iterator[str]:
+    """The address of one that may write into the robot file."""
+    with background(home, "console", "--endpoint", endpoint, "--commission", "snake.toml") as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().split()[1]
+
+
+@pytest.mark.quiet
+def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench: Path) -> None:
+    with host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
+        asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
+
+
+async def commission(address: str, home: Path, endpoint: str) -> None:
+    host_name, _, port = address.removeprefix("http://").rpartition(":")
+    async with StallingRelay(host_name, int(port)) as relay, viewing(f"http://127.0.0.1:{relay.port}") as socket:
+        viewer = Viewer(socket)
+        await viewer.come()
+        watching = asyncio.create_task(viewer.watch())
+        await until(lambda: viewer.shows("not checked: nobody has checked") and viewer.shows("id 2"), "the table")
+        await viewer.click("Start step")  # of somebody who has no control
+        await viewer.click("Take control")
+        await until(lambda: viewer.has("Release control"), "control")
+        assert not viewer.shows("data-step")
+
+        await viewer.choose("Step", "zero")
+        await viewer.click("Start step")
+        await until(lambda: viewer.shows("Lay the robot straight"), "the command's question")
+        assert "straight pose" not in (home / "snake.toml").read_text()
+        await viewer.click("Enter")
+        await until(lambda: viewer.shows("4 joints changed; restart the host with it"), "its end")
+        assert "straight pose, " in (home / "snake.toml").read_text()
+        assert robot(home).joint_table[0].drive.zero_rad == pytest.approx(0.0, abs=1e-3)
+
+        await viewer.choose("Step", "jog")
+        assert await moved_and_stood(viewer, relay, home)
+        await armed(viewer, home)
+    await watching  # the page is closed
+    await until(lambda: told(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")
+
+
+async def armed(viewer: Viewer, home: Path) -> None:
+    """Jog joint_2, which arms the robot."""
+    await until(lambda: viewer.shows("<div>done") or viewer.shows("<div>ended"), "the end of the step before")
+    await viewer.say({"type": "GuiUpdateMessage", "uuid": viewer.named("Joint (0: all)"), "updates": {"value": 2}})
+    await viewer.click("Start step")
+    await until(lambda: viewer.shows("<div>joint_2: from -0.2"), "a joint that may be moved")
+    await until(lambda: told(home)["lifecycle"] != "disarmed", "armed")
+
+
+async def moved_and_stood(viewer: Viewer, relay: StallingRelay, home: Path) -> bool:
+    """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
+    await armed(viewer, home)
+    await until(lambda: stopped(home) or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+    before = told(home)["target"][1]
+    held = {"type": "GuiButtonHoldMessage", "uuid": viewer.named(FORWARDS), "frequency": HOLD_HZ}
+    while not stopped(home) and told(home)["target"][1] < before + 0.04:
+        await viewer.say(held)
+        await asyncio.sleep(1 / HOLD_HZ)
+    await ticks(home, 25)
+    half = told(home)
+    await ticks(home, 25)
+    if stopped(home):
+        return False
+    assert told(home)["target"][1] == half["target"][1]
+    relay.stall()
+    for _ in range(HELD_IN_STALL):
+        await viewer.say(held)
+        await asyncio.sleep(1 / HOLD_HZ)
+    await asyncio.sleep(LIFTED_S)  # the finger is lifted, and only then does the network recover
+    relay.go_on()
+    await ticks(home, 50)
+    if stopped(home):
+        return False
+    assert told(home)["target"][1] == half["target"][1], "moved by what was held before the finger was lifted"
+    await viewer.click("End step")
+    await until(lambda: viewer.shows("<div>done"), "its end")
+    await until(lambda: told(home)["lifecycle"] == "disarmed", "a robot without current")
+    return True
+
+
+async def ticks(home: Path, count: int) -> None:
+    """Of the robot's."""
+    since = told(home)["tick"]
+    await until(lambda: told(home)["tick"] > since + count, f"{count} ticks")

@@ -1,0 +1,69 @@
+"""A viewer's keys at the console of a run: they drive the robot, and stop it. Without a browser, so in CI too."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Intent, Status, Trajectory
+from snakesim_testing.operator.console_wait import LIMIT_S, until
+from snakesim_testing.operator.viewer import Viewer, viewing
+from snakesim_testing.runs.command import running
+
+pytestmark = pytest.mark.e2e
+REPEAT_S = 0.04  # of a held key
+RUN = ("peg_row", "--clock-mode", "realtime", "--duration", "600", "--stay", "--console", "--no-record")
+
+
+def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -> None:
+    with running(tmp_path / "run", *RUN) as run:
+        asyncio.run(asyncio.wait_for(drive_and_stop(run.console(), run.endpoint), 2 * LIMIT_S))
+
+
+async def drive_and_stop(address: str, endpoint: str) -> None:
+    async with viewing(address) as others:
+        other = Viewer(others)
+        await other.come()
+        watching = asyncio.create_task(other.watch())
+        await until(lambda: other.shows("armed by snakesim run"), "an armed robot")
+        with open_session(Link(endpoint, "planar13")) as session:
+            intents, paths = session.reader(keys.INTENT, Intent), session.reader(keys.TRAJECTORY, Trajectory)
+            status = session.latched_reader(keys.STATUS, Status)
+            async with viewing(address) as mine:
+                driver = Viewer(mine)
+                await driver.come()
+                driving = asyncio.create_task(driver.watch())
+                await until(lambda: driver.has("Take control"), "the controls")
+                await driver.trigger("Drive: ahead")  # of somebody who has no control
+                await driver.click("Take control")
+                await until(lambda: driver.has("Release control"), "control")
+                await hold(driver, "Drive: ahead", lambda: any(path.reason for path in paths.drain()), "who drives")
+                asked = intents.drain()
+                assert asked and all(intent.requester == "viewer 2" and (intent.speed_m_s or 0) > 0 for intent in asked)
+                before = asked[-1].heading_w_rad
+                assert before is not None
+                await driver.trigger("Drive: left")
+                await hold(
+                    driver, "Drive: ahead", lambda: any((i.heading_w_rad or 0) > before for i in intents.drain())
+                )
+                await hold(driver, "Drive: backwards", lambda: any((i.speed_m_s or 0) < 0 for i in intents.drain()))
+            await driving  # the page is closed while its key is held
+            stopped = await until(lambda: paths.newest(lambda path: path.speed_m_s == 0), "a robot told to stand")
+            assert "viewer 2" in stopped.reason
+            await until(lambda: other.shows("nobody has control"), "the return of control")
+            await other.trigger("Emergency stop")
+            await until(lambda: status.newest(lambda one: one.lifecycle == "estop"), "the stop")
+            await until(lambda: other.shows(">ESTOP<"), "the stop on the page")
+        watching.cancel()
+
+
+async def hold(viewer: Viewer, key: str, done: Callable[[], bool], what: str = "an effect") -> None:
+    """Hold a key, as its keyboard repeats it."""
+    deadline = asyncio.get_running_loop().time() + LIMIT_S
+    while not done():
+        assert asyncio.get_running_loop().time() < deadline, f"not in time: {what} of {key!r}"
+        await viewer.trigger(key)
+        await asyncio.sleep(REPEAT_S)

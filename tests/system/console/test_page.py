@@ -1,0 +1,121 @@
+"""The console's page: who may open it, who may command, and what strangers can write on it."""
+
+import asyncio
+import socket
+import threading
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.model.scenario import capsules_at_start, load
+from snakesim_operator.base.console_port import open_port, page_address
+from snakesim_operator.base.page_origin import explain_refusal
+from snakesim_operator.features.console.control_token import ControlToken
+from snakesim_operator.features.console.page import page_html
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, make_expected_snapshot
+from snakesim_operator.features.console.scene.drawing import draw
+from snakesim_operator.features.console.scene.scene_colors import LEGEND
+from snakesim_operator.features.console.web.server import serve_pages
+from snakesim_testing.hal.small_robots import description, status
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+from snakesim_testing.operator.viewer import watch
+
+
+def test_a_page_is_of_the_same_host_and_port_or_refused():
+    for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):  # a tunnel has another port
+        assert explain_refusal(host, f"http://{host}") is None and explain_refusal(host, None) is None
+        assert (
+            explain_refusal(host, "http://evil.example") and explain_refusal(host, "null") and explain_refusal(host, "")
+        )
+    assert "http://localhost:8081" in (explain_refusal("localhost:8080", "http://localhost:8081") or "")
+    assert "has to be a name of this computer" in (
+        explain_refusal("evil.example:8080", "http://evil.example:8080") or ""
+    )
+    assert explain_refusal("localhost:8080", "https://mine.example", also=["https://mine.example"]) is None
+
+
+def test_a_port_that_is_taken_is_an_error_and_no_other_port():
+    with open_port(None) as first, raises_error(NotConnectedError, code="network/port-in-use"):
+        open_port(first.getsockname()[1])
+
+
+def test_a_browser_that_comes_before_the_page_gets_it():
+    listening = open_port(None)
+    with socket.create_connection(listening.getsockname(), timeout=10.0) as early:
+        early.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        viewers = [threading.Thread(target=come, args=(page_address(listening),)) for _ in range(3)]
+        for viewer in viewers:
+            viewer.start()
+        with serve_pages(listening) as (server, _):
+            assert early.recv(15) == b"HTTP/1.1 200 OK"
+            wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
+        for viewer in viewers:
+            viewer.join(10.0)
+
+
+def come(address: str) -> None:
+    asyncio.run(watch(address))
+
+
+def test_nobody_can_open_a_tunnel_to_the_internet():
+    with serve_pages(open_port(None)) as (server, _):
+        assert server.request_share_url() is None
+
+
+def test_control_is_taken_while_free_and_never_taken_away():
+    token = ControlToken()
+    assert token.acquire(1) and token.acquire(1)
+    assert not token.acquire(2) and token.holder == 1
+    assert not token.release(2) and token.holder == 1
+    assert token.release(1) and token.holder is None
+    assert token.acquire(2) and token.holder == 2
+
+
+def test_text_from_the_network_is_no_markup():
+    evil = "<img src=x onerror=alert(1)>\x1b[2J"
+    robot = description()
+    named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
+    reported = status(lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named)
+    snapshot = RobotSnapshot(robot=robot, status=reported)
+    shown = page_html.format_header(snapshot) + page_html.format_state_table(snapshot) + page_html.format_log([evil])
+    assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
+
+
+def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
+    shown = page_html.format_header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
+    assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
+    assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=description(), status=status()))
+
+
+def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
+    config = load("triplet").config
+    snapshot = make_expected_snapshot(config)
+    drawing = draw(snapshot, None)
+    assert drawing is not None
+    start = capsules_at_start(config)
+    middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
+    assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
+    assert "WAITING FOR THE ROBOT" in page_html.format_header(snapshot) and "SIMULATOR" not in page_html.format_header(
+        snapshot
+    )
+
+
+@pytest.mark.parametrize(
+    ("backend", "emulated", "words"),
+    [
+        ("sim", True, "EMULATED BY A SIMULATOR"),
+        ("sim", False, "REAL ROBOT ON SIM"),  # a name alone says nothing
+        ("can", True, "EMULATED ROBOT ON CAN"),
+        ("can", False, "REAL ROBOT ON CAN"),
+    ],
+)
+def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
+    robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
+    assert f">{words}<" in page_html.format_header(RobotSnapshot(robot=robot))
+
+
+def test_the_legend_has_a_colour_for_each_thing():
+    assert len({color for _, color in LEGEND}) == len(LEGEND)

@@ -1,0 +1,47 @@
+"""What guidance perceives is drawn about where it believes it to be, beside the truth."""
+
+import pytest
+
+from snakesim_hal.wire.messages import Obstacle
+from snakesim_operator.base.console_port import open_port
+from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
+from snakesim_operator.features.console.scene.drawing import M_PER_N, draw
+from snakesim_operator.features.console.scene.robot_scene import RobotScene
+from snakesim_operator.features.console.web.server import serve_pages
+from snakesim_testing.hal.small_robots import description
+from snakesim_testing.operator.drawn_samples import contact, joints, pushing, world
+
+
+def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
+    point = contact((0.0, 10.0, 0.0))
+    control = pushing([point], [10.0])
+    with serve_pages(open_port(None)) as (server, _):
+        scene = RobotScene(server.scene, description(), None)
+        for felt in ([], [point], []):
+            snapshot = RobotSnapshot(robot=description(), body=joints(), world=world(felt, []), control=control)
+            drawing = draw(snapshot, None)
+            assert drawing is not None
+            scene.show(drawing)
+            desired = scene._arrows.get("forces/desired")
+            assert scene._dashed_forces.visible is not bool(felt) and (desired is not None and desired.visible) is bool(
+                felt
+            )
+        ends = scene._dashed_forces.points.reshape(-1, 3)
+        assert len(ends) == 10 and ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
+
+
+def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
+    found = [
+        Obstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, felt=True),
+        Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, felt=True),
+        Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), felt=True),
+    ]
+    with serve_pages(open_port(None)) as (server, _):
+        scene = RobotScene(server.scene, description(), None)
+        for obstacles in (found, []):
+            drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world([], obstacles)), None)
+            assert drawing is not None
+            scene.show(drawing)
+            shown = list(scene._perceived_obstacles.meshes.batches.values())
+            assert [batch.visible for batch in shown] == [bool(obstacles)] * 3
+            assert sorted(float(batch.batched_positions[0, 0]) for batch in shown) == [1.0, 2.0, 3.0]

@@ -1,0 +1,154 @@
+"""The parts of deploy/vm that need no virtual machine."""
+
+import argparse
+import lzma
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deploy.vm import cpio, kernel, machine, with_vcan
+from deploy.vm.packages import PreparationError
+from snakesim_testing.messages import raises_error
+
+KERNEL = kernel.Kernel(
+    version="6.1-test",
+    image=Path("/cache/vmlinux"),
+    initramfs=Path("/cache/initramfs"),
+    depends={
+        **{name: [] for name in (*kernel.BOOT_MODULES, "can", "can_dev", "sja1000", "sch_tbf")},
+        "can_raw": ["can"],
+        "uinput": [],
+        "evdev": [],
+        "can_bcm": ["can"],
+        "vcan": ["can_dev"],
+        "kvaser_pci": ["sja1000", "can_dev"],
+    },
+    built_in=["virtio_net"],
+)
+REQUEST = machine.Request(command=["printf", "%s", "it's"], folder=Path("/a folder"), writable=[Path("/re,po")])
+
+
+def test_every_entry_of_an_archive_is_aligned() -> None:
+    for length in range(5):
+        entry = cpio.file("n" * length + "x", b"c" * length)
+        assert len(entry) % 4 == 0
+        assert int(entry[54:62], 16) == length  # the size, seventh of the eight-digit fields after the magic
+
+
+def test_a_module_comes_after_what_it_depends_on_and_what_is_built_in_is_not_loaded() -> None:
+    order = kernel.load_order(["can_raw", "virtio_net", "kvaser_pci", "vcan"], KERNEL)
+    assert order == ["can", "can_raw", "sja1000", "can_dev", "kvaser_pci", "vcan"]
+
+
+def test_a_kernel_without_the_module_is_named() -> None:
+    with raises_error(PreparationError):
+        kernel.load_order(["flexcan"], KERNEL)
+
+
+@pytest.mark.parametrize(
+    ("section", "names"),
+    [
+        (b"license=GPL\0depends=can-dev,sja1000\0retpoline=Y\0", ["can_dev", "sja1000"]),
+        (b"license=GPL\0depends=\0", []),
+        (b"license=GPL\0", []),
+    ],
+)
+def test_dependencies_are_read_from_the_module(section: bytes, names: list[str]) -> None:
+    assert kernel.dependencies(b"\x7fELF\0" + section) == names
+
+
+def test_module_names_have_no_dash_and_no_ending() -> None:
+    assert kernel.module_name("kernel/net/can/can-raw.ko.xz") == "can_raw"
+
+
+def bz_image(payload: bytes) -> bytes:
+    """As the boot protocol lays it out: one sector, four of setup, then the compressed kernel."""
+    head = bytearray(5 * 512)
+    head[0x1F1] = 4
+    struct.pack_into("<II", head, 0x248, 16, len(payload))
+    return bytes(head) + bytes(16) + payload
+
+
+def test_the_plain_kernel_is_taken_out_of_its_image() -> None:
+    plain = b"\x7fELF" + struct.pack("<III", 4, 8, 18) + b"Xen\0" + bytes(64)
+    assert kernel.plain_kernel(bz_image(lzma.compress(plain) + b"size")) == plain
+
+
+def test_a_kernel_that_qemu_could_not_start_directly_stays_packed() -> None:
+    assert kernel.plain_kernel(bz_image(lzma.compress(b"\x7fELF" + bytes(64)))) is None
+    assert kernel.plain_kernel(bz_image(b"\x1f\x8b gzip")) is None
+
+
+def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> None:
+    request = machine.Request(command=["sh", "-c", 'echo "$0 $GREETING $SNAKESIM_VCAN" > out', "it's"], folder=tmp_path)
+    script = machine.command_script(request, {"GREETING": "two\nlines", "DISPLAY": ":0", "BASH_FUNC_x%%": "() { :; }"})
+    subprocess.run(["sh", "-c", script], check=True, timeout=30, env={"PATH": "/usr/bin:/bin"})
+    assert (tmp_path / "out").read_text() == "it's two\nlines guest\n"
+    assert "DISPLAY" not in script
+    assert "BASH_FUNC" not in script
+
+
+def test_interfaces_are_brought_up_as_asked() -> None:
+    request = machine.Request([], Path("/"), channels=["vcan0", "vcan1"], controllers=True, forward=[(17447, 7447)])
+    script = machine.interface_script(request)
+    assert "ip link add vcan1 type vcan\nip link set vcan1 up\n" in script
+    assert "ip link set can1 type can bitrate 1000000" in script
+    assert "ip link set eth0 up" in script
+    assert "can1 type can" not in machine.interface_script(REQUEST)
+
+
+def qemu(request: machine.Request, monkeypatch: pytest.MonkeyPatch, kvm: bool = False) -> str:
+    monkeypatch.setattr(machine, "need_tool", str)
+    ports = {name: number for number, name in enumerate(machine.PORTS, start=10)}
+    return " ".join(machine.qemu_arguments(request, KERNEL, kvm, "/proc/self/fd/9", ports))
+
+
+def test_the_host_is_read_only_but_for_the_given_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = qemu(REQUEST, monkeypatch)
+    assert "path=/,security_model=none,readonly=on" in line
+    assert "id=share0,path=/re,,po,security_model=none,multidevs" in line
+    assert "accel tcg" in line
+    assert "accel kvm" in qemu(REQUEST, monkeypatch, kvm=True)
+
+
+def test_the_guest_has_no_network_unless_a_port_is_forwarded_on_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "-netdev" not in qemu(REQUEST, monkeypatch)
+    line = qemu(machine.Request([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
+    assert "restrict=on,hostfwd=tcp:127.0.0.1:17447-:7447" in line
+
+
+def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = qemu(machine.Request([], Path("/"), controllers=True), monkeypatch)
+    assert line.count("kvaser_pci,canbus=canbus0") == 2
+    assert line.index("sja1000,") < line.index("kvaser_pci ")
+    assert "kvaser_pci" not in qemu(REQUEST, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        *((with_vcan.ports, text) for text in ("", "17447", "0:7447", "17447:70000", "a:b")),
+        *((with_vcan.names, text) for text in ("", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen")),
+    ],
+)
+def test_a_forward_that_is_not_two_ports_and_a_channel_that_is_no_name_are_refused(
+    parse: Callable[[str], object], text: str
+) -> None:
+    with pytest.raises(argparse.ArgumentTypeError):
+        parse(text)
+
+
+def test_a_command_is_needed() -> None:
+    done = subprocess.run(
+        [sys.executable, with_vcan.__file__, "--channels", "vcan0"],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "it comes after --" in done.stderr

@@ -1,0 +1,48 @@
+"""A joint without end stops over restarts of host and drives: its cable is not wound further than its file allows."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.runs.bench import host, lab_folder
+from snakesim_testing.runs.hand_turned_robot import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
+from snakesim_testing.runs.in_process_command import snakesim
+
+pytestmark = pytest.mark.e2e
+TURN = 2 * math.pi
+ENDLESS = "\n[joints.joint_1]\nangle_rad = 3.0\ncable_turns = 0.6\n"
+
+
+def drives(home: Path, joint_1_rad: float) -> None:
+    """What the drives say."""
+    (home / "new.json").write_text(json.dumps([joint_1_rad, *[0.0] * (JOINTS - 1)]))
+    (home / "new.json").replace(home / "drives.json")
+
+
+def why(home: Path, endpoint: str) -> str:
+    return snakesim("status", "--endpoint", endpoint, cwd=home).out
+
+
+def test_a_turn_that_a_drive_has_forgotten_is_not_wound_again(tmp_path: Path) -> None:
+    held = text_of_the_example().replace("emulated=True", "emulated=False") + HELD
+    with (lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": held}) / "snake.toml").open("a") as file:
+        file.write(ENDLESS)
+    drives(tmp_path, 0.0)
+    with host(tmp_path, BACKEND) as endpoint:
+        assert "joint_1: how far its cable is wound is not known" in why(tmp_path, endpoint)
+        declared = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=tmp_path)
+        assert declared.code == 0 and "its cable counts as unwound here" in declared.out, declared.said
+    assert robot(tmp_path).joint_table[0].limits.cable_unwound
+    with host(tmp_path, BACKEND) as endpoint:
+        assert "cable" not in why(tmp_path, endpoint)
+        for angle_rad in (2.0, 4.0):  # somebody turns it through
+            drives(tmp_path, angle_rad)
+            seen(tmp_path, endpoint, angle_rad)
+    drives(tmp_path, 4.0 - TURN)  # it was switched off and on
+    with host(tmp_path, BACKEND) as endpoint:
+        shown = why(tmp_path, endpoint)
+        assert "counted over restarts it is at +4.00 rad" in shown, shown
+        assert "Turn it by hand by 1 turn to lower angles" in shown

@@ -1,0 +1,32 @@
+"""Through clutter with the CAN backend: the same guidance, navigation and control on emulated joint modules."""
+
+import numpy as np
+import pytest
+
+from snakesim_operator.results.metrics.advance import Advance
+from snakesim_operator.run.in_process import Result, simulate
+from snakesim_testing.runs.whole_run import configure
+
+LOST_S = 3.0
+
+
+def over_can(*sets: str) -> Result:
+    """The shipped scenario with nothing changed but the backend and these."""
+    return simulate(configure("surveyed_clutter", "backend=can", *sets), until_goal=True)
+
+
+@pytest.mark.slow
+def test_it_goes_on_without_a_joint_that_was_lost_on_the_way() -> None:
+    reported = over_can("duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
+    assert reported.summary.ended == "complete" and list(reported.record.host.isolated) == ["joint_7"]
+    advance = Advance.of(reported.record)
+    assert advance is not None
+    before_m = float(np.interp(LOST_S, advance.time_s, advance.along_m))
+    assert before_m > 0.4, "it moved before"
+    assert advance.along_m[-1] > before_m + 0.2, "and moves on"
+
+
+@pytest.mark.slow
+def test_it_crosses() -> None:
+    reported = over_can().summary
+    assert reported.crossed is True and not reported.faults

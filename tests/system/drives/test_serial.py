@@ -1,0 +1,77 @@
+"""Servos of another program: two processes and a pseudo terminal between them, in real time."""
+
+import os
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snakesim
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.lab.machines import HURRIED
+
+pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
+
+# A sync write of 1 to the register `torque enable` (64): instruction, address, size, and servos with what they get.
+ENABLES = re.compile(r" out .* 83 40 00 01 00( [0-9a-f]{2} 01)+ [0-9a-f]{2} [0-9a-f]{2}$", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where everything runs."""
+    return tmp_path_factory.mktemp("servos")
+
+
+@pytest.fixture(scope="module")
+def pose(folder: Path) -> Iterator[str]:
+    """Servos on `./servos`; where they send the pose."""
+    address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
+    said, first = folder / "servos.said", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
+    with said.open("wb") as file:
+        servos = subprocess.Popen(
+            [*first, *SNAKESIM, "drive", "emulate", "dynamixel", "triplet", "--channel", "servos", "--pose", address],
+            cwd=folder,
+            env=environment(folder),
+            stdout=file,
+            stderr=file,
+        )
+    try:
+        wait_until(lambda: "servos ready: 13" in said.read_text(), "the servos")
+        yield address
+    finally:
+        servos.terminate()
+        servos.wait(10)
+    assert not (folder / "servos").is_symlink(), "its name is taken away"
+
+
+def run(folder: Path, pose: str, *arguments: str) -> Ended:
+    """A run that holds its pose."""
+    where = ("--set", 'backend.ports=["servos"]', "--set", f'backend.pose_listen="{pose}"')
+    slow = ("--set", "rate_hz=25", "--set", "backend.watchdog_s=0.5", "--clock-mode", "realtime")
+    hold = ("run", "triplet", "--backend", "dynamixel", "--controller", "hold", *where, *slow)
+    return snakesim(*hold, "--endpoint", free_endpoint(), *arguments, cwd=folder)
+
+
+def test_servos_of_another_program_are_found_and_driven_in_real_time(pose: str, folder: Path) -> None:
+    found = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
+    assert found.code == 0 and found.out.count("XM540-W270 (1120)") == 13, found.said
+    ended = run(folder, pose, "--duration", "2")
+    assert ended.code == 0, ended.said
+    again = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
+    assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, "current-based position is kept"
+
+
+def test_servos_that_stop_while_the_host_is_frozen_are_reported_and_stay_off(pose: str, folder: Path) -> None:
+    """The host's process gets SIGSTOP for 1 s; the clause for every drive type is in the contract suite."""
+    frozen = ("--fault", "freeze:host@0.5-1.5", "--duration", "5", "--set", "backend.log=bytes.log")
+    ended = run(folder, pose, *frozen, "--out", str(folder / "frozen"))
+    record = RunRecord.load(folder / "frozen").host
+    assert record.armed_ticks > 10, "it was armed when it was frozen"
+    assert ended.code == 1 and record.lifecycle == "fault", ended.said
+    stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
+    assert len(stopped) == 13, record.faults
+    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"

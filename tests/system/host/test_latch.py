@@ -1,0 +1,104 @@
+"""An emergency stop on disk: written before it is answered, found again, and latched when in doubt."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
+
+import pytest
+
+from snakesim_hal.host import latch as under_test
+from snakesim_hal.host.latch import ESTOP, EstopLatch
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import EstopRequest
+from snakesim_testing.hal.local_network import running
+from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.harness.wait import wait_until
+
+
+def asked(latch: EstopLatch, what: str) -> str | None:
+    answers: SimpleQueue[str | None] = SimpleQueue()
+    if what == "engage":
+        latch.engage("anna", 7, answers.put)
+    else:
+        latch.release(answers.put)
+    return answers.get(timeout=5)
+
+
+def test_kept_found_and_released(tmp_path: Path) -> None:
+    assert asked(EstopLatch(tmp_path / "no stop yet"), "release") is None
+    first = EstopLatch(tmp_path)
+    assert first.left_by_earlier_host is None and asked(first, "engage") is None
+    assert (tmp_path / ESTOP).is_file() and [path.name for path in tmp_path.iterdir()] == [ESTOP]
+    second = EstopLatch(tmp_path)
+    assert second.left_by_earlier_host is not None and (
+        second.left_by_earlier_host.requester,
+        second.left_by_earlier_host.tick,
+    ) == ("anna", 7)
+    assert asked(second, "engage") is None and asked(second, "release") is None
+    assert EstopLatch(tmp_path).left_by_earlier_host is None
+    assert asked(second, "release") is None
+    assert asked(second, "engage") is None and EstopLatch(tmp_path).left_by_earlier_host is not None
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"requester":1}', b"\xff" * 100])
+def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / ESTOP).write_bytes(content)
+    latch = EstopLatch(tmp_path)
+    assert latch.left_by_earlier_host is not None and "cannot be read" in latch.left_by_earlier_host.requester
+    assert asked(latch, "engage") is None
+    again = EstopLatch(tmp_path)
+    assert (
+        again.left_by_earlier_host is not None and again.left_by_earlier_host.requester == "anna"
+    )  # a good file in its place
+    assert asked(latch, "release") is None and EstopLatch(tmp_path).left_by_earlier_host is None
+
+
+def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
+    (tmp_path / "in the way").write_text("a file where the folder belongs")
+    latch = EstopLatch(tmp_path / "in the way")
+    failure = asked(latch, "engage")
+    assert failure is not None and "will not outlive this host" in failure
+
+
+@pytest.fixture
+def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
+    """A disk that hangs until the event is set."""
+    goes_on, write = Event(), under_test.write_atomically
+
+    def slow(path: Path, content: bytes, *, durable: bool = False) -> None:
+        goes_on.wait(30)
+        write(path, content, durable=durable)
+
+    monkeypatch.setattr(under_test, "write_atomically", slow)
+    monkeypatch.setattr(under_test, "ANSWER_LIMIT_S", 0.3)
+    yield goes_on
+    goes_on.set()
+
+
+def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Event) -> None:
+    answers: SimpleQueue[str | None] = SimpleQueue()
+    threads = threading.active_count()
+    latch, began = EstopLatch(tmp_path), time.monotonic()
+    for _ in range(1000):  # a flood, too
+        latch.engage("anna", 7, answers.put)
+    for _ in range(1000):
+        said = answers.get(timeout=5)
+        assert said is not None and "not stored yet" in said and str(tmp_path / ESTOP) in said
+    assert time.monotonic() - began < 2.0 and threading.active_count() <= threads + 2
+    latch.close()
+    assert time.monotonic() - began < 2.0
+    hanging.set()
+    wait_until(lambda: EstopLatch(tmp_path).left_by_earlier_host is not None, "the stop kept after all")
+    assert answers.empty()  # once each
+
+
+def test_a_host_on_a_disk_that_hangs_stops_at_once_answers_and_ends(tmp_path: Path, hanging: Event) -> None:
+    with running(run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
+        began = time.monotonic()
+        answer = run.ask(keys.ESTOP, EstopRequest(requester="anna"))
+        assert answer.ok and answer.lifecycle == "estop" and "not stored yet" in answer.reason
+        assert time.monotonic() - began < 2.0
+        run.reaches("estop")

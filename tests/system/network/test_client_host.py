@@ -1,0 +1,311 @@
+"""A client and a host, in one process but over real Zenoh: ticks, leases, stops, and strangers on the network."""
+
+import itertools
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from snakesim_hal.backend import SafeSetpoints
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.host.host import Host
+from snakesim_hal.host.inbox import LIMITS, SAMPLES, CommandArrival
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.session import Arrival, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, format_encoding
+from snakesim_hal.wire.messages import (
+    Answer,
+    AppliedCommand,
+    Description,
+    Done,
+    EstopRequest,
+    JointCommand,
+    LeaseRequest,
+    Mode,
+    Pose,
+)
+from snakesim_testing.hal.local_network import Follower, LagBackend, commanded, following, meeting, received, running
+from snakesim_testing.hal.small_robots import command, description, run_config, state
+from snakesim_testing.harness.wait import wait_until
+
+pytestmark = pytest.mark.usefixtures("quick_threads")
+
+
+def passive(points: SafeSetpoints) -> bool:
+    return set(points.mode) == {Mode.PASSIVE}
+
+
+# --- lockstep --------------------------------------------------------------------------------------------------
+
+
+def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]:
+    with running(run_config(), max_ticks=ticks) as run, following(run.link, Follower(amplitude_rad)) as control:
+        run.arm()
+        wait_until(run.ended, "the end of the run")
+        statistics, box = run.host.statistics, run.host.black_box
+        assert (statistics.ticks, statistics.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
+        assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
+        assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
+        assert not run.host.authority.faults and not run.host.authority.rejected_counts
+        assert run.host.authority.state == "disarmed" and passive(run.backend.enacted[-1])
+        return box.command_digest, box.layout.arrays(box.read_rows(0)[1])
+
+
+def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
+    first, columns = lockstep_run(0.2, 150)
+    again, _ = lockstep_run(0.2, 150)
+    other, _ = lockstep_run(0.21, 150)
+    assert first == again != other
+    assert columns["time_s"] == pytest.approx(0.01 * np.arange(150))
+    asked = 0.2 * np.sin(2 * np.pi * columns["time_s"])
+    assert np.abs(columns["target"][1:, 0] - asked[1:]).max() < 1e-9  # the answer to a tick counts in that tick
+    followed = columns["angle_rad"][1:, 0] - columns["angle_rad"][:-1, 0]
+    assert followed == pytest.approx(0.5 * (columns["target"][:-1, 0] - columns["angle_rad"][:-1, 0]))
+
+
+def test_a_slow_participant_is_waited_for() -> None:
+    """Guidance owes tick t only at the end of tick t + lag - 1, and no tick passes without it."""
+    config = run_config(services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}})
+    with running(config, max_ticks=40) as run, following(run.link, Follower()), open_session(run.link) as session:
+        client = Client(session, "guidance")
+        client.description()
+        client.announce()
+        newest: dict[int, int] = {}
+        wait = iter(client.ticks(silence_s=0.05))
+        client.report_done(next(clock.tick for clock in wait if clock is not None))
+        run.arm()
+        due = 5
+        for clock in wait:
+            if clock is not None:
+                newest[clock.tick] = clock.newest["guidance"]
+                if clock.tick == due + 4:  # at the last moment
+                    assert run.host.black_box.ticks <= due + 4
+                    client.report_done(due)
+                    due += 5
+            if run.ended():
+                break
+        assert run.host.black_box.ticks == 40 and not run.host.authority.faults
+        assert all(counted == max(tick - 5, 0) // 5 * 5 for tick, counted in newest.items())
+
+
+def test_a_client_that_falls_silent_is_a_stall_then_an_expired_lease_and_the_joints_are_damped() -> None:
+    config = run_config(stall_limit_s=0.2)
+    with commanded(config, 20, end_after_fault_s=0.1) as (run, control):
+        control.silent.set()
+        wait_until(run.ended, "the end of the run")
+        stalled, expired = run.host.authority.faults
+        assert stalled.what == "service_stalled" and "control is" in stalled.cause
+        assert expired.what == "lease_expired" and expired.cause.startswith("lease of control expired")
+        assert expired.tick - stalled.tick in (4, 5, 6)  # one term of 50 ms in the robot's time
+        assert run.host.authority.state == "fault"
+        after = run.backend.enacted[-3:]
+        assert all(p.mode == [Mode.VELOCITY] * 3 and p.target == [0.0] * 3 for p in after)
+
+
+def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_clear() -> None:
+    with running(run_config()) as run:
+        with following(run.link, Follower()) as control:
+            run.arm()
+            wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
+        run.reaches("fault")
+        faults = {fault.what: fault.cause for fault in run.status.faults}
+        assert "control is gone" in faults["service_lost"] and "lease of control" in faults["lease_expired"]
+        assert not run.lifecycle("arm").ok
+        assert run.lifecycle("reset").ok
+        with following(run.link, Follower()) as control:
+            run.arm()
+            wait_until(lambda: len(control.armed_ticks) > 5, "five more ticks")
+            assert run.status.lifecycle == "armed" and not run.status.faults
+
+
+# --- stops and refusals ----------------------------------------------------------------------------------------
+
+
+def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
+    with commanded(run_config(clock_mode="realtime")) as (run, _):
+        answer = run.ask(keys.ESTOP, EstopRequest(requester="passer-by"))
+        assert answer.ok and answer.lifecycle == "estop"
+        at = len(run.backend.enacted)
+        wait_until(lambda: len(run.backend.enacted) > at + 5, "five ticks more")
+        assert all(passive(points) for points in run.backend.enacted[at + 1 :])
+        assert "passer-by" in run.status.reason and run.status.faults[-1].what == "estop"
+        assert "must be disarmed" in run.lifecycle("arm").reason
+        assert run.lifecycle("reset").lifecycle == "disarmed"
+        run.arm()
+        assert run.lifecycle("finish").ok
+        wait_until(run.ended, "the end of the run")
+        assert passive(run.backend.enacted[-1])
+
+
+def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is_not() -> None:
+    with running(run_config(clock_mode="realtime")) as run, following(run.link, Follower()) as control:
+        run.arm()
+        request = LeaseRequest(action="acquire", holder="teleop")
+        answer = run.ask(keys.LEASE, request)
+        assert not answer.ok and answer.reason.startswith("held by control (epoch ")
+        assert "priority 100" in answer.reason
+        held = answer.epoch
+        assert answer.lifecycle == "armed"
+        assert answer.host == run.host.description.host
+        wait_until(lambda: len(control.armed_ticks) > 5, "the robot going on undisturbed")
+        answer = run.ask(keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200))
+        assert answer.ok and answer.lifecycle == "disarmed"
+        at = len(run.backend.enacted)
+        late = command(run.host.description, 0.2, lease_epoch=held, sequence=10**6)  # the old holder has not heard yet
+        run.session.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
+        refused = run.host.authority.rejected_counts
+        wait_until(lambda: refused["wrong_epoch"] + refused["no_lease"] > 0, "the old holder's command refused")
+        wait_until(lambda: len(run.backend.enacted) > at + 3, "three ticks")
+        assert all(passive(points) for points in run.backend.enacted[at + 1 :])
+
+
+def test_arming_waits_for_everybody_and_says_for_whom_and_time_stands_still_until_then() -> None:
+    with running(run_config()) as run:
+        assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.reason
+        answer = run.lifecycle("arm")
+        assert not answer.ok and answer.reason == "waiting for control"
+        with following(run.link, Follower()) as control:
+            wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
+            assert set(control.ticks_seen) == {0} and run.backend.advanced == 0 and not run.backend.enacted
+            assert run.status.tick == 0 and run.host.black_box.ticks == 0
+            run.arm()
+        assert run.status.alive == ["control"] or run.host.authority.faults
+
+
+# --- strangers -------------------------------------------------------------------------------------------------
+
+
+def test_nothing_that_is_put_on_the_network_ends_the_host_and_all_of_it_is_counted() -> None:
+    garbage = [b"", b"\xff" * 50, b"\x91" * 100_000, encode(description())]
+    foreign = [
+        "zenoh/bytes",
+        ENCODING_PREFIX + "Gone/1",
+        ENCODING_PREFIX + "JointCommand/9",
+        ENCODING_PREFIX + "Done/9",
+    ]
+    own = [
+        format_encoding(JointCommand),
+        format_encoding(Done),
+        format_encoding(LeaseRequest),
+        format_encoding(EstopRequest),
+    ]
+    samples = [
+        keys.JOINT_COMMAND,
+        keys.done_key("control"),
+        keys.done_key("stranger"),
+        "actuator/*",
+        "hal/done/*",
+        "**",
+    ]
+    with running(run_config()) as run, following(run.link, Follower()) as control:
+        run.arm()
+        put, get = run.session._zenoh.put, run.session._zenoh.get  # a stranger does not keep to our session
+        for key, payload, encoding in itertools.product(samples, garbage, own + foreign):
+            put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+        counted = run.host.authority.rejected_counts
+        # `**` reaches the host twice, by its two subscriptions.
+        wait_until(lambda: sum(counted.values()) >= 7 * 32, "every sample counted")
+        assert set(counted) == {"malformed", "unknown_message", "unknown_version"}
+        for key in (keys.LEASE, keys.LIFECYCLE, keys.ESTOP):
+            for payload, encoding in itertools.product(garbage, own[2:] + foreign[:2]):
+                (reply,) = get(key, payload=payload, encoding=encoding, timeout=5.0)
+                assert reply.ok is not None
+                answer = Decoder(Answer).decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+                assert not answer.ok and answer.lifecycle == "armed"
+        for pattern in ("hal/*", "**"):  # a tool that looks what is there
+            assert all(reply.ok is not None for reply in get(pattern, timeout=1.0))
+        seen = len(control.armed_ticks)
+        wait_until(lambda: len(control.armed_ticks) > seen + 5, "the robot going on undisturbed")
+        assert run.host.authority.state == "armed" and not run.host.authority.faults
+        wait_until(lambda: run.status.commands_rejected == dict(counted), "the counts in the status")
+
+
+def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_answer() -> None:
+    """In lockstep a tick ends when the holder has answered; a refused command of somebody else is no answer."""
+    with meeting("worm") as (session,):
+        host = Host(run_config(), GuardedBackend(LagBackend(run_config())), session)
+        host.authority.observe(state(host.description))
+        host.authority.on_lease(LeaseRequest(action="acquire", holder="control"), 0)
+        own = host.authority.lease.epoch
+        for epoch, done_tick in ((0, -1), (own + 6, -1), (own, 0)):
+            sent = command(host.description, 0.1, lease_epoch=epoch)
+            arrival = Arrival(keys.JOINT_COMMAND, encode(sent), format_encoding(JointCommand), time.monotonic_ns())
+            host._inbox.handle(CommandArrival(arrival, Decoder(JointCommand)))
+            assert host.participants["control"].done_tick == done_tick
+        assert host.authority.rejected_counts["wrong_epoch"] == 2
+
+
+def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
+    limit = LIMITS[SAMPLES] or 0
+    config = run_config(clock_mode="realtime")
+    with meeting("worm", "worm") as (own, stranger):
+        host = Host(config, GuardedBackend(LagBackend(config)), own)
+        publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
+        for sequence in range(limit + 500):
+            publisher.put(command(host.description, sequence=sequence))
+        wait_until(lambda: host._inbox.dropped >= 400, "a full inbox")
+        answers: list[Any] = []
+        request = EstopRequest(requester="a person")
+        asking = threading.Thread(target=lambda: answers.append(stranger.request(keys.ESTOP, request, 10.0)))
+        asking.start()
+        wait_until(lambda: host._inbox.waiting() > limit, "the estop in the inbox")
+        thread = threading.Thread(target=host.run)
+        thread.start()
+        asking.join(15.0)
+        host.stop()
+        thread.join(15.0)
+        assert answers[0].ok and answers[0].lifecycle == "estop"
+        assert host.requests[0].startswith("tick 0: estop by 'a person', done")
+
+
+# --- realtime and free -----------------------------------------------------------------------------------------
+
+
+def test_realtime_keeps_its_deadlines_on_average() -> None:
+    """As many periods pass as there is time for, and are answered; how many are late is for the computer to say."""
+    config = run_config(clock_mode="realtime", rate_hz=50.0)
+    with running(config, max_ticks=50) as run, following(run.link, Follower()):
+        run.arm()
+        wait_until(run.ended, "the end of the run")
+        assert run.host.wall_s == pytest.approx(1.0, rel=0.1)
+        assert not run.host.authority.faults
+        found = run.host.statistics
+        assert found.answered_ticks + found.overruns >= 0.7 * found.ticks
+        latency = found.state_to_command
+        median_us = latency.percentile_us(50)
+        assert latency.count >= found.answered_ticks > 0  # late answers count, too
+        assert median_us is not None and 0 < median_us < 20_000
+
+
+def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold() -> None:
+    """Also where nothing is armed: arming may be what its old samples prevent."""
+    with running(run_config(clock_mode="realtime", rate_hz=50.0)) as run:
+        run.backend.read_s = 0.03
+        slow = "backend 'lag' takes 3"
+        wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
+        assert "ms to read" in run.status.reason and "of a tick of 20 ms; it would hold 2" in run.status.reason
+        run.backend.read_s = 0.0
+        wait_until(lambda: not run.status.realtime_warnings, "no warning")
+
+
+def test_free_waits_for_nobody() -> None:
+    with running(run_config(clock_mode="free")) as run:
+        wait_until(lambda: run.backend.advanced > 200, "two hundred ticks without anybody")
+        assert run.host.authority.state == "disarmed" and all(passive(points) for points in run.backend.enacted)
+
+
+# --- what readers see ------------------------------------------------------------------------------------------
+
+
+def test_somebody_who_comes_late_gets_description_status_and_what_is_applied() -> None:
+    with commanded(run_config()) as (run, _), open_session(run.link) as late:
+        descriptions = late.latched_reader(keys.DESCRIPTION, Description)
+        assert received(descriptions, "the description") == [run.host.description]
+        applied, poses = late.reader(keys.APPLIED, AppliedCommand), late.reader(keys.POSE, Pose)
+        commands = received(applied, "applied commands", 4)
+        assert all(c.sequence is not None and c.mode == [Mode.POSITION] * 3 for c in commands)
+        assert all(pose.tick % 5 == 0 for pose in received(poses, "a pose"))

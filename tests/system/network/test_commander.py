@@ -1,0 +1,90 @@
+"""The client alone: the feed that finds samples by their tick, and the holder of the lease."""
+
+import threading
+
+import pytest
+
+from snakesim_hal.base.errors import StalledError
+from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.network.session import open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
+from snakesim_testing.hal.local_network import meeting, running
+from snakesim_testing.hal.small_robots import clock, description, run_config, state
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+
+
+def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
+    robot, network = description(), LocalNetwork()
+    feed = Feed(network.session().reader(keys.JOINTS, JointState), keys.JOINTS)
+    joints = network.session().publisher(keys.JOINTS, JointState)
+    assert feed.newest() is None and feed.at(0) is None
+    for tick in range(100):
+        joints.put(state(robot, 0.1 * tick, tick=tick))
+        feed.store_arrived()
+    newest, kept = feed.newest(), feed.at(99)
+    assert newest is not None and newest.tick == 99 and kept is newest
+    assert feed.at(50) is None and feed.at(90) is not None
+    joints.put(state(robot, 0.0, tick=90))  # shown again: it came last
+    feed.store_arrived()
+    newest = feed.newest()
+    assert newest is not None and newest.tick == 90
+    feed.clear()
+    assert feed.newest() is None
+
+
+def naming(tick: int, joints_tick: int, arm_session: int = 1) -> Clock:
+    return clock(tick, arm_session=arm_session, newest={keys.JOINTS: joints_tick})
+
+
+def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = description()
+    monkeypatch.setattr("snakesim_hal.network.client.MISSING_SAMPLE_TIMEOUT_S", 0.1)
+    with meeting("worm", "worm") as (hal, session):
+        client = Client(session, "control")
+        feed = client.subscribe(keys.JOINTS, JointState)
+        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
+        joints = hal.publisher(keys.JOINTS, JointState, lossless=True)
+        wait_until(lambda: clocks.has_subscriber() and joints.has_subscriber(), "the client's subscriptions")
+        ticks = iter(client.ticks(silence_s=5.0))
+        for tick in (3, 4):
+            joints.put(state(robot, tick=tick))
+        clocks.put(naming(5, 3))
+        assert client.read(feed) is None  # no clock yet
+        assert next(ticks) == naming(5, 3)
+        found = client.read(feed)
+        assert found is not None and found.tick == 3  # what is named, not what is newest
+        clocks.put(naming(6, 6))
+        next(ticks)
+        late = threading.Timer(0.03, lambda: joints.put(state(robot, tick=6)))
+        late.start()
+        found = client.read(feed)
+        assert found is not None and found.tick == 6
+        clocks.put(naming(7, 7))
+        next(ticks)
+        with raises_error(StalledError, code="network/no-ticks"):
+            client.read(feed)
+        hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
+        clocks.put(naming(0, 0, arm_session=0))  # the HAL started over
+        again = next(ticks)
+        assert again is not None and again.tick == 0 and client.read(feed) is None
+        wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
+
+
+def test_a_commander_asks_for_a_free_lease_and_gives_up_one_that_passed_on() -> None:
+    with running(run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
+        client = Client(session, "pilot")
+        commander = Commander(client, client.description())
+        other = LeaseRequest(action="acquire", holder="teleop", priority=200)
+        assert run.ask(keys.LEASE, other).ok
+        ticks = (found for found in client.ticks(silence_s=1.0) if found is not None)
+        held = [commander.ensure_lease(next(ticks)) for _ in range(2)]
+        assert held[0] is False and commander.refusal is not None and "held by teleop" in commander.refusal
+        wait_until(lambda: commander.ensure_lease(next(ticks)), "the end of teleop's lease", 10.0)
+        assert commander.refusal is None and run.host.authority.lease.holder == "pilot"
+        assert run.ask(keys.LEASE, other).ok
+        wait_until(lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on")

@@ -1,0 +1,94 @@
+"""Endpoints and namespaces as people mistype them."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.network.endpoint import check_endpoint, check_guarded, check_loopback, check_namespace
+from snakesim_testing.messages import raises_error
+
+GOOD = [
+    *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),
+    *("tcp/[::1]:7447", "tcp/[fe80::1]:7#iface=eth0", "unixsock-stream/tmp/robot"),
+]
+WRONG = [
+    "banana",
+    "",
+    "127.0.0.1:7447",
+    "tcp/127.0.0.1",
+    "tcp/:7447",
+    "tcp/127.0.0.1:",
+    "tcp/127.0.0.1:http",
+    "tcp/127.0.0.1:7447 ",
+    "tcp/127.0.0.1:7447\n",
+    "http/127.0.0.1:80",
+    "tcp/127.0.0.1:0",
+    "tcp/127.0.0.1:70000",
+    "x" * 10_000,
+]
+
+
+@pytest.mark.parametrize("text", GOOD)
+def test_an_endpoint_is_taken_as_it_is(text: str) -> None:
+    assert check_endpoint(text, "--endpoint") == text
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
+    with raises_error(ConfigError, code="network/invalid-address", field=("--router", "tcp/127.0.0.1:7447")) as caught:
+        check_endpoint(text, "--router")
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "exposed"),
+    [
+        ("tcp/127.0.0.1:7447", False),
+        ("tcp/127.8.0.1:7447", False),
+        ("tcp/localhost:7447", False),
+        ("tcp/[::1]:7447", False),
+        ("unixsock-stream/tmp/robot", False),
+        ("tcp/0.0.0.0:7447", True),
+        ("tcp/[::]:7447", True),
+        ("tls/192.168.1.5:7447#iface=eth0", True),
+        ("udp/robot.lab:7447", True),
+    ],
+)
+def test_what_other_machines_may_reach_is_listened_on_only_with_access_control_or_on_request(
+    endpoint: str, exposed: bool
+) -> None:
+    check_guarded(endpoint, "--endpoint", insecure=True)
+    check_guarded(endpoint, "--endpoint", access_control=True)
+    if exposed:
+        with raises_error(ConfigError, code="network/insecure-endpoint", field="--endpoint"):
+            check_guarded(endpoint, "--endpoint")
+    else:
+        check_guarded(endpoint, "--endpoint")
+
+
+def test_namespaces() -> None:
+    assert check_namespace("lab/planar13", "--namespace") == "lab/planar13"
+    for text in ("", "/", "a/", "/a", "a//b", "**", "a/*", "a b", "a#b", "@x", "a\x1b"):
+        with raises_error(ConfigError, code="network/invalid-address"):
+            check_namespace(text, "--namespace")
+
+
+APART = ["unshare", "--net", "--map-root-user"]  # a network namespace of its own, whose loopback interface is down
+LOOKS = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+
+
+def test_a_loopback_interface_that_is_down_is_named_instead_of_waited_for(tmp_path: Path) -> None:
+    if shutil.which("unshare") is None or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("no network namespace can be made here")
+    command = [*APART, *python_command("-c", LOOKS), "run", "triplet", "--out", "run"]
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=child_environment(), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode == 1 and "loopback interface" in ended.stderr and "ip link set lo up" in ended.stderr
+    assert not (tmp_path / "run").exists()
+    check_loopback("tcp/127.0.0.1:7447")
+    check_loopback("tcp/192.0.2.1:7447")  # not on loopback: whether it answers is another question

@@ -1,0 +1,72 @@
+"""A Zenoh session file decides how a process connects, and nothing that SnakeSIM needs."""
+
+import json
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from snakesim_hal.base.errors import ConfigError, NotConnectedError
+from snakesim_hal.network.router import open_router
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session_file import read_session
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+
+QUIET = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "lab.json5"
+    path.write_text(text)
+    return path
+
+
+def test_sessions_of_one_file_meet_at_its_router_and_stock_zenoh_reads_the_same_file(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    router = tmp_path / "router.json5"
+    router.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
+    path = written(tmp_path, f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
+    link = Link.from_session_file(read_session(path), "worm")
+    assert link.endpoint == endpoint and link.namespace == "worm"
+    with (
+        raises_error(NotConnectedError, code="certificate/rejected", field="lab.json5"),
+        open_session(link, connect_timeout_s=0.1),
+    ):
+        pass
+    with open_router(router), open_session(link) as ours, zenoh.open(zenoh.Config.from_file(path)) as stock:
+        ours.declare_alive("control")
+        wait_until(lambda: tokens(stock) == ["worm/alive/control"], "the token of the one with the other", 20.0)
+
+
+def tokens(session: zenoh.Session) -> list[str]:
+    """The liveliness tokens that a session sees."""
+    return [str(reply.ok.key_expr) for reply in session.liveliness().get("**") if reply.ok is not None]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{connect: {endpoints: ["tcp/10.0.0.1:7447"]}}',
+        '{mode: "peer", connect: {endpoints: ["tcp/10.0.0.1:7447"]}}',
+        '{mode: "client"}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:0"]}}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, scouting: {gossip: {enabled: true}}}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, listen: {endpoints: ["tcp/0.0.0.0:1"]}}',
+        '{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, namespace: "a b"}',
+        '{mode: "client", connct: {}}',
+        "{mode: ",
+    ],
+)
+def test_a_file_that_contradicts_what_every_session_needs_is_refused_by_name(text: str, tmp_path: Path) -> None:
+    with raises_error(ConfigError, code=("network/invalid-address", "network/session-file"), field="lab.json5"):
+        read_session(written(tmp_path, text))
+
+
+def test_a_file_for_one_robot_is_no_way_to_another(tmp_path: Path) -> None:
+    settings = {"mode": "client", "connect": {"endpoints": ["tcp/10.0.0.1:7447"]}, "namespace": "worm"}
+    session = read_session(written(tmp_path, json.dumps(settings)))
+    assert Link.from_session_file(session).namespace == Link.from_session_file(session, "worm").namespace == "worm"
+    with raises_error(ConfigError, code="network/session-file", field="worm"):
+        Link.from_session_file(session, "eel")

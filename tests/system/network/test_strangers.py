@@ -1,0 +1,222 @@
+"""What a stranger on the network sends must end no service: each of these once did."""
+
+import time
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.host.host import Host
+from snakesim_hal.model.route import Route
+from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.robot_mismatch import find_mismatch
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+from snakesim_hal.wire.messages import (
+    Answer,
+    Clock,
+    Contacts,
+    DepthImage,
+    Description,
+    Imu,
+    Intent,
+    JointState,
+    LeaseRequest,
+    Message,
+    Trajectory,
+    World,
+)
+from snakesim_hal.wire.quantities import Quaternion
+from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
+from snakesim_testing.hal.local_network import LagBackend, meeting
+from snakesim_testing.hal.small_robots import contact, pose, power, run_config, state
+from snakesim_testing.hal.strategies import plain_example
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+
+X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+
+
+def contacts(link: int) -> Contacts:
+    return Contacts(tick=0, timestamp_ns=0, contacts=[contact(link)])
+
+
+def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:
+    example = plain_example(World)
+    example["contacts"][0]["link"] = link
+    return msgspec.convert({**example, "base_orientation_wxyz": orientation}, World)
+
+
+def imu(link: list[int], rates: int) -> Imu:
+    return Imu(tick=0, timestamp_ns=0, link=link, angular_velocity_rad_s=[X] * rates, acceleration_m_s2=[X] * len(link))
+
+
+def trajectory(*path: tuple[float, float]) -> Trajectory:
+    return Trajectory(
+        tick=0, timestamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False
+    )
+
+
+def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthImage:
+    values = {"link": link, "orientation_l_wxyz": turned, "width": 3, "height": 2, "depth": depth}
+    return msgspec.convert({**plain_example(DepthImage), **values}, DepthImage)
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (state(ROBOT, 0.1), None),
+        (msgspec.structs.replace(state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
+        (msgspec.structs.replace(state(ROBOT, 0.1), valid=[]), "wrong_length"),
+        (power(), None),
+        (power(joints=4), "wrong_length"),
+        (imu([0, 3], 2), None),
+        (imu([], 0), None),
+        (imu([0, 4], 2), "wrong_length"),
+        (imu([0, 3], 1), "wrong_length"),
+        (contacts(3), None),
+        (contacts(4), "wrong_length"),
+        (world(3), None),
+        (world(4), "wrong_length"),
+        (world(0, (0.0, 0.0, 0.0, 0.0)), "no_rotation"),
+        (pose(orientation_wxyz=(0.6, 0.0, 0.0, 0.8)), None),
+        (pose(orientation_wxyz=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
+        (pose(orientation_wxyz=(1.0, 1.0, 1.0, 1.0)), "no_rotation"),
+        (image(bytes(12)), None),
+        (image(bytes(11)), "wrong_length"),
+        (image(bytes(12), link=4), "wrong_length"),
+        (image(bytes(12), turned=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
+        (trajectory((0.0, 0.0), (1.0, 0.0)), None),
+        (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
+        (Intent(timestamp_ns=0, requester="operator"), None),
+    ],
+)
+def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
+    wrong = find_mismatch(message, ROBOT)
+    assert (wrong.reason if wrong is not None else None) == why
+
+
+def test_what_passes_as_a_path_makes_a_route() -> None:
+    tiny = 5e-324  # the shortest step there is: its length is no number to divide by
+    for path in ([(0.0, 0.0), (tiny, 0.0)], [(1e6, 0.0), (-1e6, 0.0)]):
+        if find_mismatch(trajectory(*path), ROBOT) is None:
+            assert Route(path).length_m > 0
+
+
+def served(hal: Session) -> None:
+    """A HAL that shows its robot and nothing else."""
+    hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+
+
+def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out() -> None:
+    with meeting("worm", "worm") as (hal, session):
+        served(hal)
+        client = Client(session, "navigation")
+        intents, joints = client.subscribe(keys.INTENT, Intent), client.subscribe(keys.JOINTS, JointState)
+        assert client.description() == client.description() == ROBOT  # asked again, it is remembered
+        clocks = hal.publisher(keys.CLOCK, Clock)
+        asked, felt = hal.publisher(keys.INTENT, Intent), hal.publisher(keys.JOINTS, JointState)
+        wait_until(
+            lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(), "everybody heard"
+        )
+        for speed in (0.1, 0.2):
+            asked.put(Intent(timestamp_ns=5, requester="operator", speed_m_s=speed))
+        felt.put(state(ROBOT, 0.1, tick=3))
+        felt.put(msgspec.structs.replace(state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
+        ticks = client.ticks()
+
+        def all_there() -> bool:
+            clocks.put(CLOCK)
+            next(ticks)
+            return session.rejected == {"wrong_length": 1} and intents.newest() is not None
+
+        wait_until(all_there, "the wrong state counted, and an intent")
+        intent, newest = intents.newest(), joints.newest()
+        assert intent is not None and intent.speed_m_s == 0.2
+        assert newest is not None and newest.tick == 3
+
+
+def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
+    with meeting("worm", "worm") as (rogue, session):
+        served(rogue)
+        network: Any = rogue._zenoh  # pyright: ignore[reportPrivateUsage] - a rogue does not keep to our session
+        stranger = network.declare_queryable(
+            keys.LEASE, lambda query: query.reply(keys.LEASE, b"\xc1", encoding="zenoh/bytes")
+        )
+        with raises_error(NotConnectedError, code="network/no-answer"):
+            session.request(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
+        commander = Commander(Client(session, "control"), ROBOT)
+        time.sleep(0.3)  # it asks at most so often
+        assert not commander.ensure_lease(CLOCK)
+        assert commander.refusal is not None and "cannot be decoded" in commander.refusal
+        assert session.rejected == {"unknown_message": 2}
+        stranger.undeclare()
+
+
+def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> None:
+    with meeting("worm", "worm", "worm") as (hal, session, stranger):
+        heard: list[int] = []
+        for listener in (hal, session):
+            listener.on_arrival(keys.JOINTS, lambda arrival: heard.append(len(arrival.payload)))
+        publisher = stranger.publisher(keys.JOINTS, JointState, lossless=True)
+        wait_until(publisher.has_subscriber, "somebody listening")
+        put: Any = stranger._zenoh.put  # pyright: ignore[reportPrivateUsage] - a stranger does not keep to our session
+        for length in (MAX_PAYLOAD_BYTES, 10 * MAX_PAYLOAD_BYTES, 1):
+            put(keys.JOINTS, bytes(length), congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: heard.count(1) >= 2, "the last one everywhere")
+        assert sorted(heard) == [1, 1, MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES]
+
+
+def test_large_images_arrive_where_they_are_expected() -> None:
+    """A robot's own processes know its cameras; to everybody else more than a MiB is too long."""
+    endpoint, largest = free_endpoint(), 2 * 1280 * 960
+    with (
+        open_session(Link(endpoint, "worm", listen=True, max_bytes=largest)) as hal,
+        open_session(Link(endpoint, "worm", max_bytes=largest)) as session,
+        open_session(Link(endpoint, "worm")) as small,
+    ):
+        readers = [each.reader(keys.depth_key("head"), DepthImage) for each in (session, small)]
+        publisher = hal.publisher(keys.depth_key("head"), DepthImage, lossless=True)
+        wait_until(publisher.has_subscriber, "somebody listening")
+        sent = msgspec.structs.replace(image(bytes(largest)), width=1280, height=960)
+        publisher.put(sent)
+        wait_until(lambda: readers[0].drain() == [sent], "the image")
+        assert readers[1].drain() == []
+
+
+def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
+    config, answers = run_config(clock_mode="realtime", services={}), list[Answer]()
+    with meeting("worm") as (session,):
+        host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
+        host.on_request(LeaseRequest(action="acquire", holder="control"), answers.append)
+        host.authority.observe(state(ROBOT))
+        host.authority.state = "armed"
+        time.sleep(1.5e-9 * host.description.lease_ns)
+        host.on_request(LeaseRequest(action="acquire", holder="stranger"), answers.append)
+    assert [answer.ok for answer in answers] == [True, True]
+    assert host.authority.state == "fault" and host.authority.faults[-1].what == "lease_expired"
+
+
+def test_a_flood_is_dropped_unread_but_for_the_newest_that_is_wanted() -> None:
+    with meeting("worm", "worm") as (hal, session):
+        reader, asked = session.reader(keys.JOINTS, JointState), list[int]()
+        joints, after = hal.publisher(keys.JOINTS, JointState, lossless=True), session.reader(keys.CLOCK, Clock)
+        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
+        wait_until(lambda: joints.has_subscriber() and clocks.has_subscriber(), "both readers")
+        for tick in range(101):
+            joints.put(state(ROBOT, tick=tick))
+        clocks.put(CLOCK)
+        wait_until(after.drain, "what was sent last")
+
+        def wanted(message: JointState) -> bool:
+            asked.append(message.tick)
+            return message.tick < 100
+
+        newest = reader.newest(wanted)
+        assert newest is not None and newest.tick == 99 and asked == [100, 99]
+        assert reader.newest(wanted) is None and reader.drain() == []

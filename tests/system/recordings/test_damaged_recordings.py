@@ -1,0 +1,328 @@
+"""A damaged recording: every command goes on behind the damage, tells what is lost, and ends with exit code 3."""
+
+import csv
+import dataclasses
+import json
+import struct
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+
+from snakesim_hal.wire import keys
+from snakesim_operator.playback import video
+from snakesim_operator.playback.episodes import read_episodes
+from snakesim_operator.playback.export import write_parquet
+from snakesim_operator.playback.lerobot import write_lerobot
+from snakesim_operator.playback.pictures import Pictures
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.summary import summarise
+from snakesim_testing.operator.damaged_recordings import chunks, flipped, packed, recorded, spans, written
+from snakesim_testing.runs.in_process_command import snakesim
+
+INCOMPLETE = 3
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("recorded") / "run", 1.5, 100_000)
+
+
+@pytest.fixture(scope="module")
+def whole(run: Path) -> bytes:
+    content = (run / RECORDING).read_bytes()
+    assert len(chunks(content)) >= 5
+    return content
+
+
+def lost(whole_path: Path, path: Path) -> Counter[str]:
+    """By key, by comparison with the file as it was."""
+    before, after = (Counter(one.key for one in RecordingReader(of).read_messages()) for of in (whole_path, path))
+    return before - after
+
+
+def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key(
+    run: Path, whole: bytes, tmp_path: Path
+) -> None:
+    damaged, following = chunks(whole)[2:4]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    reader = RecordingReader(path)
+    kept = list(reader.read_messages())
+    truth = lost(run / RECORDING, path)
+    assert truth[keys.JOINTS] >= 2 and len(kept) > 500
+    assert {key: count for key, count in reader.losses.lost_by_key.items() if not key.startswith("/")} == truth
+    (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
+    clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
+    hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
+    assert gap.end_ns is not None and hole[0] <= gap.begin_ns < gap.end_ns <= hole[1]
+    assert reader.finished and following.begin  # what follows was read
+
+
+@pytest.mark.slow  # one flipped bit in one of them below
+def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Path) -> None:
+    for chunk in chunks(whole):
+        for at in (chunk.begin, chunk.begin + 2, chunk.begin + 45, chunk.end - 5):  # kind, length, name, data
+            path = written(tmp_path / "a.mcap", flipped(whole, at))
+            reader = RecordingReader(path)
+            kept = list(reader.read_messages())
+            ours = {key: n for key, n in reader.losses.lost_by_key.items() if not key.startswith("/")}
+            assert kept and reader.finished and ours == lost(run / RECORDING, path), (chunk, at, reader.missing)
+
+
+COMMANDS = [
+    ["recording", "info", "a.mcap"],
+    ["recording", "report", "a.mcap"],
+    ["study", "compare", "whole.mcap", "a.mcap"],
+    ["study", "compare", "a.mcap", "whole.mcap", "--json"],
+    ["recording", "export", "a.mcap", "--format", "csv", "--out", "a.csv"],
+    ["recording", "export", "a.mcap", "--format", "npz", "--out", "a.npz"],
+    ["recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap"],
+    ["replay", "a.mcap", "--control"],
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "damage"),
+    [*((command, "flipped") for command in COMMANDS), (COMMANDS[0], "halved"), (COMMANDS[0], "taken out")],
+)
+def test_every_command_tells_of_the_damage_and_ends_with_3(
+    whole: bytes, tmp_path: Path, command: list[str], damage: str
+) -> None:
+    second = chunks(whole)[1]
+    damaged = {
+        "flipped": flipped(whole, (second.begin + second.end) // 2),
+        "halved": whole[: len(whole) // 2],
+        "taken out": whole[: second.begin] + whole[second.end :],
+    }[damage]
+    written(tmp_path / "whole.mcap", whole)
+    written(tmp_path / "a.mcap", damaged)
+    ended = snakesim(*command, cwd=tmp_path)
+    assert ended.code == INCOMPLETE, ended
+    said = [line for line in ended.err.splitlines() if "update() took" not in line]  # a busy computer
+    assert len(said) == 1 and said[0].startswith("snakesim: a.mcap is incomplete: ")
+    assert ("breaks off at" if damage == "halved" else "actuator/joints") in ended.err
+    if "--json" in command:
+        assert json.loads(ended.out)["missing"]["a"] and not json.loads(ended.out)["missing"]["b"]
+
+
+def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole: bytes, tmp_path: Path) -> None:
+    for name in ("whole.mcap", "a.mcap"):
+        written(tmp_path / name, whole)
+    for command in COMMANDS:
+        ended = snakesim(*command, cwd=tmp_path)
+        errors = [line for line in ended.err.splitlines() if "update() took" not in line]  # by a busy computer
+        assert ended.code == 0 and not errors, ended
+    page = (tmp_path / "a.html").read_text()
+    assert "The run ended early" not in page and "The record is incomplete" not in page
+    # What repeats the run names a file that can be.
+    assert "snakesim run config.json --backend sim" in page and "a.mcap/config.json" not in page
+    assert "Save the effective configuration below as <code>config.json</code>" in page
+
+
+def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: bytes, tmp_path: Path) -> None:
+    first = chunks(whole)[0]
+    written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
+    ended = snakesim("recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
+    count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
+    assert ended.code == INCOMPLETE and int(ended.out.split()[0]) > count > 500  # and those for Foxglove
+    reader = RecordingReader(tmp_path / "copy.mcap")
+    assert len(list(reader.read_messages())) == count and reader.finished
+    told = snakesim("recording", "info", "copy.mcap", cwd=tmp_path)
+    assert told.code == INCOMPLETE and "before it was copied: damaged in 1 place" in told.err
+    assert "sensor/joints" in told.err
+
+
+def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    for form in ("csv", "npz"):
+        snakesim("recording", "export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+    with (tmp_path / "a.csv").open() as file:
+        assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
+        rows = list(csv.DictReader(file))
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert "its end" in str(arrays["missing"][0]) and len(arrays["time_s"]) == len(rows) > 20
+
+
+def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
+    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    for form, out in (("parquet", "a.parquet"), ("lerobot", "set")):
+        assert (
+            snakesim("recording", "export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
+        )
+    assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.missing"]
+    assert "its end" in json.loads((tmp_path / "set" / "meta" / "missing.json").read_text())["0"][0]
+
+
+@pytest.mark.parametrize("fps", [None, 50.0])
+def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: Path, fps: float | None) -> None:
+    """No frame gets a time that it did not have, and no reward is earned while nothing was recorded."""
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
+    damaged = chunks(whole)[len(chunks(whole)) // 2]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    (intact,), parts = read_episodes([run], None, images=False), read_episodes([path], None, images=False)
+    write_lerobot(parts, tmp_path / "set", write_parquet, fps)
+    files = sorted((tmp_path / "set" / "data").rglob("*.parquet"))
+    assert len(files) == 2
+    record = RunRecord.load(path)
+    gap_s = float(np.diff(record.time_s).max())
+    assert gap_s > 0.1
+    begins_s = [record.time_s[0], record.time_s[int(np.argmax(np.diff(record.time_s))) + 1]]
+    assert intact.reward_m is not None
+    for file, begin_s in zip(files, begins_s, strict=True):
+        frames = parquet.read_table(file).to_pydict()
+        rows = [intact.record.row_at(begin_s + timestamp) for timestamp in frames["timestamp"]]
+        angles = np.array(frames["observation.state"])[:, : intact.record.angle_rad.shape[1]]
+        assert np.allclose(angles, intact.record.angle_rad[rows], atol=1e-6)  # they were measured at that time
+        earned_m = float(intact.reward_m[rows[0] : rows[-1] + 1].sum())
+        assert sum(frames["next.reward"]) == pytest.approx(earned_m, abs=0.002)
+        assert max(frames["next.reward"]) < 4 * intact.reward_m.max()
+        assert frames["next.done"] == [False] * (len(rows) - 1) + [True]
+    summary = summarise(record, "complete")
+    assert summary.mean_speed_m_s == pytest.approx(summarise(intact.record, "complete").mean_speed_m_s, rel=1e-6)
+
+
+def test_an_episode_after_a_gap_begins_with_a_picture_of_its_own(whole: bytes, tmp_path: Path) -> None:
+    """What a camera showed before the gap is not what the robot saw behind it."""
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
+    damaged = chunks(whole)[len(chunks(whole)) // 2]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    before, after = read_episodes([path], None, images=False)
+    record = before.record
+    first_tick, first_tick_after = int(record.ticks[0]), int(record.ticks[after.rows[0]])
+    pictures = Pictures(2, 1)
+    for shade, tick in enumerate((first_tick, first_tick_after + 3)):
+        pictures.add(tick, np.full((1, 2, 3), shade, np.uint8))
+    parts = [dataclasses.replace(part, pictures={"head": pictures}) for part in (before, after)]
+    write_lerobot(parts, tmp_path / "set", write_parquet)
+    lengths = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pydict()["length"]
+    assert lengths == [len(before.rows), len(after.rows) - 3]
+
+
+def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
+    damaged = chunks(whole)[len(chunks(whole)) // 2]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    record = RunRecord.load(path)
+    before, after = (int(rows[end]) for rows, end in zip(record.stretches, (-1, 0), strict=True))
+    times_s = video.times_of_pictures(record, 100.0, 1.0, (0.0, np.inf))
+    gap_s = record.time_s[after] - record.time_s[before]
+    assert (times_s == record.time_s[before]).sum() == round(gap_s * 100)  # and never the pose that came later
+    (sentence,) = video.standstills_in_words(times_s, 0.01, 0.01)
+    assert f"between {record.time_s[before]:.2f} and {record.time_s[after]:.2f} s" in sentence
+
+
+def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "whole.mcap", whole)
+    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    snakesim("recording", "report", "a.mcap", cwd=tmp_path)
+    page = (tmp_path / "a.html").read_text()
+    assert "How the run ended is not known: the recording breaks off after 0." in page and "ended early" not in page
+    assert "The record is incomplete. recording: its end" in page
+    compared = snakesim("study", "compare", "whole.mcap", "a.mcap", cwd=tmp_path)
+    assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
+    assert "in what both records hold: " in compared.out and "for all of their" not in compared.out
+
+
+def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "a.mcap", whole)
+    for form in ("csv", "npz", "mcap"):
+        out = tmp_path / ("b.mcap" if form == "mcap" else f"a.{form}")
+        out.symlink_to(tmp_path / "elsewhere")
+        wanted = ["--out", "b.mcap"] if form == "mcap" else []
+        ended = snakesim("recording", "export", "a.mcap", "--format", form, *wanted, cwd=tmp_path)
+        assert ended.code == 2 and "there is a symbolic link already; choose another one with --out" in ended.err
+        assert not (tmp_path / "elsewhere").exists()
+
+
+def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_path: Path) -> None:
+    end = next(span for span in spans(whole) if span.opcode == Opcode.METADATA)
+    path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
+    reader = RecordingReader(path)
+    assert list(reader.read_messages()) and reader.finished and not reader.missing
+
+
+def test_a_bad_lz4_chunk_and_an_impossible_time_are_damage_as_any_other(whole: bytes, tmp_path: Path) -> None:
+    first, second = chunks(whole)[:2]
+    bad = packed(b"abc", "lz4", data=b"no lz4 at all")
+    reader = RecordingReader(written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :]))
+    assert len(list(reader.read_messages())) > 500 and "a chunk that cannot be unpacked" in reader.missing[0]
+    (channel,) = struct.unpack("<H", b"\x01\x00")
+    late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
+    reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
+    assert max(one.time_ns for one in reader.read_messages()) < 2**62 and reader.missing
+    assert snakesim("recording", "info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
+
+
+def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> None:
+    second = chunks(whole)[1]
+    for opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT):
+        absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
+        reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :]))
+        list(reader.read_messages())
+        assert reader.finished and not reader.losses.lost_by_key and reader.losses.damage_count == 1
+
+
+def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
+    bomb = packed(bytes(60_000_000))
+    assert len(bomb) < 10_000
+    written(tmp_path / "bomb.mcap", MCAP0_MAGIC + bomb * 20)
+    for command in (
+        ["recording", "info", "bomb.mcap"],
+        ["recording", "export", "bomb.mcap", "--format", "mcap", "--out", "o.mcap"],
+    ):
+        ended = snakesim(*command, cwd=tmp_path)
+        assert ended.code == 2 and len(ended.err.splitlines()) == 1, ended
+        assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
+
+
+NAVIGATION = "services.navigation.code="
+NAMED = {  # the class that is made another; how a run names that one, how the refusal calls it, and what stands for it
+    "controller": ("control.hold import Hold", ("--controller", "./mine.py:Mine"), ("--controller", "hold")),
+    "service navigation": (
+        "navigation.service import Navigation",
+        ("--set", f"{NAVIGATION}./mine.py:Mine"),
+        ("--set", f"{NAVIGATION}navigation"),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NAMED)
+def test_what_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, kind: str) -> None:
+    base, own, shipped = NAMED[kind]
+    (tmp_path / "mine.py").write_text(
+        "from pathlib import Path\n"
+        f"from snakesim_gnc.{base} as Base\n"
+        "(Path(__file__).parent / 'ran').touch()\n"
+        "class Mine(Base):\n    pass\n"
+    )
+    begun = snakesim("run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", *own, cwd=tmp_path)
+    assert begun.code == 0 and (tmp_path / "ran").exists(), begun
+    (tmp_path / "ran").unlink()
+    for words in ("info run", "report run", "export run --format csv", "compare run run"):
+        assert snakesim(*words.split(), cwd=tmp_path).code == 0
+    more = () if kind == "controller" else ("--controller", "hold")  # which says nothing of a service
+    refused = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
+    assert refused.code == 2 and f"the recording names './mine.py:Mine' as its {kind}" in refused.err
+    assert "--run-recorded-code" in refused.err and " ".join(own) in refused.err
+    assert not (tmp_path / "ran").exists()
+    for flags, runs in ((shipped, False), (own, True), (("--run-recorded-code",), True)):
+        replayed = snakesim("replay", "run", "--control", *flags, cwd=tmp_path)
+        assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+        assert (tmp_path / "ran").exists() == runs
+        (tmp_path / "ran").unlink(missing_ok=True)
+
+
+def test_a_folder_with_a_black_box_tells_of_its_recording_too(run: Path, whole: bytes, tmp_path: Path) -> None:
+    for path in run.iterdir():
+        if path.is_file():
+            written(tmp_path / path.name, path.read_bytes())
+    written(tmp_path / RECORDING, whole[: len(whole) // 2])
+    ended = snakesim("recording", "report", ".", cwd=tmp_path)
+    assert ended.code == INCOMPLETE and "its end: it breaks off" in ended.err
+    assert len(RunRecord.load(tmp_path).time_s) == 150  # the rows are the black box's

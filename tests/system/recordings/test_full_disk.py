@@ -1,0 +1,68 @@
+"""An export that does not fit on the disk is named, and leaves no half file; an earlier file stays as it was."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from snakesim.training.curve import write_curve
+from snakesim.training.search import Generation
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.evaluate.store import write_tables
+from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.messages import raises_error
+from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
+
+FITS_BYTES = 2000  # less than any of these exports takes
+GENERATION = Generation(0, 10, 0.1, 0.2, None, None, None)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("full") / "run"
+    ended, _ = run_to_summary(out, "triplet", "--duration", "0.5")
+    assert ended.code == 0, ended.err
+    return out
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (["recording", "export", "--format", "csv"], "table.csv"),
+        (["recording", "export", "--format", "parquet"], "table.parquet"),
+        (["recording", "export", "--format", "npz"], "arrays.npz"),
+        (["recording", "export", "--format", "lerobot"], "dataset"),
+        (["recording", "export", "--format", "mcap"], "whole.mcap"),
+        (["recording", "plot"], "plot.pdf"),
+        (["recording", "plot"], "plot.svg"),
+        (["recording", "video", "--width", "64", "--height", "48", "--fps", "10"], "film.gif"),
+        (["recording", "video", "--width", "64", "--height", "48", "--fps", "10"], "film.mp4"),
+        (["recording", "report"], "report.html"),
+    ],
+    ids=lambda one: one if isinstance(one, str) else "",
+)
+def test_an_export_that_does_not_fit_is_named_and_leaves_nothing(
+    run: Path, tmp_path: Path, command: list[str], name: str
+) -> None:
+    out = tmp_path / name
+    with max_file_size(FITS_BYTES):
+        ended = snakesim(*command[:2], str(run), *command[2:], "--out", str(out), cwd=tmp_path)
+    assert ended.code == 2 and f"{out}: cannot be written: " in ended.err, ended.out + ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (lambda folder: write_curve(folder, [GENERATION] * 200), "curve.csv"),
+        (lambda folder: write_tables(folder, [], {}), "results.parquet"),
+    ],
+    ids=["curve", "tables"],
+)
+def test_what_searches_and_evaluations_leave_is_whole_or_as_before(
+    tmp_path: Path, write: Callable[[Path], object], name: str
+) -> None:
+    (tmp_path / name).write_text("an earlier one")
+    with max_file_size(FITS_BYTES), raises_error(ConfigError, code="file/not-writable", field=name):
+        write(tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "an earlier one")]

@@ -1,0 +1,86 @@
+"""Parameters of the controller, changed while it runs: recorded with time and author, and changed in a replay too."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from snakesim_hal.controller import load_controller
+from snakesim_hal.model.json_schema import make_schema
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlParameters, ParametersRequest
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
+from snakesim_testing.runs.in_process_command import snakesim
+
+CHANGED_AT = 30  # turns
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in which ada changed two gains."""
+    path = tmp_path_factory.mktemp("tuned") / RECORDING
+    config = load("peg_row", [parse_set("duration_s=0.6")]).config
+    with InProcessRun(config) as run:
+        session, recording = run.network.session(), RecordingWriter(path)
+        for row in keys.SPACE:
+            session.on_latched_arrival(row.key, recording.write_arrival)
+        request = ParametersRequest(
+            requester="ada",
+            controller=config.controller,
+            parameters='{"propulsion_n": 20, "damping_nm_s_per_rad": 0.9}',
+        )
+        for turn, _ in enumerate(run.iterate_ticks()):
+            if turn == CHANGED_AT:
+                session.send_query(keys.PARAMETERS, request)
+        recording.close({})
+    return path
+
+
+def test_a_replay_changes_them_in_the_same_tick(tuned: Path, tmp_path: Path) -> None:
+    replayed = snakesim("replay", str(tuned), "--control", cwd=tmp_path)
+    assert replayed.code == 0 and replayed.out == "60 commands, the same to the bit\n", replayed.out + replayed.err
+
+
+def test_the_recording_tells_who_set_what_and_when(tuned: Path, tmp_path: Path) -> None:
+    said = snakesim("recording", "info", str(tuned), cwd=tmp_path).out
+    row = next(line for line in said.splitlines() if line.startswith("  set "))
+    assert row.endswith(" s by ada: control.propulsion_n: 35.0 -> 20.0, control.damping_nm_s_per_rad: 0.5 -> 0.9")
+
+
+def test_what_is_set_for_the_replay_stays(tuned: Path, tmp_path: Path) -> None:
+    given = ["--set", "control.propulsion_n=20", "--set", "control.damping_nm_s_per_rad=0.9"]
+    replayed = snakesim("replay", str(tuned), "--control", *given, cwd=tmp_path)
+    assert "commands differ, the first answers tick " in replayed.out
+    first = int(replayed.out.split("answers tick ")[1].split()[0])
+    assert first < CHANGED_AT, "differs before the change, and not after it alone"
+
+
+MUST_BE_SET = {"policy": {"model": "a.onnx"}}
+
+
+@pytest.mark.parametrize("name", list_installed(CONTROLLERS))
+def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
+    parameters_type = load_controller(name).Parameters
+    in_force = ControlParameters(
+        tick=0,
+        timestamp_ns=0,
+        controller=name,
+        parameters=msgspec.json.encode(parameters_type(**MUST_BE_SET.get(name, {}))).decode(),
+        schema=msgspec.json.encode(make_schema(parameters_type)).decode(),
+    )
+    found = read_parameters(in_force)
+    assert len(found) == len(msgspec.structs.fields(parameters_type))
+    for one in found:
+        assert one.description and one.range and (one.unit or one.name in ("push_scale", "model", "slides")), one
+
+
+def test_ranges_are_told_in_words() -> None:
+    assert Parameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range == ">= 0, <= 5"
+    assert Parameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range == "> 0"
+    assert Parameter("a", "x", choices=("x", "y")).range == "x or y"
+    assert (Parameter("a", 0.3, "N").value_with_unit, Parameter("a", 0.3, "1").value_with_unit) == ("0.3 N", "0.3")

@@ -1,0 +1,208 @@
+"""A recording: what is in it is what was on the wire, whatever became of its recorder or its disk."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import pytest
+from mcap.reader import make_reader
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import HAL
+from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode, format_encoding
+from snakesim_hal.wire.messages import Clock, Description, Done, Intent, OwnSample
+from snakesim_hal.wire.own_sample import make_message_schema
+from snakesim_hal.wire.quantities import bounded
+from snakesim_operator.recording import tap as tap_module
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.recorder_process import record_to_file
+from snakesim_operator.recording.recover import recover_recording
+from snakesim_operator.recording.tap import Tap
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_testing.hal.small_robots import PERIOD_NS, description
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+from snakesim_testing.operator.clock_samples import clock
+
+
+class Whisker(OwnSample, frozen=True, kw_only=True):
+    """Bend of a whisker."""
+
+    bend_rad: Annotated[float, bounded(-2.0, 2.0, "rad")]
+
+
+def done(tick: int, service: str = "control") -> Arrival:
+    return Arrival(keys.done_key(service), encode(Done(tick=tick)), format_encoding(Done), time.monotonic_ns())
+
+
+def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
+    recording = RecordingWriter(tmp_path / "a.mcap")
+    intent = Arrival(
+        keys.INTENT, encode(Intent(timestamp_ns=5, requester="anna")), format_encoding(Intent), time.monotonic_ns()
+    )
+    negative = msgspec.structs.replace(done(0), payload=msgspec.msgpack.encode({"tick": -1}))
+    sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]
+    for arrival in sent:
+        recording.write_arrival(arrival)
+    recording.close({"dropped": {}})
+    found = list((reader := RecordingReader(tmp_path / "a.mcap")).read_messages())
+    assert [(one.key, one.payload, one.encoding) for one in found] == [(a.key, a.payload, a.encoding) for a in sent]
+    # A tick that cannot be true, or none: the time of the newest clock.
+    assert [one.time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
+    assert all(abs(one.wall_ns - time.time_ns()) < 60e9 for one in found)
+    assert reader.finished and reader.metadata == {"dropped": {}} and not reader.missing
+
+
+def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
+    recording = RecordingWriter(tmp_path / "a.mcap")
+    for tick in range(50):
+        recording.write_arrival(clock(tick))
+        if tick in (20, 30):
+            recording.flush()
+    recording.close({"version": "1"})
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = list(reader.iter_messages())
+        late = [message.log_time for *_, message in reader.iter_messages(starting_at=25 * PERIOD_NS)]
+        summary, about = reader.get_summary(), list(reader.iter_metadata())
+    assert summary is not None and summary.statistics is not None and summary.statistics.message_count == 50
+    assert len(summary.chunk_indexes) == 3 and late == [tick * PERIOD_NS for tick in range(25, 50)]
+    assert summary.statistics.message_start_time == 0 and summary.statistics.message_end_time == 49 * PERIOD_NS
+    assert [(one.name, one.metadata) for one in about] == [("snakesim", {"version": '"1"'})]
+    schema, channel, message = found[-1]
+    assert schema is not None and (schema.name, schema.encoding) == ("snakesim.Clock", "jsonschema")
+    assert (channel.topic, channel.message_encoding, message.log_time) == (keys.CLOCK, "msgpack", 49 * PERIOD_NS)
+
+
+KILLED = """
+import os, sys, time
+from pathlib import Path
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_operator.recording.recover import recover_recording
+from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.operator.clock_samples import clock
+recording = RecordingWriter(Path(sys.argv[1]))
+for tick in range(10**9):
+    recording.write_arrival(clock(tick))
+    recording.flush_when_due()
+    print(time.monotonic(), tick, flush=True)
+    time.sleep(0.002)
+"""
+
+
+def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    ticks: list[tuple[float, int]] = []
+    while not ticks or ticks[-1][0] - ticks[0][0] < 1.2:
+        at, tick = process.stdout.readline().split()
+        ticks.append((float(at), int(tick)))
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait(10)
+    process.stdout.close()
+    reader = RecordingReader(path)
+    kept = len(list(reader.read_messages()))
+    a_second_before = [tick for at, tick in ticks if at < ticks[-1][0] - 1.0]
+    assert kept > a_second_before[-1] and not reader.finished and "its end: it breaks off" in reader.missing[0]
+    with path.open("rb") as file, contextlib.suppress(Exception):  # the stock reader, as far as it goes
+        stock = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+        assert len(stock) == kept
+
+
+def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: Path) -> None:
+    with max_file_size(20_000):
+        recording = RecordingWriter(tmp_path / "a.mcap")
+        for tick in range(5000):
+            recording.write_arrival(clock(tick))
+            if tick % 50 == 0:
+                recording.flush()
+        recording.close({})
+    assert "File too large" in recording.failure
+    reader = RecordingReader(tmp_path / "a.mcap")
+    ticks = [one.time_ns // PERIOD_NS for one in reader.read_messages()]
+    assert (
+        len(ticks) > 200 and ticks == list(range(len(ticks))) and not reader.losses.damage_count and not reader.finished
+    )
+
+
+def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tap_module, "MAX_BYTES", 1000)
+    network = LocalNetwork()
+    tap, publisher = Tap(network.session()), network.session().publisher(keys.done_key("control"), Done)
+    for tick in range(2000):
+        publisher.put(Done(tick=tick))
+    kept = tap.drain()
+    assert sum(len(arrival.payload) for arrival in kept) <= 1000
+    assert len(kept) + tap.dropped[keys.done_key("control")] == 2000
+    publisher.put(Done(tick=1))
+    assert len(tap.drain()) == 1
+
+
+def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tap_module, "MAX_BYTES", 100)
+    monkeypatch.setattr(tap_module, "LIMIT_S", 0.2)
+    network = LocalNetwork()
+    tap, publisher = Tap(network.session()), network.session().publisher(keys.done_key("control"), Done)
+    tap.lossless = True
+    began = time.monotonic()
+    for tick in range(200):
+        publisher.put(Done(tick=tick))
+    assert 0.2 <= time.monotonic() - began < 0.5
+    assert tap.dropped.total() + len(tap.drain()) == 200
+
+
+def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
+    """What is damaged: tests/system/recordings/test_damaged_recordings.py."""
+    (tmp_path / "bad.mcap").write_bytes(b"no recording at all")
+    with raises_error(ConfigError, code="recording/not-readable", field="bad.mcap"):
+        recover_recording(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
+    assert not (tmp_path / "copy.mcap").exists()
+
+
+def test_a_recorder_that_is_told_to_end_waits_for_what_its_host_sends_before_it_leaves(tmp_path: Path) -> None:
+    endpoint, told = free_endpoint(), threading.Event()
+    link, path = Link(endpoint, "planar13"), tmp_path / "a.mcap"
+    recorder = threading.Thread(target=lambda: record_to_file(link, path, lambda: not told.is_set(), after_host=True))
+    with open_session(Link(endpoint, "planar13", listen=True)) as host:
+        host.declare_alive(HAL)
+        clocks = host.publisher(keys.CLOCK, Clock, lossless=True)
+        recorder.start()
+        wait_until(lambda: clocks.has_subscriber() and host.present(keys.alive_key("recorder")), "the recorder")
+        for tick in range(40):
+            host.send(keys.CLOCK, clock(tick).payload)
+            if tick == 20:
+                told.set()
+                time.sleep(0.2)  # many of its turns
+    recorder.join()
+    assert [one.payload for one in RecordingReader(path).read_messages([keys.CLOCK])] == [
+        clock(t).payload for t in range(40)
+    ]
+
+
+def test_a_sample_that_comes_before_the_description_is_kept_with_its_own_schema(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    own = keys.custom_key("left")
+    early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.OwnSample/1", 0)
+    schema = make_message_schema(Whisker, "test")
+    described = encode(msgspec.structs.replace(description(), own={own: schema}))
+    robot = Arrival(keys.DESCRIPTION, described, format_encoding(Description), 0)
+    recording = RecordingWriter(path)
+    for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):
+        recording.write_arrival(arrival)
+    recording.close({})
+    with path.open("rb") as file:
+        schemas = {schema.name for schema, channel, _ in make_reader(file).iter_messages(topics=[own]) if schema}
+    assert schemas == {"snakesim.own.Whisker"} and recording.counts[own] == 2

@@ -1,0 +1,15 @@
+"""The programs of a lab on this computer, ended with the test."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_testing.runs.lab_programs import Lab
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    with contextlib.ExitStack() as stack:
+        yield Lab(tmp_path, stack)

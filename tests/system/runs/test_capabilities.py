@@ -1,0 +1,37 @@
+"""What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
+
+
+from snakesim_gnc.control.guarded import GuardedController
+from snakesim_gnc.control.hold import Hold
+from snakesim_hal.base.errors import ControllerError
+from snakesim_hal.controller import NoParameters, Observation
+from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.run.in_process import simulate
+from snakesim_testing.hal.small_robots import state
+from snakesim_testing.messages import raises_error
+
+SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
+
+
+def test_a_robot_of_position_servos_without_measurements_runs_what_needs_none() -> None:
+    sets = ("controller=lateral_undulation", "duration_s=2", *SERVOS)
+    result = simulate(load("peg_row", [parse_set(text) for text in sets]).config)
+    assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0.0) > 0.1
+    assert not result.record.torque_nm.any(), "what is not measured is not told"
+    assert set(result.record.mode.flat) <= {Mode.PASSIVE, Mode.POSITION}
+
+
+def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_command() -> None:
+    class Pushes(Hold):
+        def update(self, observation):  # pyright: ignore
+            command = super().update(observation)
+            command.setpoints.mode[1] = Mode.TORQUE
+            return command
+
+    config = load("triplet", [parse_set(text) for text in SERVOS]).config
+    robot = describe_robot(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
+    observation = Observation(tick=0, time_s=0.0, period_s=0.01, joints=state(robot), world=None, trajectory=None)
+    with raises_error(ControllerError, code="controller/failed", field="joint_2"):
+        GuardedController("pushes", Pushes, robot, NoParameters()).update(observation)  # pyright: ignore[reportArgumentType]

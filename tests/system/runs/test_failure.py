@@ -1,0 +1,90 @@
+"""What happens when a part dies, a person presses Ctrl-C, or the supervisor itself is killed."""
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Mode, Status
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import armed_run
+from snakesim_testing.runs.command import run_to_summary
+from snakesim_testing.runs.command import snakesim
+from snakesim_testing.runs.command import summary_of
+
+pytestmark = pytest.mark.e2e
+
+LONG = ["triplet", "--controller", "hold", "--duration", "600"]
+
+
+@pytest.mark.parametrize("clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
+def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path: Path, clock_mode: str) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            statuses = session.reader(keys.STATUS, Status)
+            wait_until(lambda: bool(statuses.drain()), "a status")
+            os.kill(run.part("control"), signal.SIGKILL)
+            wait_until(lambda: any("lease of control expired" in one.reason for one in statuses.drain()), "the reason")
+        assert run.end() == 1
+    faults = {fault.what: fault for fault in summary_of(run.out).faults}  # a busy computer may see any of them first
+    assert set(faults) == {"service_lost", "lease_expired"}
+    lost, expired = faults["service_lost"], faults["lease_expired"]
+    record = RunRecord.load(tmp_path / "run")
+    lease_ticks = round(record.description.lease_ns / record.config.period_ns)
+    assert expired.tick - lost.tick <= lease_ticks + 2
+    last_commanded = int(np.flatnonzero((record.mode == Mode.POSITION).any(axis=1))[-1])
+    after = record.mode[last_commanded + 1 :]
+    assert len(after) > 50
+    assert (after == Mode.VELOCITY).all() and (record.target[last_commanded + 1 :] == 0).all()  # damped
+    told_later = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
+    assert told_later.code == 1 and "lease of control expired" in told_later.out
+
+
+@pytest.mark.slow  # tests/unit/gnc/test_guarded.py has each wrong answer
+@pytest.mark.parametrize("clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
+def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
+    """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
+    (tmp_path / "wave.py").write_text(
+        "from snakesim_hal.controller import ControllerCommand, RequestedSetpoints\n"
+        "from snakesim_gnc.control.hold import Hold\n"
+        "from snakesim_hal.wire.messages import Mode\n\n\n"
+        "class Wave(Hold):\n"
+        "    def update(self, observation):\n"
+        "        if observation.time_s < 0.5:\n"
+        "            return super().update(observation)\n"
+        "        angles = list(observation.joints.angle_rad)[:-1]\n"
+        "        return ControllerCommand(RequestedSetpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
+    )
+    flags = ["--controller", "./wave.py:Wave", "--clock-mode", clock_mode, "--duration", "60"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    said = (
+        "controller ./wave.py:Wave (class Wave): RequestedSetpoints.mode has 12 values, must have 13: one a joint, "
+        "joint_1 to joint_13"
+    )
+    assert ended.code == 1 and summary.duration_s < 5.0  # not after the time that a stalled service is given
+    assert summary.ended.startswith(f"control ended with exit code 1: {said}")
+    assert f"fault: control ended with exit code 1: {said}" in ended.out
+    assert summary.last_reason is not None and summary.last_reason.startswith(said)
+    assert (tmp_path / "run" / "control.log").read_text().splitlines()[-1].startswith(f"snakesim control: {said}")
+
+
+@pytest.mark.slow  # tests/system/host/test_control_service.py has what control reports of it
+def test_a_controller_that_is_too_slow_is_named_as_the_cause_of_the_stop(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text(
+        "import time\n\n"
+        "from snakesim_gnc.control.hold import Hold\n\n\n"
+        "class Slow(Hold):\n"
+        "    def update(self, observation):\n"
+        "        time.sleep(0.1)\n"
+        "        return super().update(observation)\n"
+    )
+    flags = ["--controller", "./slow.py:Slow", "--clock-mode", "realtime", "--duration", "10"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 1
+    assert re.match(r"control: update\(\) took \d\d\d ms of 10 ms; lease of control expired", summary.ended)

@@ -1,0 +1,72 @@
+"""Faults on request in runs of one process, planned with a flag. Those that are refused are in refusals.toml."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.runs.in_process_command import run_to_summary
+from snakesim_testing.runs.in_process_command import snakesim
+
+MAY_LOSE_ONE = "robot.safety.max_isolated_joints=1"
+slow = partial(pytest.param, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("backend", "fault", "what"),
+    [
+        ("sim", "mute:joint_3@1", "state_invalid"),
+        slow("sim", "nan:joint_3@1", "state_invalid"),
+        slow("sim", "diverge:simulator@1", "backend_failed"),
+        ("can", "mute:joint_3@1", "module_silent"),
+        slow("can", "leak:joint_3@1", "module_leak"),
+        slow("can", "cut:bus_1@1-1.3", "interface_down"),
+        slow("odrive", "mute:joint_3@1", "drive_silent"),
+        slow("odrive", "reboot:joint_3@1", "drive_silent"),  # as dynamixel
+        slow("odrive", "overheat:joint_3@1", "drive_fault"),
+        slow("odrive", "cut:bus_1@1-1.3", "interface_down"),  # as can
+        slow("moteus", "mute:joint_3@1", "drive_silent"),  # as odrive
+        slow("moteus", "reboot:joint_3@1", "drive_silent"),  # as odrive
+        slow("moteus", "overheat:joint_3@1", "drive_fault"),  # as odrive
+        slow("moteus", "cut:bus_1@1-1.3", "interface_down"),  # as odrive
+        slow("dynamixel", "mute:joint_3@1", "drive_silent"),  # as odrive
+        slow("dynamixel", "reboot:joint_3@1", "drive_silent"),
+        slow("dynamixel", "overheat:joint_3@1", "drive_fault"),  # as odrive
+        slow("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
+        ("dynamixel", "cut:bus_1@1-1.3", "interface_down"),
+        slow("mixed", "reboot:joint_12@1", "drive_silent"),  # as dynamixel
+        slow("mixed", "cut:bus_2@1-1.3", "interface_down"),
+    ],
+)
+def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
+    tmp_path: Path, backend: str, fault: str, what: str
+) -> None:
+    robot = ("--set", "robot=planar13_mixed") if backend == "mixed" else ()
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault)
+    record = RunRecord.load(tmp_path / "run").host
+    by = 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
+    assert ended.code == 1 and summary.faults[0].what == what
+    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= by
+    assert record.lifecycle == "fault"
+
+
+@pytest.mark.parametrize("backend", ["sim", "can", slow("odrive"), slow("moteus"), slow("dynamixel")])
+def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
+    flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "1.5", "--set", MAY_LOSE_ONE]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 1.5, ended.out
+    assert summary.isolated == ["joint_5"] and summary.faults[0].joint == "joint_5"
+    assert "isolated              joint_5: failed, and passive since" in ended.out
+    left = RunRecord.load(tmp_path / "run")
+    modes, limits = left.mode, left.torque_limit_nm
+    before, after = slice(50, 95), slice(106, 150)
+    assert (modes[before, 4] == Mode.POSITION).all() and (modes[after, 4] == Mode.PASSIVE).all()
+    assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
+
+
+def test_the_list_is_there_without_a_robot(tmp_path: Path) -> None:
+    ended = snakesim("fault", "list", cwd=tmp_path)
+    assert ended.code == 0 and "undervoltage" in ended.out

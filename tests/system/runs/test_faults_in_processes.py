@@ -1,0 +1,116 @@
+"""Faults on request in runs of real processes: planned with a flag, asked for with the command, and refused."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import armed_run
+from snakesim_testing.runs.command import run_to_summary
+from snakesim_testing.runs.command import snakesim
+from snakesim_testing.runs.in_process_command import tell
+
+pytestmark = pytest.mark.e2e
+
+
+@pytest.mark.slow  # rows of the fault table
+@pytest.mark.parametrize(
+    ("backend", "clock_mode"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
+)
+def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, clock_mode: str) -> None:
+    """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
+    faults = ["duplicate:actuator/joints@0.5-1.5", "duplicate:sensor/joints@0.5-1.5", "slow:simulator@1-1.2=0.5"]
+    flags = [word for fault in faults for word in ("--fault", fault)]
+    ended, _ = run_to_summary(
+        tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--clock-mode", clock_mode, *flags
+    )
+    record = RunRecord.load(tmp_path / "run").host
+    assert ended.code == 0 and record.armed_ticks == 200
+    replayed = record.rejected_commands["replayed"]
+    assert replayed == 100 if clock_mode == "lockstep" else 90 <= replayed <= 110
+    assert [text.partition(": ")[2] for text in record.injected] == [
+        "duplicate:sensor/joints@0.5-1.5=1 begins",
+        "slow:simulator@1-1.2=0.5 begins",
+        "slow:simulator@1-1.2=0.5 ends",
+        "duplicate:sensor/joints@0.5-1.5=1 ends",
+    ]
+
+
+@pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
+def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
+    arguments = [
+        "triplet",
+        "--controller",
+        "hold",
+        "--duration",
+        "600",
+        "--clock-mode",
+        "realtime",
+        "--backend",
+        backend,
+    ]
+    with armed_run(tmp_path / "run", *arguments) as run:
+        result = tell(run, "fault", "inject", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
+        assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
+        result = tell(run, "fault", "inject", "mute", "joint_99")
+        assert result.code == 1 and "no joint_99" in result.err
+        result = tell(run, "fault", "inject", "drop", "guidance/world", "--amount", "0.2", "--duration", "0.5")
+        assert result.code == 0 and result.out.startswith("drop of guidance/world has begun, at "), result.err
+        result = tell(run, "fault", "inject", "mute", "joint_3", "--duration", "30")
+        assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), result.err
+        assert run.end() == 1
+    record = RunRecord.load(tmp_path / "run").host
+    assert record.faults[0].joint in (None, "joint_3") and "joint_3" in record.faults[0].cause
+    assert "mute:joint_3@" in record.injected[0]
+    said = (tmp_path / "run" / "guidance.log").read_text()
+    assert "drop:guidance/world@" in said and "begins" in said
+
+
+@pytest.mark.slow  # a row of the fault table
+def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
+    flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
+    assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
+
+
+@pytest.mark.slow  # the attack on it is in verification/attack
+def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
+    """A backend that does not say that it is emulated counts as real."""
+    (tmp_path / "bench.py").write_text(
+        "import sys\nfrom pathlib import Path\n\nimport msgspec\n"
+        "from snakesim_gnc.control.hold import Hold\n"
+        "from snakesim_sim_backend.backend import SimBackend\n\n"
+        "def tell(part):\n"
+        "    loaded = [name for name in sys.modules if name.startswith('snakesim_hal.faults.')]\n"
+        "    loaded = [name for name in loaded if name != 'snakesim_hal.faults.allowed']\n"
+        f"    Path({str(tmp_path)!r}, part).write_text(' '.join(loaded))\n\n"
+        "class Bench(SimBackend):\n"
+        "    def describe(self):\n"
+        "        return msgspec.structs.replace(super().describe(), emulated=False)\n"
+        "    def advance(self):\n"
+        "        super().advance()\n"
+        "        tell('host')\n\n"
+        "class Telling(Hold):\n"
+        "    def update(self, observation):\n"
+        "        tell('control')\n"
+        "        return super().update(observation)\n"
+    )
+    arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
+    arguments += ["--clock-mode", "realtime", "--unchecked"]
+    loaded = [tmp_path / part for part in ("host", "control")]
+    with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
+        for words in (("mute", "joint_3"), ("hang", "control")):
+            result = tell(run, "fault", "inject", *words)
+            assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err
+        run.process.terminate()
+        run.end()
+    assert [file.read_text() for file in loaded] == ["", ""], "no process has the code that carries them out"
+    allowed = ("--set", "allow_fault_injection=true", "--duration", "0.5", "--out", str(tmp_path / "allowed"))
+    snakesim("run", *arguments, *allowed, "--endpoint", free_endpoint(), cwd=tmp_path)
+    assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
+    ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)
+    assert ended.code == 1 and "`faults` are planned, and something real moves here" in ended.out
+    wait_until(lambda: not list((tmp_path / "other").glob("host.json")), "no record of it")

@@ -1,0 +1,133 @@
+"""What `simulate` and `snakesim run --in-process` leave. What they refuse is in refusals.toml."""
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
+from snakesim_operator.run.conclusion import conclude
+from snakesim_operator.run.in_process import LOG_FILE, run_in_process, simulate
+from snakesim_testing.harness.command import SNAKESIM, environment
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.in_process_command import snakesim
+
+LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY}
+
+
+def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    ended = snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path)
+    assert ended.code == 0, ended.out + ended.err
+    assert {path.name for path in out.iterdir()} == LEFT | {LOG_FILE}
+    assert "in one process" in ended.out and str(out / REPORT) in ended.out and not ended.err
+
+
+FAILING = """
+from snakesim_gnc.control.hold import Hold
+
+
+class Failing(Hold):
+    def update(self, observation):
+        if observation.tick == 20:
+            raise ValueError("no idea")
+        return super().update(observation)
+"""
+
+
+def test_a_controller_that_fails_ends_the_run_in_a_safe_stop(tmp_path: Path) -> None:
+    (tmp_path / "failing.py").write_text(FAILING)
+    result = simulate(load("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config)
+    assert "control ended: controller" in result.summary.ended and "no idea" in result.summary.ended
+    assert [fault.what for fault in result.summary.faults] == ["service_lost", "lease_expired"]
+    assert result.record.host.lifecycle == "fault"
+
+
+ENDLESS = """
+import os
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from snakesim_gnc.control.hold import Hold
+
+
+class Endless(Hold):
+    def update(self, observation):
+        while observation.tick > 20:
+            Path("begun").touch()
+        return super().update(observation)
+
+
+class Compiled(Hold):
+    def update(self, observation):
+        if observation.tick > 20:
+            Path("begun").touch()
+            sum(iter(int, 1))
+        return super().update(observation)
+"""
+
+
+def test_a_controller_that_does_not_return_ends_the_run_in_a_safe_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_LIMIT_S", 2.0)
+    (tmp_path / "endless.py").write_text(ENDLESS)
+    changes = [Override("controller", "./endless.py:Endless", "the test"), parse_set("start_limit_s=1")]
+    result = simulate(load("triplet", changes).config)
+    assert "control ended: " in result.summary.ended, result.summary.ended
+    assert "took longer than 2 s in one tick; if it needs so long, allow it with --set" in result.summary.ended
+    assert result.record.host.lifecycle == "fault"
+
+
+@pytest.mark.parametrize("controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)])
+def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, tmp_path: Path) -> None:
+    (tmp_path / "endless.py").write_text(ENDLESS)
+    typed = [*SNAKESIM, "run", "triplet", "--in-process", "--controller", f"./endless.py:{controller}", "--out", "run"]
+    with subprocess.Popen(
+        typed, cwd=tmp_path, env=environment(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        try:
+            wait_until((tmp_path / "begun").exists, "a tick that does not end", 60)
+            began = time.monotonic()
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=60)[0]
+        finally:
+            process.kill()
+    assert process.returncode == 130, said
+    assert time.monotonic() - began < 30
+    if controller == "Endless":
+        assert "The run ended early: interrupted." in said and (tmp_path / "run" / REPORT).is_file()
+    else:
+        assert "had not returned 3 s after it was told to stop; its process was killed" in said
+
+
+def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def conclude_interrupted(*arguments: Any) -> int:
+        os.kill(os.getpid(), signal.SIGINT)
+        return conclude(*arguments)
+
+    monkeypatch.setattr("snakesim_operator.run.in_process.conclude", conclude_interrupted)
+    config = load("triplet", [parse_set("duration_s=0.1"), parse_set("clock_mode=lockstep")]).config
+    assert run_in_process(config, tmp_path / "run") == 0
+    assert (tmp_path / "run" / REPORT).is_file()
+
+
+def test_a_run_that_ends_in_a_fault_is_the_same_each_time() -> None:
+    config = load("peg_row", [parse_set("duration_s=3"), parse_set('faults=["mute:joint_3@0.5"]')]).config
+    first, second = (simulate(config).summary for _ in range(2))
+    assert "joint_3" in first.ended
+    assert (first.ticks, first.command_digest) == (second.ticks, second.command_digest)

@@ -1,0 +1,68 @@
+"""Host, services and router as programs of their own, as on the machines of a lab: any order, and again at will."""
+
+import contextlib
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.model.files import ROUTER
+from snakesim_hal.network.session_file import read_session
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs import in_process_command as command
+from snakesim_testing.runs.command import Ended
+from snakesim_testing.runs.command import SNAKESIM
+from snakesim_testing.runs.command import environment
+from snakesim_testing.runs.lab_programs import Lab
+from snakesim_testing.runs.lab_programs import SCENARIO
+
+pytestmark = pytest.mark.e2e
+
+SERVICES = ("guidance", "navigation", "control")
+
+
+
+
+
+
+def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_host(lab: Lab) -> None:
+    for name in SERVICES[:2]:
+        lab.service(name)
+    other_goal = lab.service("control", "--set", "mission.speed_m_s=0.3")
+    first = lab.host("never-armed")
+    waited = lab.folder / "service-control.log"
+    wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
+    router = lab.start("start", "router", str(lab.router_file))
+    wait_until(lambda: "DIFFERS: `mission` is " in lab.tell("status").out, "the difference")
+    refused = lab.tell("robot", "arm", "planar13", "sim").err
+    assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
+    other_goal.kill()
+    lab.service("control")
+    wait_until(lambda: "next: `snakesim robot arm planar13 sim --session " in lab.tell("status").out, "ready to arm")
+    said = lab.tell("status").out
+    assert all(f"  process {name}: " in said for name in ("host", *SERVICES)) and "DIFFERS" not in said, said
+    first.send_signal(signal.SIGKILL)  # at tick 0, where the next host begins as well
+    first.wait()
+    second = lab.host("second")
+    lab.until_armed()
+    assert second.wait(60) == 0, (lab.folder / "host-triplet.log").read_text()
+    _, alone = command.run_to_summary(lab.folder / "alone", *SCENARIO)
+    assert RunRecord.load(lab.folder / "second").host.command_digest == alone.command_digest
+    router.send_signal(signal.SIGINT)
+    assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
+
+
+@pytest.mark.slow
+def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    (endpoint,) = read_session(lab.session).endpoints
+    monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
+    for ended in (lab.tell("robot", "disarm"), command.snakesim("robot", "disarm", cwd=lab.folder)):
+        assert ended.code == 1 and f"no robot on {endpoint}" in ended.err
+    elsewhere = command.snakesim("robot", "disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
+    assert elsewhere.code == 1 and endpoint not in elsewhere.err
+    ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")
+    assert ended.code == 2 and "--router and --session" in ended.err, ended.err

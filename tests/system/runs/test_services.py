@@ -1,0 +1,214 @@
+"""Services of one's own, in a file: named by path as controllers are, in processes and in one."""
+
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.model.files import SHIPPED
+from snakesim_hal.wire import keys
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.results.recording_contents import read_recording
+from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.in_process import LOG_FILE
+from snakesim_testing.runs.command import SNAKESIM, Ended, environment, run_to_summary
+from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.runs import in_process_command as in_process
+
+pytestmark = pytest.mark.e2e
+
+PAGE = REPOSITORY / "docs" / "sensors.md"
+SERVICE = next(section.files["mocap.py"] for section in sections(PAGE) if "mocap.py" in section.files)
+MORE = """
+
+class Another(MotionCapture):
+    name = "another"
+
+
+class Bare:
+    name = "sensor"
+
+
+class Empty(Service):
+    name = "sensor"
+
+
+from pathlib import Path
+(Path(__file__).parent / "ran").touch()
+"""
+NAMED = "services.sensor.code=./lab/mocap.py:MotionCapture"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A robot without a pose sensor, and a service that has one."""
+    robot = (SHIPPED / "robots" / "planar13.toml").read_text()
+    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.pose]"))
+    (tmp_path / "bare.toml").write_text(bare)
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "mocap.py").write_text(SERVICE + MORE)
+    return tmp_path
+
+
+SHORT = ["triplet", "--duration", "0.5", "--set", "robot=./bare.toml"]
+
+
+def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]) -> str | None:
+    """Of a run in which guidance knows the pose from the service alone."""
+    ended, summary = run(home / out, *SHORT, "--set", NAMED)
+    assert ended.code == 0, ended.out + ended.err
+    recorded = read_recording(home / out / RECORDING, (keys.POSE, keys.WORLD))
+    assert set(range(50)) <= recorded.messages_by_tick[keys.POSE].keys() and recorded.streams[keys.WORLD]
+    return summary.command_digest
+
+
+def test_a_service_of_a_file_publishes_a_pose_in_processes_and_in_one(home: Path) -> None:
+    assert digest_of(home, "many", run_to_summary) == digest_of(home, "one", in_process.run_to_summary)
+
+
+WRONG = {
+    "no such class": (
+        "MotionCaptuer",
+        "no 'MotionCaptuer', as in",
+        "classes in it are MotionCapture, Another, Bare, Empty",
+    ),
+    "another name": ("Another", "calls itself 'another'", "[services.another]"),
+    "no service": ("Bare", "is not derived from `Service`", "snakesim_hal/service.py"),
+    "no outputs": ("Empty", "has no outputs", "snakesim_hal/service.py"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_file_without_that_service_is_refused_before_anything_starts(home: Path, wrong: str) -> None:
+    name, *words = WRONG[wrong]
+    code = f"services.sensor.code=./lab/mocap.py:{name}"
+    ended = in_process.snakesim("run", *SHORT, "--set", code, "--out", "run", cwd=home)
+    assert ended.code == 2 and not (home / "run").exists()
+    assert all(word in ended.err for word in ("./lab/mocap.py", *words)), ended.err
+
+
+def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
+    shown = in_process.snakesim("config", "triplet", "--set", NAMED, cwd=home)
+    assert shown.code == 0 and not (home / "lab" / "ran").exists()
+    assert "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture" in shown.out
+
+
+@pytest.mark.slow
+def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path) -> None:
+    """It waits for a host, of which there is none, and says under which name."""
+    for name in ("./lab/mocap.py:MotionCapture", "sensor"):
+        command = [*SNAKESIM, "start", "service", name, "triplet", "--set", NAMED, "--endpoint", free_endpoint()]
+        with subprocess.Popen(command, cwd=home, env=environment(home), stderr=subprocess.PIPE, text=True) as service:
+            assert service.stderr is not None
+            said = service.stderr.readline()
+            service.terminate()
+        assert said.startswith("sensor: waiting for the network")
+
+
+MALFORMED = {
+    "number": ("position_w=(0.0, float('nan'), 0.0)", "Pose.position_w[1] is nan, must be `float` >= -"),
+    "array": ("position_w=np.zeros(3)", "Pose.position_w is array([0., 0., 0.]), must be plain Python numbers, "),
+    "rotation": ("orientation_wxyz=(0.5, 0.0, 0.0, 0.0)", "(0.5, 0.0, 0.0, 0.0) of norm 0.5, must be a rotation"),
+}
+LOST = """
+
+class Lost(MotionCapture):
+    def outputs(self, clock):
+        said = super().outputs(clock)
+        if said is None or clock.lifecycle != "armed":
+            return said
+        return [(key, msgspec.structs.replace(pose, {})) for key, pose in said]
+"""
+
+
+@pytest.mark.slow  # the decoders' errors: tests/unit/hal/wire
+@pytest.mark.parametrize(
+    ("clock_mode", "wrong"),
+    [
+        ("lockstep", "array"),
+        ("one", "number"),
+        *(pytest.param(*row, marks=pytest.mark.slow) for row in (("realtime", "number"), ("one", "rotation"))),
+    ],
+)
+def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
+    home: Path, clock_mode: str, wrong: str
+) -> None:
+    field, words = MALFORMED[wrong]
+    lost = LOST.replace("{}", field)
+    (home / "lab" / "lost.py").write_text(f"import msgspec\nimport numpy as np\n{SERVICE}{lost}")
+    code = [*SHORT, "--duration", "60", "--set", "services.sensor.code=./lab/lost.py:Lost"]
+    if clock_mode == "one":
+        ended, summary = in_process.run_to_summary(home / "run", *code)
+        log = (home / "run" / LOG_FILE).read_text()
+    else:
+        ended, summary = run_to_summary(home / "run", *code, "--clock-mode", clock_mode)
+        log = (home / "run" / "sensor.log").read_text()
+    assert ended.code == 1 and summary.duration_s < 5.0  # it ends at once
+    said = re.compile(
+        r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*" + re.escape(words)
+    )
+    assert all(said.search(text) for text in (log, summary.ended, ended.out)), f"{log}\n{summary.ended}\n{ended.out}"
+
+
+@pytest.mark.slow
+def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
+    lost = LOST.replace("{}", "position_w=1 / 0")
+    (home / "lab" / "lost.py").write_text(f"import msgspec\n{SERVICE}{lost}")
+    code = [*SHORT, "--set", "services.sensor.code=./lab/lost.py:Lost"]
+    ended, summary = in_process.run_to_summary(home / "run", *code)
+    said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
+    assert ended.code == 1 and said in summary.ended and said in (home / "run" / LOG_FILE).read_text()
+
+
+SILENT = """
+
+class Silent(MotionCapture):
+    def outputs(self, clock):
+        return []
+"""
+
+
+@pytest.mark.slow
+def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Path) -> None:
+    (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
+    flags = [*SHORT, "--set", "services.sensor.code=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
+    ended, summary = run_to_summary(home / "run", *flags)
+    why = "waiting for guidance, which has no sensor/pose yet (mission.localization=dead_reckoning does without"
+    given_up = "not ready to arm within 3 s"
+    for said in (summary.ended, ended.out):
+        assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out
+    assert ended.code == 1 and summary.duration_s == 0.0
+    alone = in_process.snakesim("run", *flags, "--in-process", "--out", "one", cwd=home)
+    assert alone.code != 0 and given_up in alone.err and why in alone.err, alone
+
+
+FROZEN = """
+
+class Frozen(MotionCapture):
+    def outputs(self, clock):
+        if clock.tick <= 50:
+            self.last = super().outputs(clock)[0][1]
+        return [(keys.POSE, msgspec.structs.replace(self.last, tick=clock.tick))]
+"""
+
+
+def test_control_holds_when_a_service_tells_an_old_pose_again_and_again(home: Path) -> None:
+    (home / "lab" / "frozen.py").write_text("import msgspec\n" + SERVICE + FROZEN)
+    code = ["--set", "services.sensor.code=./lab/frozen.py:Frozen", "--duration", "1"]
+    ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
+    assert ended.code == 0 and summary.pose_from == "sensor", ended.out
+    assert summary.reported_state == "NotLocomoting" and re.search(
+        r"sensor/pose is 0\.\d+ s old", summary.reported_reason or ""
+    )
+
+
+def test_a_service_for_the_pose_brings_no_contacts_and_nobody_waits_for_them(home: Path) -> None:
+    """On a robot whose file has no contact sensors."""
+    robot = (home / "bare.toml").read_text()
+    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.contacts]"))
+    (home / "bare.toml").write_text(bare)
+    ended, _ = in_process.run_to_summary(home / "run", *SHORT, "--set", NAMED)
+    assert ended.code == 0, ended.out

@@ -1,0 +1,79 @@
+"""`snakesim sim`, and what it leaves of a run: real processes, over their network."""
+
+import contextlib
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import SimulatorRequest, Status
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.run.in_process import simulate
+from snakesim_testing.runs.command import running
+from snakesim_testing.harness.processes import nothing_left
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.in_process_command import snakesim, tell
+
+pytestmark = pytest.mark.e2e
+
+RUN = ["peg_row", "--duration", "1"]
+
+
+@pytest.mark.slow  # tests/system/host/test_simulated_time.py
+def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_not(tmp_path: Path) -> None:
+    plain = simulate(load(RUN[0], [parse_set("duration_s=1")]).config).summary
+    out = tmp_path / "run"
+    with running(out, *RUN) as run:
+
+        def sim(*asked: str, code: int = 0) -> str:
+            ended = tell(run, "sim", *asked)
+            assert ended.code == code, ended.out + ended.err
+            return ended.out + ended.err
+
+        run.wait_for("network:")
+        with open_session(Link(run.endpoint, "planar13"), 30.0) as session:
+            statuses = session.latched_reader(keys.STATUS, Status)
+            seen: list[Status] = []
+
+            def shows(lifecycle: str, tick: int) -> bool:
+                seen.extend(statuses.drain())
+                return bool(seen) and (seen[-1].lifecycle, seen[-1].tick) == (lifecycle, tick)
+
+            wait_until(lambda: pause(session), "the pause")
+            wait_until(lambda: shows("armed", 0), "armed in the pause, before the first tick")
+            sim("step", "20")
+            wait_until(lambda: shows("armed", 20), "20 ticks")
+            sim("reset")
+            wait_until(lambda: shows("disarmed", 0) and seen[-1].ready_to_arm, "another host")
+            hosts = {status.host for status in seen}
+            assert len(hosts) == 2, hosts
+            assert "as fast as it can" in sim("speed", "2", code=1)
+            sim("pause")
+            assert tell(run, "robot", "arm", "planar13", "sim").code == 0
+            sim("step", "7")
+            wait_until(lambda: shows("armed", 7), "7 ticks")
+            wait_until(lambda: "PAUSED" in run.said(), "the pause on the terminal")
+            sim("resume")
+        assert run.end() == 0, run.said()
+    nothing_left(out)
+    said = run.said()
+    assert "the simulator was reset" in said and "host" in said
+    assert f"command digest        {plain.command_digest[:16]}" in said
+    assert (out / "recording-1.mcap").is_file() and (out / "blackbox-1.rows").is_file()
+    recorded = RunRecord.load(out / "recording.mcap").host
+    assert recorded.command_digest == plain.command_digest and recorded.ticks == 100
+    told = snakesim("recording", "info", str(out), cwd=tmp_path)
+    assert told.code == 0 and "lacks" not in told.out, told.said
+    replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)
+    same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}  # the last may come too late
+    assert replayed.out in same, replayed.out + replayed.err
+
+
+def pause(session: Session) -> bool:
+    """False while there is no host that answers."""
+    with contextlib.suppress(NotConnectedError):
+        return session.request(keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")).ok
+    return False

@@ -1,0 +1,186 @@
+"""What `snakesim run --stay` does when processes end: it starts them again, and arms nothing. And faults on request."""
+
+import os
+import re
+import signal
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
+from snakesim_operator.results.summary import RunSummary
+from snakesim_testing.runs.command import Running, armed_run, running, summary_of
+from snakesim_testing.harness.processes import nothing_left, processes_of
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.in_process_command import snakesim
+
+pytestmark = pytest.mark.e2e
+
+SERVICES = ("guidance", "navigation", "control")
+# 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
+LONG = ["triplet", "--controller", "hold", "--duration", "600", "--set", "rate_hz=50"]
+BACK_S = 20.0  # 5 s on a machine that has nothing else to do
+
+
+class Robot:
+    """A run as somebody on its network sees it."""
+
+    def __init__(self, session: Session) -> None:
+        self._session, self._statuses = session, session.latched_reader(keys.STATUS, Status)
+        self._status: Status | None = None
+
+    def status(self) -> Status:
+        def heard() -> Status | None:
+            self._status = (self._statuses.drain() or [self._status])[-1]
+            return self._status
+
+        wait_until(heard, "a status")
+        assert self._status is not None
+        return self._status
+
+    def reaches(self, lifecycle: str) -> Status:
+        wait_until(lambda: self.status().lifecycle == lifecycle, f"lifecycle {lifecycle}", BACK_S)
+        return self.status()
+
+    def is_ready(self) -> None:
+        wait_until(lambda: self.status().ready_to_arm, "ready to arm", BACK_S)
+
+    def tell(self, action: Literal["arm", "reset"]) -> Answer:
+        robot = self._session.latest(keys.DESCRIPTION, Description, BACK_S)
+        assert robot is not None
+        request = LifecycleRequest(
+            action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+        )
+        return self._session.request(keys.LIFECYCLE, request)
+
+    def arm(self) -> None:
+        wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
+
+    def is_commanded(self, times: int) -> bool:
+        """Arm a robot that is disarmed; whether it has then accepted so many commands."""
+        if self.status().lifecycle == "disarmed":
+            self.tell("arm")
+        return self.status().lifecycle == "armed" and self.status().commands_accepted > times
+
+    def fault(self, kind: str, target: str, **more: object) -> Answer:
+        request = FaultRequest(kind=kind, target=target, **more)  # pyright: ignore[reportArgumentType]
+        return self._session.request(keys.fault_key("run"), request, 5.0)
+
+
+def pids(run: Running, *names: str) -> dict[str, int]:
+    return {name: run.part(name) for name in names}
+
+
+def interrupt(run: Running) -> RunSummary:
+    assert run.interrupt() == 130 and "report:" in run.said(), run.said()
+    return summary_of(run.out)
+
+
+@pytest.mark.parametrize("clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
+def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot = Robot(session)
+            first, services = robot.reaches("armed"), pids(run, *SERVICES)
+            os.kill(run.part("host"), signal.SIGKILL)
+            wait_until(lambda: robot.status().lease_epoch > first.lease_epoch + 1, "another host's lease", BACK_S)
+            robot.is_ready()
+            assert robot.status().lifecycle == "disarmed" and robot.status().commands_accepted == 0
+            assert robot.status().tick == 0 or clock_mode == "realtime"
+            assert pids(run, *SERVICES) == services  # they found the new host by themselves
+            wait_until(lambda: robot.is_commanded(20), "commands to the new host")
+        summary = interrupt(run)
+    assert summary.hosts == 2 and [restart.name for restart in summary.restarts] == ["host"]
+    assert (tmp_path / "run" / "recording-1.mcap").is_file()
+    assert summary.ticks > 0 and "host was ended by SIGKILL; restart in 0.5 s" in run.said()
+
+
+def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_path: Path) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot, before = Robot(session), run.part("control")
+            os.kill(before, signal.SIGKILL)
+            robot.reaches("fault")
+            wait_until(lambda: run.parts().get("control", before) != before, "another process of control")
+            wait_until(
+                lambda: "control" in robot.status().alive and robot.status().lease_holder == "control", "control"
+            )
+            assert robot.status().lifecycle == "fault" and not robot.tell("arm").ok
+            assert robot.tell("reset").ok
+            robot.is_ready()
+            robot.arm()
+            robot.reaches("armed")
+        summary = interrupt(run)
+    assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
+    assert summary.ended == "interrupted" and "go on with `snakesim robot reset`" in run.said()
+
+
+@pytest.mark.slow  # a row of the fault table
+def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot = Robot(session)
+            robot.reaches("armed")
+            before = pids(run, "host", *SERVICES)
+            os.kill(run.part("router"), signal.SIGKILL)
+            robot.reaches("fault")  # told by the host as soon as there is a router again
+            wait_until(lambda: not robot.status().waiting_for, "everybody back", BACK_S)
+            assert robot.status().lifecycle == "fault" and pids(run, "host", *SERVICES) == before
+            assert "lease_expired" in [fault.what for fault in robot.status().faults]
+            for command in (["robot", "reset"], ["robot", "arm", "planar13", "sim"]):
+                result = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
+                if command == ["robot", "reset"]:
+                    assert result.code == 0, result.err
+                    robot.is_ready()
+            robot.reaches("armed")
+        interrupt(run)
+
+
+@pytest.mark.slow
+def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
+        os.kill(run.part("guidance"), signal.SIGKILL)
+        assert run.end() == 1 and "guidance was ended by SIGKILL" in run.said()
+
+
+@pytest.mark.slow  # rows of the fault table
+def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
+    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot = Robot(session)
+            robot.reaches("armed")
+            assert robot.fault("freeze", "control", for_s=0.5).ok
+            robot.reaches("fault")
+            wait_until(lambda: "injected fault ends: freeze:control" in run.said(), "the thaw")
+            before = run.part("navigation")
+            assert robot.fault("stop", "navigation").ok
+            wait_until(lambda: run.said().count("; restart in") == 1, "navigation's end")
+            wait_until(lambda: not robot.status().waiting_for, "navigation again", BACK_S)
+            assert run.part("navigation") != before
+            for kind, target, word in (
+                ("kill", "nobody", "host, guidance, navigation, control"),
+                ("hang", "control", "fault/control"),
+                ("kill", "router", "no process 'router'"),
+                ("freeze", "sensor/imu", "knows no 'freeze'"),
+                ("freeze", "host", "give --for SECONDS"),
+            ):
+                answer = robot.fault(kind, target)
+                assert not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason, answer
+            assert robot.fault("freeze", "host", for_s=60.0).ok
+            run.wait_for("injected fault: freeze:host")
+        interrupt(run)  # a frozen host is thawed to end in order
+
+
+def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
+    frozen_soon = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
+    with running(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon) as run:
+        run.wait_for("injected fault: freeze:host")
+        frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
+        assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
+        assert len(processes_of(tmp_path / "run")) == 6  # router, host, three services, recorder
+        os.kill(run.process.pid, signal.SIGKILL)
+        run.end()
+        nothing_left(tmp_path / "run")

@@ -1,0 +1,59 @@
+"""What a run says of itself is what happened: who stands still does not locomote, and a run that ended has an end."""
+
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.network.session import Arrival
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode, format_encoding
+from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.writer import RecordingWriter
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import REPORT
+from snakesim_operator.results.summary import summarise
+from snakesim_testing.runs.in_process_command import run_to_summary
+
+STILL = (
+    "from snakesim_hal.controller import ControllerCommand, positions\n"
+    "from snakesim_gnc.control.hold import Hold\n\n\n"
+    "class Still(Hold):\n"
+    "    def update(self, observation):\n"
+    "        return ControllerCommand(super().update(observation).setpoints)\n"
+)
+
+
+def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_path: Path) -> None:
+    (tmp_path / "still.py").write_text(STILL)
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
+    assert ended.code == 0 and summary.locomoting_fraction == 0.0
+    assert (summary.last_state, summary.last_reason) == ("NotLocomoting", "standing still: less than 20 mm in 1 s")
+    assert "locomoting            0 %" in ended.out
+    assert "Did not locomote: standing still: less than 20 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
+
+
+def test_a_snake_that_moves_locomotes_from_when_it_is_seen_to_move(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
+    assert ended.code == 0 and summary.path_distance_m is not None and summary.path_distance_m > 0.5
+    assert summary.locomoting_fraction is not None and summary.locomoting_fraction > 0.95
+    states = [state.state for state in RunRecord.load(tmp_path / "run").control if state.state != "Idle"]
+    assert states[0] == "NotLocomoting" and states[-1] == "Locomoting"
+
+
+def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Path) -> None:
+    _, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "1")
+    assert summary.last_state not in (None, "PowerOff")
+    last = RunRecord.load(tmp_path / "run").control[-1]
+    gone = msgspec.structs.replace(last, state="PowerOff", reason="no clock from the HAL")
+    before = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages())
+    (tmp_path / "run" / RECORDING).unlink()
+    recording = RecordingWriter(tmp_path / "run" / RECORDING)
+    for reported in before:
+        recording.write_arrival(Arrival(reported.key, reported.payload, reported.encoding, reported.wall_ns))
+    reported = Arrival(keys.CONTROL_STATE, encode(gone), format_encoding(ControlState), 0)
+    recording.write_arrival(reported)  # as control reports it while a host writes a long record
+    recording.close({})
+    again = summarise(RunRecord.load(tmp_path / "run"), "complete")
+    assert (again.last_state, again.last_reason) == (summary.last_state, summary.last_reason)

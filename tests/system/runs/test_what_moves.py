@@ -1,0 +1,118 @@
+"""Every drive type says of itself whether something real moves, and a run prints it at its begin and at its end."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_can_backend.can_drives import backend as can_family
+from snakesim_can_backend.driver import modules
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.buses import Buses
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drive_type import DriverTypeContext
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_hal.model.plugins import BACKENDS, find_plugin
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.what_moves import describe_what_moves
+from snakesim_hal.programs.preflight import backend_settings
+from snakesim_serial_backend.dynamixel import backend as dynamixel
+from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.runs.in_process_command import run_to_summary
+
+MIXED_ROBOT = {
+    "robot__drive": {"driver": "odrive"},
+    "robot__joints": {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}},
+}
+
+
+def configured(backend: str, **sections: Any) -> RunConfig:
+    """Four joints; nothing but the body's inertia under emulated drives."""
+    robot = MIXED_ROBOT if backend == "mixed" else {}
+    own = {backend: {"physics_model": "inertia"} | sections.pop(backend, {})}
+    clock_mode = "lockstep" if not sections and len(own[backend]) == 1 else "realtime"
+    return run_config(
+        backend=backend,
+        robot__chain__modules=4,
+        rate_hz=100,
+        clock_mode=clock_mode,
+        backends={**own, **sections},
+        **robot,
+    )
+
+
+def opened(config: RunConfig) -> Any:
+    factory = find_plugin(BACKENDS, config.backend)
+    return factory(config, backend_settings(config, factory))
+
+
+@pytest.mark.parametrize("backend", ["can", "odrive", "moteus", "dynamixel", "mixed"])
+def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
+    robot = opened(configured(backend))
+    try:
+        assert describe_what_moves(robot.describe()) == f"EMULATED: nothing real moves (backend {backend})"
+    finally:
+        robot.close()
+
+
+@pytest.mark.parametrize(
+    ("backend", "buses", "emulated"),
+    [
+        ("odrive", {"odrive": ["can0"]}, False),
+        ("odrive", {"odrive": ["vcan0"]}, True),
+        ("odrive", {"odrive": ["vcan0", "can0"]}, False),
+        ("moteus", {"moteus": ["can0"]}, False),
+        ("moteus", {"moteus": ["udp_multicast:239.74.163.2"]}, True),
+        ("dynamixel", {"dynamixel": ["/dev/ttyUSB0"]}, False),
+        ("dynamixel", {"dynamixel": ["/dev/pts/7"]}, True),
+        ("mixed", {"odrive": ["vcan0"], "dynamixel": ["/dev/pts/7"]}, True),
+        ("mixed", {"odrive": ["vcan0"], "dynamixel": ["/dev/ttyUSB0"]}, False),
+        ("mixed", {"odrive": ["can0"], "dynamixel": ["/dev/pts/7"]}, False),
+    ],
+)
+def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
+    monkeypatch: pytest.MonkeyPatch, backend: str, buses: dict[str, list[str]], emulated: bool
+) -> None:
+    monkeypatch.setattr(can_family, "open_wire", lambda channel, *_rates: SimpleNamespace(channel=channel))
+    monkeypatch.setattr(dynamixel, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0))
+    sections = {name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()}
+    config = configured(backend, **sections)
+    factory = find_plugin(BACKENDS, backend)
+    clock = DriverClock(config)
+    opened_buses: list[BusSpec] = []
+    for part in factory.split_by_driver_type(config, backend_settings(config, factory)):
+        context = DriverTypeContext(config, part.settings, part.joints, clock, None)
+        opened_buses += part.driver_type.plan_buses(context)
+    in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
+    assert (
+        Buses(in_turn, DriveReadings(config.robot.joint_table, clock.now_ns), opened_buses, clock.now_ns).emulated
+        == emulated
+    )
+
+
+def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Joint modules say it themselves, each in its Identity."""
+    found_by = modules.find_modules
+
+    def find(*arguments: Any) -> Any:
+        first, *others = found_by(*arguments)
+        return [dataclasses.replace(first, emulated=False), *others]
+
+    monkeypatch.setattr(modules, "find_modules", find)
+    robot = opened(configured("can"))
+    try:
+        assert describe_what_moves(robot.describe()) == "REAL: motors move (backend can)"
+    finally:
+        robot.close()
+
+
+def test_a_run_says_it_at_its_begin_and_at_its_end(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", "odrive", "--duration", "0.1")
+    assert summary.emulated
+    first, second, *others = ended.out.splitlines()
+    assert first.startswith("triplet: planar13") and second == "EMULATED: nothing real moves (backend odrive)"
+    assert "  EMULATED              nothing real moved (backend odrive)" in others
+    assert "EMULATED: nothing real moved" in (tmp_path / "run" / "report.html").read_text()

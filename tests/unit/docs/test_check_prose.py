@@ -1,0 +1,50 @@
+"""The checker of the documentation's English finds what it should, and leaves code alone."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+CHECKER = Path(__file__).parents[3] / "docs" / "style" / "check_prose.py"
+
+
+@pytest.fixture(scope="module")
+def checker() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("check_prose", CHECKER)
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["check_prose"] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("line", "is_rejected"),
+    [
+        ("The sensor tells its range.", True),
+        ("Nobody commands the robot.", True),
+        ("The bus gets no set-points.", True),
+        ("The sensor publishes its range.", False),
+        ("Add a tell-tale.", False),
+    ],
+)
+def test_reject_list_line_finds_words(checker: ModuleType, line: str, is_rejected: bool) -> None:
+    problems = list(checker.find_rejected(line, checker.read_reject_list(), in_docs=True))
+    assert bool(problems) == is_rejected
+
+
+def test_remove_code_page_keeps_line_numbers(checker: ModuleType) -> None:
+    lines = ["Use `nobody` here.", "```sh", "nobody", "```", "See [this](nobody.md)."]
+    assert checker.remove_code(lines) == ["Use `code` here.", "", "", "", "See [this]."]
+
+
+def test_empty_header_cell_is_found(checker: ModuleType) -> None:
+    table = ["| name | |", "|---|---|", "| a | b |", "", "| name | value |", "|---|---|"]
+    assert list(checker.find_tables_without_header(table)) == [1]
+
+
+def test_long_sentence_is_found_with_its_line(checker: ModuleType) -> None:
+    long = " ".join(["word"] * (checker.MAX_SENTENCE_WORDS + 1)) + "."
+    assert list(checker.find_long_sentences(["Short one.", "", long])) == [(3, checker.MAX_SENTENCE_WORDS + 1)]

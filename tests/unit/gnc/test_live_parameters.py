@@ -1,0 +1,85 @@
+"""Parameters of a controller that runs: taken when they are valid, otherwise nothing changes."""
+
+import msgspec
+import pytest
+
+from snakesim_gnc.control.live_parameters import LiveParameters
+from snakesim_hal.model.scenario import load
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.local_network import LocalNetwork, LocalSession
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, ParametersRequest
+from snakesim_testing.hal.small_robots import description
+
+CLOCK = Clock(
+    tick=7,
+    timestamp_ns=70,
+    period_ns=10,
+    clock_mode="lockstep",
+    lifecycle="armed",
+    arm_session=1,
+    lease_epoch=1,
+    newest={},
+)
+
+
+class Bench:
+    """Control's parameters, and an operator."""
+
+    def __init__(self) -> None:
+        network = LocalNetwork()
+        config = load("triplet", []).config
+        self.parameters = LiveParameters(Client(network.session(), "control"), config)
+        self.parameters.configure(description())
+        self.anew: list[bool] = []
+        network.answer = lambda: self.anew.append(self.parameters.answer_requests(CLOCK))
+        self.operator: LocalSession = network.session()
+        self.parameters.answer_requests(CLOCK)
+
+    def ask(self, parameters: str, controller: str = "obstacle_triplet") -> Answer:
+        return self.operator.request(
+            keys.PARAMETERS, ParametersRequest(requester="ada", controller=controller, parameters=parameters)
+        )
+
+    def in_force(self) -> ControlParameters:
+        found = self.operator.latest(keys.PARAMETERS_IN_FORCE, ControlParameters, 1.0)
+        assert found is not None
+        return found
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_the_configuration_is_in_force_first_with_its_schema_and_valid_parameters_make_the_controller_anew(
+    bench: Bench,
+):
+    reported = bench.in_force()
+    assert msgspec.json.decode(reported.parameters)["propulsion_n"] == 35.0
+    assert '"propulsion_n":{"unit":"N"' in reported.schema and reported.requester is None and reported.changes == 0
+    assert bench.ask('{"propulsion_n": 20}').ok and bench.anew == [True]
+    reported = bench.in_force()
+    assert msgspec.json.decode(reported.parameters)["propulsion_n"] == 20.0
+    assert (reported.requester, reported.changes, reported.tick) == ("ada", 1, 7)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ('{"propulsion_n": -1}', "`controllers.obstacle_triplet.propulsion_n` = -1 N is not allowed"),
+        ('{"propulsion": 1}', "did you mean `propulsion_n`?"),
+        ('{"propulsion_n": NaN}', "malformed"),
+        ("[]", "object"),
+    ],
+)
+def test_others_are_refused_and_nothing_changes(bench: Bench, parameters: str, said: str):
+    before = bench.in_force()
+    answer = bench.ask(parameters)
+    assert not answer.ok and answer.refusal == "bad_parameters" and said in answer.reason
+    assert bench.anew == [False] and bench.in_force() == before
+
+
+def test_parameters_for_another_controller_are_refused(bench: Bench):
+    answer = bench.ask("{}", controller="hold")
+    assert answer.refusal == "wrong_controller" and "obstacle_triplet" in answer.reason

@@ -1,0 +1,172 @@
+"""The documentation of a Struct's fields: from the literals behind them, and from their types."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import pytest
+from msgspec import Meta
+
+from snakesim_hal.model.field_docs import FieldDoc, describe_fields, document_fields
+from snakesim_hal.model.field_words import find_unit, format_value
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.joints import JointExceptions, Limits
+from snakesim_hal.model.json_schema import list_structs, make_schema
+from snakesim_hal.model.plugins import CONTROLLERS, find_plugin
+from snakesim_hal.wire.quantities import about, above
+
+
+class Wheel(FileStruct, frozen=True, kw_only=True):
+    """A wheel."""
+
+    radius_m: Annotated[float, above(2, "m")]
+    """Radius of the wheel,
+    without its tire.
+    """
+
+    spokes: Annotated[int, Meta(ge=0, lt=100)] = 36  # no description
+    slip_m_s: Annotated[float | None, about("speed at the ground")] = None
+
+
+class Kart(FileStruct, frozen=True, kw_only=True, tag="kart", tag_field="kind"):
+    """A kart."""
+
+    wheels: list[Wheel] = []
+    """Its wheels."""
+
+    drive: Literal["front", "rear"] = "rear"
+    gains: dict[str, float] = msgspec.field(default_factory=lambda: {"left": 1.0})
+    size_m: tuple[float, float] | None = None
+    """Length and width; none: unknown."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=8)]
+
+
+class SpareWheel(Wheel, frozen=True, kw_only=True):
+    """A wheel with another description of its spokes, and of what it inherits."""
+
+    spokes: int = 0
+    """Number of spokes."""
+
+
+def docs_of(struct: type[msgspec.Struct]) -> dict[str, FieldDoc]:
+    return {doc.name: doc for doc in document_fields(struct)}
+
+
+def test_a_description_is_the_literal_behind_a_field_in_one_line() -> None:
+    assert describe_fields(Wheel)["radius_m"] == "Radius of the wheel, without its tire."
+    assert "spokes" not in describe_fields(Wheel)
+
+
+def test_a_field_without_a_literal_has_the_description_of_its_type() -> None:
+    assert describe_fields(Wheel)["slip_m_s"] == "speed at the ground"
+
+
+def test_descriptions_are_inherited_and_overridden() -> None:
+    assert describe_fields(SpareWheel)["spokes"] == "Number of spokes."
+    assert describe_fields(SpareWheel)["radius_m"] == describe_fields(Wheel)["radius_m"]
+
+
+def test_exceptions_have_the_descriptions_of_the_section_for_all_but_for_none() -> None:
+    assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
+    exceptions: Any = JointExceptions
+    described = describe_fields(exceptions)
+    assert described["torque_nm"] == "Maximum torque of the joint; none: as in the section for all."
+    assert described["rated_nm"].count("none:") == 1
+
+
+def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: Any = msgspec.defstruct("Made", [("x", int)], module="gone")
+    assert describe_fields(made) == {}
+    monkeypatch.setattr(sys.modules[__name__], "__file__", str(Path("gone.pyc").absolute()))
+
+    class Local(FileStruct, frozen=True):
+        x: int
+        """Never read."""
+
+    assert describe_fields(Local) == {}
+
+
+def test_a_plugin_in_a_file_is_described(tmp_path: Path) -> None:
+    code = '''
+from snakesim_hal.model.files import FileStruct
+
+class Wave:
+    class Settings(FileStruct):
+        """The wave."""
+
+        lag_rad: float = 0.5
+        """Phase from joint to joint."""
+'''
+    (tmp_path / "wave.py").write_text(code)
+    settings = find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave").Settings
+    (doc,) = document_fields(settings)
+    assert (doc.description, doc.unit, doc.default) == ("Phase from joint to joint.", "rad", "0.5")
+
+
+@pytest.mark.parametrize(
+    ("struct", "field", "type_words", "unit", "range_words", "default"),
+    [
+        (Wheel, "radius_m", "number", "m", "> 0, <= 2", None),
+        (Wheel, "spokes", "whole number", "", ">= 0, < 100", "36"),
+        (Wheel, "slip_m_s", "number", "m/s", "", "none"),
+        (Kart, "kind", "text", "", '"kart"', None),
+        (Kart, "wheels", "list of tables", "", "", "[]"),
+        (Kart, "drive", "text", "", '"front", "rear"', '"rear"'),
+        (Kart, "gains", "numbers by name", "", "", "{left = 1.0}"),
+        (Kart, "size_m", "2 numbers", "m", "", "none"),
+        (Kart, "name", "text", "", "1 to 8 characters", None),
+    ],
+)
+def test_type_unit_range_and_default(
+    struct: type[msgspec.Struct], field: str, type_words: str, unit: str, range_words: str, default: str | None
+) -> None:
+    doc = docs_of(struct)[field]
+    assert (doc.type_words, doc.unit, doc.range_words, doc.default) == (type_words, unit, range_words, default)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("reach_m", "m"),
+        ("speed_rad_s", "rad/s"),
+        ("gain_nm_s_per_rad", "N·m·s/rad"),
+        ("growth_per_s", ""),  # a unit that the table does not have, not seconds
+        ("count", ""),
+    ],
+)
+def test_a_number_without_a_unit_has_that_of_its_name(name: str, unit: str) -> None:
+    assert find_unit(name, msgspec.inspect.type_info(float)) == unit
+    assert find_unit(name, msgspec.inspect.type_info(str)) == ""
+
+
+def test_values_are_written_as_in_a_file() -> None:
+    value = {"on": True, "to": [1, 2.5], "name": "α"}
+    assert format_value(value) == '{on = true, to = [1, 2.5], name = "α"}'
+
+
+def test_the_schema_has_descriptions_defaults_and_units() -> None:
+    schema = make_schema(Kart)
+    properties = schema["$defs"]["Kart"]["properties"]
+    assert properties["wheels"]["description"] == "Its wheels."
+    assert properties["gains"]["default"] == {"left": 1.0}
+    assert properties["size_m"]["unit"] == "m"
+    assert schema["$defs"]["Wheel"]["properties"]["radius_m"]["unit"] == "m"
+    assert list_structs(Kart) == [Kart, Wheel]
+
+
+def test_two_classes_of_one_name_have_descriptions_each() -> None:
+    class Other:
+        class Wheel(FileStruct, frozen=True):
+            """A toothed wheel."""
+
+            teeth: int = 0
+            """Number of teeth."""
+
+    both: Any = msgspec.defstruct("Both", [("front", Wheel), ("rear", Other.Wheel)])
+    descriptions: list[str] = []
+    for definition in make_schema(both)["$defs"].values():
+        descriptions += [field["description"] for field in definition["properties"].values() if "description" in field]
+    assert "Radius of the wheel, without its tire." in descriptions
+    assert "Number of teeth." in descriptions

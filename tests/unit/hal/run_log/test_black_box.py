@@ -1,0 +1,192 @@
+"""The black box: keeps every tick, and its digest stands for what the motors were told."""
+
+import threading
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from snakesim_hal.backend import SafeSetpoints, Samples
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
+from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Contacts, Mode
+from snakesim_testing.hal.small_robots import contact, description, pose, state
+from snakesim_testing.messages import raises_error
+
+ROBOT = description()
+
+
+def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> TickDecision:
+    return TickDecision(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
+
+
+def digest(*rows: tuple[int, TickDecision], angle: float = 0.0) -> str:
+    box = BlackBox(ROBOT)
+    for tick, reported in rows:
+        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, angle)), reported)
+    return box.command_digest
+
+
+def all_rows(box: BlackBox) -> dict[str, Any]:
+    """Everything that the box holds, as columns."""
+    rows = bytearray()
+    row, taken = box.read_rows(0)
+    while taken:
+        rows += taken
+        row, taken = box.read_rows(row + len(taken) // box.layout.row_bytes)
+    return box.layout.arrays(bytes(rows))
+
+
+def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
+    box = BlackBox(ROBOT)
+    count = 9000  # several times what is taken at once
+    for tick in range(count):
+        others: dict[str, Any] = {}
+        if tick == 2:
+            others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
+        if tick in (3, 6):
+            touches = [contact(obstacle="a", force_l=(3.0, 4.0, 0.0)), contact(obstacle="a"), contact(obstacle="b")]
+            others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=touches if tick == 3 else [])
+        joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
+        box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
+    columns = all_rows(box)
+    assert compute_digest(columns) == box.command_digest
+    assert box.ticks == count and all(len(column) == count for column in columns.values())
+    assert columns["time_s"] == pytest.approx(0.01 * np.arange(count))
+    assert columns["angle_rad"][-1].tolist() == pytest.approx([0.1, 0.2, 0.001 * (count - 1)])
+    assert columns["velocity_rad_s"][7].tolist() == [2.0] * 3 and columns["torque_nm"][7].tolist() == [3.0, 4.0, 5.0]
+    assert columns["target"][4321] == pytest.approx([0.4321] * 3)
+    assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3 and set(columns["mode"].flat) == {3}
+    assert np.isnan(columns["position_w"][:2]).all()  # unknown until the first pose
+    assert columns["position_w"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
+    assert columns["orientation_wxyz"][5].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert columns["contact_peak_n"][:8].tolist() == [0, 0, 0, 5, 5, 5, 0, 0]
+    assert columns["contact_count"][:8].tolist() == [0, 0, 0, 2, 2, 2, 0, 0]
+
+
+def test_the_digest_stands_for_tick_mode_target_and_torque_limit_and_nothing_else() -> None:
+    same = digest((0, decision()), (1, decision()))
+    assert digest((0, decision()), (1, decision()), angle=0.5) == same
+    others = [
+        digest((0, decision())),
+        digest((0, decision()), (2, decision())),
+        digest((0, decision()), (1, decision(0.1 + 1e-15))),
+        digest((0, decision()), (1, decision(mode=Mode.VELOCITY))),
+        digest((0, decision()), (1, decision(torque_limit=3.9))),
+        digest((1, decision()), (0, decision())),
+    ]
+    assert len({same, *others}) == 7
+
+
+def on_disk(box: BlackBox, path: Path, torn: int = 0) -> Path:
+    content = box.layout.header() + box.read_rows(0)[1]
+    path.write_bytes(content[: len(content) - torn])
+    return path
+
+
+@pytest.mark.parametrize("torn", [0, 1, 100])
+def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int) -> None:
+    box = BlackBox(ROBOT)
+    for tick in range(5):
+        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, 0.3 * tick)), decision())
+    layout, columns = read_black_box(on_disk(box, tmp_path / "box", torn))
+    assert (layout.robot, layout.joints) == ("worm", ["joint_1", "joint_2", "joint_3"])
+    whole = all_rows(box)
+    assert set(columns) == set(whole) and columns["tick"].tolist() == list(range(5 - bool(torn)))
+    for name, column in columns.items():
+        assert np.array_equal(column, whole[name][: len(column)], equal_nan=True), name
+    assert (compute_digest(columns) == box.command_digest) == (not torn)
+
+
+def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
+    _, columns = read_black_box(on_disk(BlackBox(ROBOT), tmp_path / "box"))
+    assert columns["angle_rad"].shape == (0, 3) and compute_digest(columns) == BlackBox(ROBOT).command_digest
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\0" * 100,
+        b"{}\n",
+        BlackBox(ROBOT).layout.header()[:-50],
+        BlackBox(ROBOT).layout.header().replace(b'"row_bytes":', b'"row_bytes":1'),
+        BlackBox(ROBOT).layout.header().replace(b"<f8", b"<O8"),
+        BlackBox(ROBOT).layout.header().replace(b"blackbox/1", b"blackbox/2"),
+        b"[" * 3_000_000,
+    ],
+)
+def test_what_is_no_box_is_named(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "box").write_bytes(content)
+    try:
+        _, columns = read_black_box(tmp_path / "box")
+    except ConfigError as error:
+        assert str(tmp_path / "box") in str(error)
+    else:  # wider rows than the columns need are padding
+        assert all(len(column) == 0 for column in columns.values())
+    with raises_error(ConfigError, code="recording/not-readable"):
+        read_black_box(tmp_path / "gone")
+
+
+def test_when_nobody_takes_them_the_newest_rows_are_kept() -> None:
+    box = BlackBox(ROBOT, memory_bytes=10 * BlackBox(ROBOT).layout.row_bytes)
+    for tick in range(25):
+        box.record(tick, tick, Samples(state(ROBOT, 0.001 * tick)), decision())
+    first, rows = box.read_rows(3)
+    assert first == 16 and all_rows(box)["tick"].tolist() == list(range(16, 25)) and box.ticks == 25
+    assert box.layout.arrays(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
+    assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))  # of all, kept or not
+
+
+def test_rows_are_whole_while_another_thread_takes_them() -> None:
+    box = BlackBox(ROBOT, memory_bytes=50 * BlackBox(ROBOT).layout.row_bytes)
+    count, over = 20_000, threading.Event()
+    torn: list[int] = []
+
+    def take() -> None:
+        row = 0
+        while not over.is_set():
+            first, rows = box.read_rows(row)
+            columns = box.layout.arrays(rows)
+            same = columns["angle_rad"][:, 0] == columns["tick"]
+            torn.extend(columns["tick"][~same].tolist())
+            if len(rows) and columns["tick"][0] != first:
+                torn.append(first)
+            row = first + len(columns["tick"])
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    for tick in range(count):
+        box.record(tick, tick, Samples(state(ROBOT, float(tick))), decision())
+    over.set()
+    thread.join(10)
+    assert torn == []
+
+
+def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
+    robot = description(chain__modules=100)
+    box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
+    reported = TickDecision(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    for tick in range(300):
+        box.record(tick, tick, row, reported)
+    peaks = [0] * 700
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for i in range(len(peaks)):
+        tracemalloc.reset_peak()
+        box.record(300 + i, i, row, reported)
+        peaks[i] = tracemalloc.get_traced_memory()[1] - before - 36 * i  # the list's own numbers
+    kept = tracemalloc.get_traced_memory()[0] - before - 36 * len(peaks)
+    tracemalloc.stop()
+    assert max(peaks) < 20_000 and kept < 2_000
+
+
+def test_the_force_over_50_ms_is_kept_where_the_sensor_tells_it() -> None:
+    box = BlackBox(ROBOT)
+    touches = Contacts(tick=0, timestamp_ns=0, contacts=[contact(force_l=(3.0, 4.0, 0.0))], measured_force_n=1.5)
+    box.record(0, 0, Samples(state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
+    assert all_rows(box)["contact_peak_n"].tolist() == [1.5]

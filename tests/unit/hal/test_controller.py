@@ -1,0 +1,155 @@
+"""The base class of controllers: its defaults, what a subclass may declare, and how a wrong class is refused."""
+
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    NoParameters,
+    Observation,
+    decode_parameters,
+    load_controller,
+    positions,
+    require_controller,
+)
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.programs.preflight import check_plugins
+from snakesim_testing.hal.small_robots import description, state
+
+SHIPPED = list_installed(CONTROLLERS)
+DECLARED = {name for name in vars(Controller) if not name.startswith("_")}
+DECLARATIONS = DECLARED - {"check", "update"}
+
+
+class Plain(Controller[NoParameters]):
+    def update(self, observation: Observation) -> ControllerCommand:
+        return ControllerCommand(positions(self.robot, observation.joints.angle_rad))
+
+
+class GainParameters(FileStruct, frozen=True):
+    gain: float = 1.0
+
+
+class Gained(Plain):
+    Parameters = GainParameters
+
+
+def test_a_subclass_with_update_alone_has_all_defaults() -> None:
+    robot = description()
+    plain = Plain(robot, NoParameters())
+    assert plain.robot is robot and plain.parameters == NoParameters()
+    assert (plain.needs_world, plain.uses_sensors) == (True, False)
+    assert (plain.required_modes, plain.required_measurements) == ((), ())
+    assert decode_parameters(Plain, {}, "a.toml", "controllers.plain") == Plain.Parameters()
+    Plain.check(robot, NoParameters())
+    command = plain.update(Observation(0, 0.0, 0.01, state(robot), None, None))
+    assert command.setpoints.target == list(state(robot).angle_rad)
+
+
+def test_parameters_are_checked_by_the_controllers_struct_and_errors_name_file_or_flag() -> None:
+    assert decode_parameters(Gained, {"gain": 2.0}, "a.toml", "controllers.p").gain == 2.0
+    with pytest.raises(ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"):
+        decode_parameters(Gained, {"gian": 1}, "a.toml", "controllers.p")
+    origin = {"controllers.p.gain": "--set control.gain=x"}
+    with pytest.raises(ConfigError, match=r"^--set control\.gain=x: `controllers\.p\.gain` = 'x'"):
+        decode_parameters(Gained, {"gain": "x"}, "a.toml", "controllers.p", origin)
+
+
+def test_parameters_that_are_no_struct_are_refused() -> None:
+    class Odd(Plain):
+        Parameters: Any = dict
+
+    with pytest.raises(ConfigError, match=r"class Odd in .*test_controller\.py: `Parameters` is .*dict.*, must be a"):
+        decode_parameters(Odd, {}, "a.toml", "controllers.odd")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_controller_declares_only_what_the_base_class_knows(name: str) -> None:
+    """A misspelled declaration would be without effect."""
+    for part in load_controller(name).__mro__:
+        if part is Controller or not issubclass(part, Controller):
+            continue
+        attributes = {key for key, value in vars(part).items() if not inspect.isfunction(value)}
+        unknown = {key for key in attributes if not key.startswith("_")} - DECLARED
+        assert not unknown, f"{part.__name__} declares {unknown}; Controller knows {DECLARATIONS}"
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_declarations_of_a_shipped_controller_have_the_types_of_the_base_class(name: str) -> None:
+    controller = load_controller(name)
+    assert issubclass(controller.Parameters, msgspec.Struct)
+    for declaration in DECLARATIONS - {"Parameters"}:
+        assert type(vars(Controller)[declaration]) is type(inspect.getattr_static(controller, declaration)), declaration
+
+
+def test_every_declaration_of_the_base_class_is_documented() -> None:
+    lines = inspect.getsource(Controller).splitlines()
+    for declaration in DECLARATIONS:
+        row = next(i for i, line in enumerate(lines) if line.startswith(f"    {declaration}: "))
+        assert lines[row + 1].startswith('    """'), declaration
+    assert all(vars(Controller)[method].__doc__ for method in ("check", "update", "__init__"))
+
+
+BARE = """\
+class Wave:
+    def __init__(self, robot, parameters):
+        self.robot = robot
+
+    def update(self, observation):
+        return None
+"""
+NO_UPDATE = """\
+import snakesim
+
+class Wave(snakesim.Controller):
+    def updat(self, observation):
+        return None
+"""
+WRONG = {
+    "without the base class": (
+        BARE,
+        "class Wave in {file} does not derive from Controller, the base class of all controllers. "
+        "Write `class Wave(snakesim.Controller):`",
+    ),
+    "without update": (NO_UPDATE, "class Wave in {file} has no method `update`"),
+    "a function": ("def Wave(robot, parameters): ...\n", "the object <function Wave at "),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_preflight_refuses_what_is_no_controller_and_says_how_to_write_one(wrong: str, tmp_path: Path) -> None:
+    text, words = WRONG[wrong]
+    file = tmp_path / "wave.py"
+    file.write_text(text)
+    config = load("triplet", [parse_set(f"controller={file}:Wave")]).config
+    with pytest.raises(ConfigError, match=re.escape(words.format(file=file))) as caught:
+        check_plugins(config)
+    assert str(caught.value).startswith("controller '") and "snakesim.Controller" in str(caught.value)
+
+
+def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:
+    (tmp_path / "picky.py").write_text(
+        "from snakesim_gnc.control.hold import Hold\n"
+        "from snakesim_hal.base.errors import ConfigError\n\n\n"
+        "class Picky(Hold):\n"
+        "    @classmethod\n"
+        "    def check(cls, robot, parameters):\n"
+        "        raise ConfigError(f'{cls.__name__} does not move {robot.robot}')\n"
+    )
+    config = load("triplet", [parse_set(f"controller={tmp_path}/picky.py:Picky")]).config
+    with pytest.raises(ConfigError, match=r"^Picky does not move planar13$"):
+        check_plugins(config)
+
+
+def test_a_class_without_a_file_is_named_by_its_module() -> None:
+    with pytest.raises(ConfigError, match="class int in module builtins does not derive from Controller"):
+        require_controller(int, "program:int")

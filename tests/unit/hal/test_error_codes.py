@@ -1,0 +1,95 @@
+"""Every code that is used is explained, every explained code is used, and docs/errors.md is current."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from docs.site.error_pages import PAGE, make_page
+from snakesim_can_backend.protocol.definitions import ModuleFault
+from snakesim_hal.base import errors
+from snakesim_hal.base.error_codes import ERROR_CODES
+from snakesim_hal.base.fault_codes import FAULT_CODES, REFUSAL_CODES
+from snakesim_hal.base.terminal import run_tool
+
+REPOSITORY = Path(__file__).parents[3]
+REGISTRIES = ("error_codes.py", "fault_codes.py")
+MODULE_FAULTS = {  # made of the names of fault bits and states
+    *(f"module_{fault.name.lower()}" for fault in ModuleFault),
+    "module_fault",
+    "module_emergency",
+}
+
+
+def iterate_sources() -> Iterator[ast.Module]:
+    for path in sorted(REPOSITORY.glob("snakesim*/**/*.py")):
+        if path.name not in REGISTRIES and path.parts[len(REPOSITORY.parts)] != "snakesim_testing":
+            yield ast.parse(path.read_text(encoding="utf-8"))
+
+
+def find_texts(node: ast.AST) -> set[str]:
+    return {part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)}
+
+
+def find_codes(source: ast.Module) -> Iterator[str]:
+    """The texts that `code` is set to: as an argument, as a default of a class, as a constant, or returned."""
+    for node in ast.walk(source):
+        match node:
+            case ast.keyword(arg="code", value=value) | ast.Assign(targets=[ast.Name(id="code")], value=value):
+                yield from find_texts(value)
+            case ast.Assign(targets=[ast.Name(id="INCOMPLETE_CODE")], value=value):
+                yield from find_texts(value)
+            case ast.FunctionDef(name="_choose_code", body=[_, *body]):
+                for statement in body:
+                    yield from find_texts(statement)
+
+
+@pytest.fixture(scope="module")
+def sources() -> list[ast.Module]:
+    return list(iterate_sources())
+
+
+def test_codes_of_errors_are_those_of_the_registry(sources: list[ast.Module]) -> None:
+    used = {code for source in sources for code in find_codes(source) if re.fullmatch(r"[a-z0-9]+/[a-z-]+", code)}
+    assert used == set(ERROR_CODES)
+
+
+def test_faults_are_those_of_the_registry(sources: list[ast.Module]) -> None:
+    texts = {text for source in sources for text in find_texts(source)}
+    assert set(FAULT_CODES) - texts <= MODULE_FAULTS
+    assert set(REFUSAL_CODES) <= texts
+    used: set[str] = set()
+    for source in sources:
+        for node in ast.walk(source):
+            match node:
+                case ast.Call(func=ast.Name(id="Fault"), keywords=keywords):
+                    used |= {text for word in keywords if word.arg == "what" for text in find_texts(word.value)}
+                case ast.Call(func=ast.Name(id="Finding" | "report"), args=[ast.Constant(value=str(word)), *_]):
+                    used.add(word)
+    assert used <= set(FAULT_CODES)
+
+
+def test_every_class_has_a_default_that_is_explained() -> None:
+    classes = [value for value in vars(errors).values() if isinstance(value, type) and hasattr(value, "code")]
+    assert len(classes) > 8 and all(error_type.code in ERROR_CODES for error_type in classes)
+
+
+def test_entries_are_sentences() -> None:
+    for code, entry in [*ERROR_CODES.items(), *FAULT_CODES.items(), *REFUSAL_CODES.items()]:
+        assert all(text.endswith(".") and "|" not in text for text in entry), code
+
+
+def test_the_page_is_current() -> None:
+    assert PAGE.read_text(encoding="utf-8") == make_page(), "run `make schemas`"
+
+
+def test_the_code_ends_the_first_line(capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> int:
+        raise errors.RefusedError("choose one:", "  a", code="network/several-robots")
+
+    assert run_tool("snakesim", fail, as_json=True) == 1
+    out, err = capsys.readouterr()
+    assert err == "snakesim: choose one: [network/several-robots]\n  a\n"
+    assert out == '{"error":{"code":"network/several-robots","message":"choose one:\\n  a"}}\n'

@@ -1,0 +1,32 @@
+"""The form of a controller's parameters, from the schema that control publishes."""
+
+import pytest
+
+from snakesim_hal.wire.messages import ControlParameters
+from snakesim_operator.features.console.page.parameter_form import InputField, list_input_fields
+
+SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
+    "push_n": {"type": "number", "unit": "N", "description": "a bound", "exclusiveMinimum": 0, "maximum": 10000},
+    "share": {"type": "number", "minimum": 0, "maximum": 1},
+    "bend_rad": {"type": "number"},
+    "mode": {"enum": ["a", "b"]},
+    "on": {"type": "boolean"},
+    "names": {"type": "array"}}}}}"""
+VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": true, "names": ["x"]}'
+
+
+def in_force(values: str, schema: str) -> ControlParameters:
+    return ControlParameters(tick=0, timestamp_ns=0, controller="any", parameters=values, schema=schema)
+
+
+def test_each_setting_has_an_input_within_its_bounds():
+    push, share, bend, mode, on = list_input_fields(in_force(VALUES, SCHEMA))
+    assert push == InputField("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N")
+    assert (share.low, share.high) == (0.0, 1.0)
+    assert (bend.low, bend.high) == (-0.8, 0.8)
+    assert mode.choices == ("a", "b") and on.value is True
+
+
+@pytest.mark.parametrize("schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000])
+def test_a_schema_that_cannot_be_read_gives_no_form(schema: str):
+    assert list_input_fields(in_force(VALUES, schema)) == []

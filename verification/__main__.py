@@ -1,0 +1,132 @@
+"""`python -m verification [PART ...] [--minutes N]`: run the campaign part by part, and print what became of each.
+
+A part that fails does not stop the others. `--list` names the parts and about how long each takes on two cores.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from snakesim_hal.base.process import child_environment, python_command
+
+ROOT = Path(__file__).parents[1]
+WITH_VCAN = ("deploy/vm/with_vcan.py", "--", sys.executable, "-m")
+PYTEST = ("pytest", "-q", "--timeout", "1800")
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the campaign: Python's arguments behind `-m`, or a script of the repository."""
+
+    about: str
+    minutes: float  # on two cores; what `--minutes` counts with
+    command: tuple[str, ...]
+    script: bool = False
+
+
+PARTS = {
+    "lease": Part(
+        "mutants of limiter, lease and lifecycle",
+        2,
+        ("verification.mutation", "--files", "limiter.py", "lease.py", "lifecycle.py", "stop_ramp.py"),
+    ),
+    "decoders": Part("100,000 damaged payloads into every decoder", 1, ("verification.fuzz", "--payloads", "100000")),
+    "contracts": Part(
+        "tools of the campaign, and the rules of who may import whom",
+        1,
+        (
+            *PYTEST,
+            "verification/test_import_contracts.py",
+            "verification/test_docstring_names.py",
+            "verification/soak/test_judgement.py",
+            "verification/fuzz",
+        ),
+    ),
+    "quiet": Part(
+        "robots in real time, one test after the other",
+        4,
+        (*PYTEST, "tests", "--ignore", "tests/system/can", "-m", "quiet"),
+    ),
+    "slow": Part(
+        "the long forms of the tests",
+        15,
+        (*PYTEST, "tests", "--ignore", "tests/system/can", "-n", "2", "-m", "slow and not quiet"),
+    ),
+    "can": Part(
+        "all CAN tests and the contract on a kernel's bus",
+        8,
+        (*WITH_VCAN, *PYTEST, "tests/system/can", "tests/contract", "-m", "can or slow"),
+        script=True,
+    ),
+    "documents": Part("every command that the documentation prints", 12, (*PYTEST, "verification/documents", "-m", "")),
+    "installation": Part("wheels, extras and left-out packages", 6, (*PYTEST, "verification/installation", "-m", "")),
+    "computers": Part(
+        "the digests under the code of other processors", 8, (*PYTEST, "verification/computers", "-m", "")
+    ),
+    "commissioning": Part(
+        "hidden faults of joints", 3, (*PYTEST, "verification/test_commissioning_trials.py", "-m", "")
+    ),
+    "attack": Part("every attack of an unauthorized client, in full", 10, ("verification.attack", "-q")),
+    "links": Part("bad links between machines (root)", 4, (*PYTEST, "verification/links", "-m", "")),
+    "faults": Part("the fault table, three trials of each row", 9, ("verification.faults", "--trials", "3")),
+    "fuzz": Part(
+        "damaged payloads into a running robot",
+        3,
+        ("verification.fuzz", "--network", "--payloads", "200000"),
+    ),
+    "kills": Part("processes killed and frozen at random", 5, ("verification.soak.kills", "--trials", "40")),
+    "soak": Part("random faults for ten minutes", 10, ("verification.soak", "--minutes", "10")),
+    "mutation": Part("mutants of all of the safety core", 12, ("verification.mutation",)),
+}
+
+
+def main() -> int:
+    """Run the parts that are asked for; return 1 if one of them failed."""
+    parser = argparse.ArgumentParser(prog="python -m verification", description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (all)")
+    parser.add_argument("--minutes", type=float, help="run the first parts that fit into this time")
+    parser.add_argument("--list", action="store_true", help="name the parts, and run none")
+    asked = parser.parse_args()
+    if unknown := set(asked.parts) - PARTS.keys():
+        parser.error(f"no part called {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    chosen = _fitting([name for name in PARTS if not asked.parts or name in asked.parts], asked.minutes)
+    if asked.list:
+        for name in chosen:
+            print(f"{name:<14}{PARTS[name].minutes:>4g} min  {PARTS[name].about}")
+        return 0
+    failed = [name for name in chosen if not _run(name)]
+    print(f"verification: {len(chosen) - len(failed)} of {len(chosen)} parts passed", flush=True)
+    for name in failed:
+        print(f"  failed: {name} (python -m verification {name})")
+    return 1 if failed else 0
+
+
+def _fitting(names: list[str], minutes: float | None) -> list[str]:
+    """Return the first of the parts that fit into the time together."""
+    if minutes is None:
+        return names
+    chosen: list[str] = []
+    for name in names:
+        minutes -= PARTS[name].minutes
+        if minutes < 0:
+            break
+        chosen.append(name)
+    return chosen
+
+
+def _run(name: str) -> bool:
+    """Run one part; whether it passed."""
+    part = PARTS[name]
+    print(f"== {name}: {part.about}", flush=True)
+    began_s = time.monotonic()
+    words = part.command if part.script else ("-m", *part.command)
+    code = subprocess.run(python_command(*words), cwd=ROOT, env=child_environment(), check=False).returncode
+    print(f"== {name}: exit code {code} after {(time.monotonic() - began_s) / 60:.1f} min", flush=True)
+    return code == 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

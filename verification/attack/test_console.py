@@ -1,0 +1,242 @@
+"""C1 to C8: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import psutil
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from snakesim_testing.harness.page import CAMERA, STOP, Page, ask, flood
+from snakesim_testing.harness.processes import processes_of
+from snakesim_testing.harness.wait import wait_until
+from verification.attack.command import address
+from verification.attack.effort import Record, effort
+from verification.attack.means.floods import half_sent
+from verification.attack.robot import Robot, Victim
+
+STOP_S = 60.0  # from a click to the stop; far above what it takes
+FLOOD_S = float(effort(2, 20))
+FILES = 1024  # that each process of the robot may open
+FLOODED_STOP_S = 5.0  # what is promised for a stop while requests flood the console; it takes some 0.02 s
+MOST_MB = 80.0  # that a flood may cost the console
+REFUSED = ("http://evil.example", "null", "http://localhost:9", "http://127.0.0.1:9", "file://", "https://localhost")
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Victim]:
+    kept = Victim(tmp_path_factory.mktemp("shown"), "--console", inside=("prlimit", f"--nofile={FILES}:{FILES}"))
+    yield kept
+    kept.close()
+
+
+@pytest.fixture
+def robot(shown: Victim) -> Robot:
+    return shown.armed()
+
+
+@pytest.fixture
+def at(robot: Robot) -> str:
+    """The console's address."""
+    return robot.run.console()
+
+
+def stops(robot: Robot, act: Callable[[], object]) -> float:
+    """Seconds from an act until the robot is stopped."""
+    asked_s = time.monotonic()
+    act()
+    return robot.operator.stopped_at(asked_s, STOP_S) - asked_s
+
+
+UPDATES: tuple[Any, ...] = (
+    {"update_cb": []},
+    {"__class__": 1},
+    {"value": True, "update_cb": []},
+    {"removed": True},
+    {"is_button": False, "value": False},
+    {"sync_cb": None},
+    {"gui_api": None},
+    {"value": ["update_cb"]},
+    {},
+    [],
+)
+
+
+def test_c1_no_viewer_switches_the_stop_off(robot: Robot, at: str) -> None:
+    health = robot.health()
+    with Page(at) as viewer, Page(at) as other:
+        for one in UPDATES * 2:
+            viewer.change(viewer.find(STOP), one)
+        viewer.say(CAMERA)
+        robot.stays("armed", 0.5)
+        stops(robot, lambda: other.click(STOP))
+    robot.operator.recover()
+    with Page(at) as late:
+        stops(robot, lambda: late.click(STOP))
+    robot.unharmed(health)
+
+
+def test_c2_who_has_no_control_commands_nothing_by_his_own_buttons_or_anothers(robot: Robot, at: str) -> None:
+    health = robot.health()
+    with Page(at) as driver, Page(at) as intruder:
+        driver.click("Take control")
+        driver.find("Release control")
+        for page in (driver, intruder):
+            page.find("Robot")
+            for control, props in list(page.controls.items()):
+                if props.get("label") == STOP:
+                    continue
+                if props.get("label") == "Release control":  # of somebody else
+                    assert page is driver
+                for value in ("Disarm", "Reset", "Inject", 90, 0.4, True, *props.get("options", ())):
+                    intruder.change(control, {"value": value})
+                intruder.say({"type": "GuiButtonHoldMessage", "uuid": control, "frequency": 10.0})
+                if "hotkey" in props and props.get("label") != "Emergency stop":
+                    intruder.say({"type": "CommandTriggerMessage", "uuid": control})
+        robot.stays("armed", 1.5)
+        assert driver.find("Release control")
+        for said in ("without control of the robot", "no control of this viewer"):
+            wait_until(lambda said=said: said in (robot.run.out / "console.log").read_text(), said)
+        stops(robot, lambda: intruder.click(STOP))
+    robot.unharmed(health)
+
+
+NONSENSE: dict[str, Any] = {
+    "sharing": {"type": "ShareUrlRequest"},
+    "a_file": {
+        "type": "FileTransferStartUpload",
+        "source_component_uuid": "x",
+        "transfer_uuid": "y",
+        "filename": "../../x",
+        "mime_type": "text/plain",
+        "part_count": 1,
+        "size_bytes": 10**12,
+    },
+    "javascript": {"type": "RunJavascriptMessage", "source": "alert(1)"},
+    "a_form": {"type": "GuiFormDirtyMessage", "uuid": "x"},
+    "a_camera_with_more": CAMERA | {"excluded_self_client": 0},
+    "a_camera_at_infinity": CAMERA | {"position": [float("inf"), float("nan"), 0.0]},
+    "no_type": {"uuid": "x", "updates": {"value": True}},
+    "a_type_that_is_none": {"type": ["GuiUpdateMessage"], "uuid": "x"},
+    "a_type_of_tomorrow": {"type": "GuiSetAnythingMessage", "uuid": "x", "value": 1},
+    "a_list": [1, 2, 3],
+    "noise": b"\xc1\xff\x00\x93",
+    "nothing": b"",
+    "a_text": '{"type": "GuiUpdateMessage"}',
+    "depth": b"\x91" * 60_000,
+}
+
+
+def test_c3_what_no_page_says_ends_nothing_and_is_told_once(robot: Robot, at: str) -> None:
+    health = robot.health()
+    with Page(at) as viewer:
+        viewer.find(STOP)
+        for said in [*NONSENSE.values()] * 3:
+            viewer.say(said)
+        stops(robot, lambda: viewer.click(STOP))  # by the same connection, after it
+    robot.unharmed(health)
+    assert (robot.run.out / "console.log").read_text().count(": unknown:") == 1
+
+
+def test_c4_who_says_too_much_is_hung_up_on(robot: Robot, at: str) -> None:
+    health = robot.health()
+    with Page(at) as viewer, Page(at) as other:
+        viewer.change(viewer.find(STOP), {"value": "x" * 1_000_000})
+        assert viewer.ended() == 1009
+        stops(robot, lambda: other.click(STOP))
+    robot.unharmed(health)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["camera", "unknown", "stop"])
+def test_c5_a_flood_costs_nobody_the_stop(robot: Robot, at: str, kind: str, record_property: Record) -> None:
+    health = robot.health()
+    with Page(at) as other, ExitStack() as stack:
+        button = other.find(STOP)
+        said = {
+            "camera": CAMERA,
+            "unknown": {"type": "GuiUpdateMessage", "uuid": button, "updates": {"update_cb": []}},
+            "stop": {"type": "GuiUpdateMessage", "uuid": button, "updates": {"value": True}},
+        }[kind]
+        before_mb = console_mb(robot)
+        floods = [threading.Thread(target=flood, args=(at, said, FLOOD_S + 2.0)) for _ in range(effort(3, 12))]
+        for one in floods:
+            one.start()
+            stack.callback(one.join)
+        if kind == "stop":
+            robot.operator.stopped_at(time.monotonic() - 1.0, STOP_S)
+        else:
+            time.sleep(FLOOD_S)
+            record_property("stopped after", f"{stops(robot, lambda: other.click(STOP)):.2f} s from a click")
+        began = time.monotonic()
+        assert ask(at, "GET") == (200, "ready")
+        record_property("second stop answers", f"{1000 * (time.monotonic() - began):.0f} ms")
+    assert console_mb(robot) < before_mb + MOST_MB
+    robot.unharmed(health, kind)
+
+
+def console_mb(robot: Robot) -> float:
+    """Resident memory of the console."""
+    pid = next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.features.console" in line)
+    return psutil.Process(pid).memory_info().rss / 1e6
+
+
+def test_c6_pages_of_other_origins_are_refused(robot: Robot, at: str) -> None:
+    for origin in (*REFUSED, at.replace("127.0.0.1", "localhost")):  # another name: another origin
+        with pytest.raises(InvalidStatus) as refused:
+            Page(at, origin)
+        assert refused.value.response.status_code == 403
+        for method in ("GET", "POST"):
+            status, why = ask(at, method, Origin=origin)
+            assert status == 403 and "may connect" in why
+    assert ask(at, "GET", "/", Host="evil.example")[0] == 403  # a name of theirs that points here
+    assert ask(at, "POST", Host="evil.example", Origin="http://evil.example")[0] == 403
+    with Page(at, at) as own:
+        own.find(STOP)
+    robot.stays("armed", 0.3)
+
+
+def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, record_property: Record) -> None:
+    health = robot.health()
+    with ExitStack() as stack:
+        for said in (b"", b"POST /stop HTTP/1.1\r\nHost: ", b"GET / HTTP/1.1\r\n") * effort(40, 100):
+            half = stack.enter_context(socket.create_connection(address(at.replace("http://", "tcp/"))))
+            half.sendall(said)
+        answers: list[tuple[int, str]] = []
+        took_s = stops(robot, lambda: answers.append(ask(at, "POST", Origin=at)))
+        assert answers[0][0] == 200 and "planar13: stopped" in answers[0][1]
+    record_property("stopped after", f"{1000 * took_s:.0f} ms from POST /stop")
+    assert 'id = "second-stop"' in ask(at, "GET", "/")[1] and ask(at, "GET", "/")[0] == 200
+    robot.unharmed(health)
+
+
+def test_c8_half_sent_requests_of_several_processes_cost_nobody_the_stop(
+    robot: Robot, at: str, record_property: Record
+) -> None:
+    """With more of them than the console may open files, by all of its stops, during the flood and after it."""
+    health = robot.health()
+    with Page(at) as page, Page(at, draws=False) as without_scene:
+        ways: dict[str, Callable[[], object]] = {
+            "the page's button": lambda: page.click(STOP),
+            "the button of a page without WebGL": lambda: without_scene.click(STOP),
+            "POST /stop": lambda: ask(at, "POST", Origin=at),
+        }
+        page.find(STOP)
+        without_scene.find(STOP)
+        with half_sent(at, count=2000, processes=3):
+            for name, act in ways.items():
+                took_s = stops(robot, act)
+                record_property(f"stopped in the flood by {name}", f"after {1000 * took_s:.0f} ms")
+                assert took_s < FLOODED_STOP_S, name
+                robot.operator.recover()
+            wait_until(lambda: ask(at, "GET") == (200, "ready"), "a second stop that has tested itself", 10.0)
+        for name, act in ways.items():
+            assert stops(robot, act) < FLOODED_STOP_S, name
+            robot.operator.recover()
+        with Page(at) as late:
+            late.find(STOP)
+    robot.unharmed(health)

@@ -1,0 +1,325 @@
+"""Emulated robots with a hidden fault, and what the joint check and the system identification find of it.
+
+    python -m verification.commissioning_trials check|identify --first 1000 --trials 70
+
+Every trial is a robot of its own, by its number, which is its seed: the joint, the size of its fault, the friction of
+the floor, how straight a person laid the robot, and what its motors are. It prints each trial in which something was
+missed or a sound joint was blamed, then a table.
+"""
+
+import argparse
+import random
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
+from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
+from snakesim_drivers.kit.drive_settings import BodySettings
+from snakesim_gnc.control.identify import Identify, IdentifyParameters
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.controller import Observation
+from snakesim_hal.model.checked import JointProperty
+from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Imu, JointState, Mode
+from snakesim_operator.features.commissioning.identification import JointIdentification, identify_joints
+from snakesim_operator.features.commissioning.judge import JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.measured import collect_measurements
+
+LAID_RAD = 0.03  # how straight a person lays a robot, at each joint
+OFFSET_RAD = 0.15
+GEARS = (0.5, 2 / 3, 0.8, 1.25, 1.5, 2.0)
+BACKLASHES_RAD = (0.0175, 0.025, 0.035, 0.045)  # 1 to 2.6 degrees
+NONE = "none"
+# Hidden fault -> the property that should be found wrong, and words of its verdict.
+FAULTS: Mapping[str, tuple[JointProperty, str]] = {
+    "sign": ("sign", "the other way"),
+    "order": ("order", "swapped"),
+    "zero": ("zero", "zero is off"),
+    "gear": ("gear", "as far as its drive says"),
+    "backlash": ("gear", "backlash of"),
+    "dead motor": ("drive", "did not move"),
+}
+
+
+# --- the joint check -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CheckTrial:
+    """One robot, and what was found of it."""
+
+    fault: str
+    joints: Sequence[int]  # that have the fault
+    rows: Sequence[JointVerdict]
+
+    @property
+    def found(self) -> bool:
+        """Whether the right property of every joint with the fault was found wrong, by the right name."""
+        name, words = FAULTS[self.fault]
+        rows = [self.rows[joint] for joint in self.joints]
+        return all(row.findings[name].state == "wrong" and words in row.findings[name].reason for row in rows)
+
+    @property
+    def blamed(self) -> list[str]:
+        """Sound joints of which something is wrong."""
+        rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
+        return [f"{row.joint}: {row.summary}" for row in rows if row.properties("wrong")]
+
+    @property
+    def unsure(self) -> list[str]:
+        """Sound joints of which something is unknown."""
+        rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
+        return [f"{row.joint}: {row.summary}" for row in rows if row.properties("unknown")]
+
+
+def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: float = 13.0) -> CheckTrial:
+    """Check a robot with a hidden fault. sets: as `--set` of a run."""
+    pick = random.Random(number)
+    zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(modules)]
+    joint, other = pick.sample(range(modules), 2)
+    faults: list[str] = []
+    match fault:
+        case "sign":
+            faults = [f"joint_{joint + 1}.sign=-1"]
+        case "order":
+            faults = [f"joint_{joint + 1}.id={other + 1}", f"joint_{other + 1}.id={joint + 1}"]
+        case "zero":
+            zeros[joint] += pick.choice((-OFFSET_RAD, OFFSET_RAD))
+        case "gear":
+            faults = [f"joint_{joint + 1}.gear={pick.choice(GEARS)}"]
+        case "backlash":
+            faults = [f"joint_{joint + 1}.backlash_rad={pick.choice(BACKLASHES_RAD)}"]
+        case "dead motor":
+            faults = [f"joint_{joint + 1}.connected=false"]
+        case _:
+            pass
+    truth = [*faults, *(f"joint_{i + 1}.zero_rad={zero}" for i, zero in enumerate(zeros))]
+    run = [f"seed={number}", f"scene.ground.friction={pick.uniform(0.2, 0.8)}", f"robot.chain.modules={modules}"]
+    run += [f"duration_s={seconds}", *(f"backends.can.mounted.{text}" for text in truth)]
+    with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
+    return CheckTrial(fault, with_fault, _checked("backend=can", *sets, *run))
+
+
+def _checked(*sets: str) -> list[JointVerdict]:
+    """Run the joint check in this process, and judge it."""
+    config = load("joint_check", [parse_set(text) for text in sets]).config
+    imus: list[Imu] = []
+    with InProcessRun(config) as run:
+        reader = run.network.session().reader(keys.IMU, Imu)
+        box = run.host.black_box
+        rows = b""
+        for _ in run.iterate_ticks():
+            imus += reader.drain()
+            rows += box.read_rows(len(rows) // box.layout.row_bytes)[1]
+        columns = box.layout.arrays(rows)
+        robot = run.host.description
+    ticks = columns.pop("tick").tolist()
+    return judge_joints(collect_measurements(config, robot, ticks, columns, imus), straight=True)
+
+
+def check_table(first: int, trials: int, *sets: str) -> list[str]:
+    """Return the table of trials with every fault, and as many without any."""
+    made: list[CheckTrial] = []
+    kinds = [*FAULTS, NONE]
+    for number in range(first, first + trials):
+        fault = kinds[number % len(kinds)]
+        trial = check_trial(number, fault, *sets)
+        made.append(trial)
+        if trial.blamed or trial.unsure or (trial.joints and not trial.found):
+            said = [f"{trial.rows[joint].joint}: {trial.rows[joint].summary}" for joint in trial.joints]
+            print(f"trial {number}, {fault}: {said}; blamed {trial.blamed}; unsure {trial.unsure}", flush=True)
+    lines = ["| hidden fault | robots | found by name | robots with a sound joint blamed | with one unknown |"]
+    lines.append("|---|---|---|---|---|")
+    for fault in kinds:
+        those = [trial for trial in made if trial.fault == fault]
+        found = "-" if fault == NONE else str(sum(trial.found for trial in those))
+        blamed, unsure = sum(bool(trial.blamed) for trial in those), sum(bool(trial.unsure) for trial in those)
+        lines.append(f"| {fault} | {len(those)} | {found} | {blamed} | {unsure} |")
+    return lines
+
+
+# --- system identification -------------------------------------------------------------------------------------
+
+IDENTIFY_MODULES = 5
+IDENTIFY_ROBOT = (
+    f"robot.chain.modules={IDENTIFY_MODULES}",
+    "robot.motor.friction_nm=0.15",
+    "robot.motor.viscous_nm_s_per_rad=0.1",
+    "robot.motor.torque_constant_nm_per_a=0.5",
+)
+FIELDS = ("friction_nm", "viscous_nm_s_per_rad", "armature_kg_m2", "response_time_s", "torque_constant_nm_per_a")
+DRAWN = 0.3  # to either side of the file's value
+LATENCY_S = 0.01
+IMU_RATE_HZ = 5.0  # of joint modules, one after the other
+GYRO_NOISE_RAD_S = 0.005
+
+
+@dataclass
+class IdentifyTrial:
+    """One robot, and what was found of it."""
+
+    loose: int | None  # joint with backlash
+    truth: Mapping[str, Mounted]
+    found: Sequence[JointIdentification]
+    written: int = field(init=False, default=0)  # values
+    covered: int = field(init=False, default=0)  # values that are written, and whose interval covers the truth
+    constants_off: int = field(init=False, default=0)  # torque constants that are written, and off by more than 10 %
+
+    def __post_init__(self) -> None:
+        """Compare what would be written with the truth."""
+        for one in self.found:
+            if one.fails:
+                continue
+            for name, value in one.fields.items():
+                if name not in FIELDS:
+                    continue
+                truth = getattr(self.truth[one.joint], name)
+                self.written += 1
+                self.covered += value.covers(truth)
+                self.constants_off += name == "torque_constant_nm_per_a" and abs(value.value / truth - 1) > 0.1
+
+    @property
+    def named(self) -> list[int]:
+        """Joints that are said to have backlash."""
+        return [joint for joint, one in enumerate(self.found) if any("backlash" in text for text in one.unknown)]
+
+
+def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTrial, IdentifyTrial]:
+    """Identify a robot whose parameters are hidden: with what its IMUs measured, and without.
+
+    sets: as `--set`. backlash: in one of its joints.
+    """
+    pick = random.Random(number)
+    texts = (*IDENTIFY_ROBOT, f"seed={number + 1}", *sets)
+    config = load("identify", [parse_set(text) for text in texts]).config
+    truth: dict[str, Mounted] = {}
+    latency_s: list[float] = []
+    loose = pick.randrange(IDENTIFY_MODULES)
+    backlash_rad = pick.choice(BACKLASHES_RAD)
+    for joint, one in enumerate(config.robot.joint_table):
+        values = {name: getattr(one.motor, name) * pick.uniform(1 - DRAWN, 1 + DRAWN) for name in FIELDS}
+        if backlash and joint == loose:
+            values["backlash_rad"] = backlash_rad
+        truth[one.name] = Mounted(**values)
+        latency_s.append(round(LATENCY_S * pick.uniform(1 - DRAWN, 1 + DRAWN), 3))
+    columns, link_rates = _shaken(config, truth, latency_s)
+    with_imus, without = (
+        IdentifyTrial(loose if backlash else None, truth, identify_joints(config, columns, rates))
+        for rates in (link_rates, None)
+    )
+    return with_imus, without
+
+
+def _shaken(
+    config: RunConfig, truth: Mapping[str, Mounted], latency_s: Sequence[float]
+) -> tuple[dict[str, Floats], Floats]:
+    """Return the columns of a record of the controller on emulated drives, and what the gyros of the links measured.
+
+    Bus and host are left out, so that a hundred trials take minutes. Latencies are whole steps of the physics model.
+    """
+    settings = BodySettings(
+        mounted=dict(truth), physics_model_settings=config.backends["can"]["physics_model_settings"]
+    )
+    physics_model = make_physics_model(config, settings, "can")
+    joints = config.robot.joint_table
+    body = EmulatedBody(SharedPhysics(config, physics_model, truth, None), range(len(joints)))
+    robot = describe_robot(
+        config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
+    )
+    controller = Identify(robot, msgspec.convert(config.controller_parameters, IdentifyParameters))
+    noise = np.random.default_rng(config.seed).standard_normal
+    sensor = config.robot.sensors.joints
+    sigma = np.array([sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm])
+    # A drive computes its torque from its current, by the constant that the file says.
+    by_file = [joint.motor.torque_constant_nm_per_a or 1.0 for joint in joints]
+    in_truth = [joint.motor.torque_constant_nm_per_a or 1.0 for joint in body.joints]
+    as_measured = np.array(by_file) / np.array(in_truth)
+    period_s = config.period_ns * 1e-9
+    steps = round(period_s / physics_model.step_s)
+    late = [round(one / physics_model.step_s) for one in latency_s]
+    imu_ticks = round(config.rate_hz / IMU_RATE_HZ)
+    waiting: dict[int, list[tuple[int, float]]] = defaultdict(list)  # step -> joint and target
+    ticks = round(config.duration_s * config.rate_hz)
+    rows: dict[str, list[Any]] = {name: [] for name in ("angle_rad", "velocity_rad_s", "torque_nm", "target")}
+    link_rates = np.full((ticks, len(joints) + 1, 3), np.nan)
+    for tick in range(ticks):
+        reporting = [i for i in range(len(joints)) if tick % imu_ticks == 7 * i % imu_ticks]
+        imu = physics_model.imu() if reporting else None
+        if imu is not None:
+            for i in reporting:
+                rate = np.array(imu.angular_velocity_rad_s[list(imu.link).index(i + 1)])
+                link_rates[tick, i + 1] = rate + GYRO_NOISE_RAD_S * noise(3)
+        state = np.stack((physics_model.angle_rad, physics_model.velocity_rad_s, body.motors.torque_nm * as_measured))
+        angle, velocity, torque = (state + sigma[:, None] * noise(state.shape)).tolist()
+        joint_state = JointState(
+            tick=tick,
+            timestamp_ns=tick * config.period_ns,
+            angle_rad=angle,
+            velocity_rad_s=velocity,
+            torque_nm=torque,
+            valid=[True] * len(joints),
+            age_ns=[0] * len(joints),
+        )
+        view = Observation(tick, tick * period_s, period_s, joint_state, None, None)
+        target = list(controller.update(view).setpoints.target)
+        for name, values in zip(rows, (angle, velocity, torque, target), strict=True):
+            rows[name].append(values)
+        for i in range(len(joints)):
+            waiting[tick * steps + late[i]].append((i, target[i]))
+        for step in range(tick * steps, (tick + 1) * steps):
+            for i, target_rad in waiting.pop(step, ()):
+                motor, limits = joints[i].motor, joints[i].limits
+                gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, limits.speed_rad_s
+                body.drive_motor(i, Mode.POSITION, target_rad, limits.torque_nm, *gains)
+            body.advance_to((step + 1) * physics_model.step_s * 1e6)
+    return {name: np.array(values) for name, values in rows.items()}, link_rates
+
+
+def identify_table(first: int, trials: int, *sets: str) -> list[str]:
+    """Return the table of trials with backlash in one of five joints, and without, with IMUs and without."""
+    lines = ["| hidden fault | IMUs | robots | named | named falsely | values written | they cover | constants off |"]
+    lines.append("|---|---|---|---|---|---|---|---|")
+    for backlash in (True, False):
+        made = [identify_trials(number, *sets, backlash=backlash) for number in range(first, first + trials)]
+        for imus, those in zip(("yes", "no"), zip(*made, strict=True), strict=True):
+            lines.append(
+                f"| {'backlash' if backlash else NONE} | {imus} | {_identified_row(those, backlash=backlash)} |"
+            )
+    return lines
+
+
+def _identified_row(trials: Sequence[IdentifyTrial], *, backlash: bool) -> str:
+    named = str(sum(trial.loose in trial.named for trial in trials)) if backlash else "-"
+    falsely = sum(any(joint != trial.loose for joint in trial.named) for trial in trials)
+    written = sum(trial.written for trial in trials)
+    covered = sum(trial.covered for trial in trials)
+    possible = len(FIELDS) * sum(len(trial.found) for trial in trials)
+    off = sum(trial.constants_off for trial in trials)
+    share = f"{100 * covered / written:.0f} %" if written else "-"
+    return f"{len(trials)} | {named} | {falsely} | {written} of {possible} | {share} | {off}"
+
+
+def main() -> int:
+    """Print the table of the check or of the identification."""
+    tables: dict[str, Callable[..., list[str]]] = {"check": check_table, "identify": identify_table}
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("table", choices=tables)
+    parser.add_argument("--first", type=int, default=1000, help="number of the first trial (default: 1000)")
+    parser.add_argument("--trials", type=int, default=70, help="default: 70")
+    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="PATH=VALUE", help="as of a run")
+    arguments = parser.parse_args()
+    print("\n".join(tables[arguments.table](arguments.first, arguments.trials, *arguments.sets)))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""One digest on every computer."""

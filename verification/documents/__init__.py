@@ -1,0 +1,1 @@
+"""What the documentation asks its readers to type."""

@@ -1,0 +1,83 @@
+"""Watches a host over its private channel, from outside of it: no network that fails or is flooded is in between.
+
+Times are of the monotonic clock when a status reached this process, so they are upper bounds.
+"""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+
+from snakesim_hal.network.private_channel import MAX_BYTES, HostMessage, socket_pair
+from snakesim_hal.wire.messages import Status
+from verification.faults.observer import Heard, TrialError
+
+LOOK_S = 0.0005
+LIMIT_S = 10.0
+OBSERVER_PRIORITY = 30  # of 99; host and control have 20
+
+
+@contextlib.contextmanager
+def urgently() -> Iterator[None]:
+    """Have this thread, and those that start meanwhile, outrank the robot's own where the system lets them.
+
+    So an observer is not kept waiting by a controller that is busy, and has priority. Processes do not inherit it.
+    """
+    priority = os.sched_param(OBSERVER_PRIORITY)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, priority)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, priority)
+
+
+class HostWatch:
+    """Keeps every status that the host tells its starter."""
+
+    def __init__(self) -> None:
+        self._socket, self.inherited = socket_pair()
+        self._socket.settimeout(0.1)
+        self._statuses: list[Heard[Status]] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="host watch", daemon=True)
+        with urgently():
+            self._thread.start()
+
+    def close(self) -> None:
+        """End it."""
+        self._over.set()
+        self._thread.join()
+        self._socket.close()
+        self.inherited.close()
+
+    def lifecycle(self) -> str | None:
+        """What was told last."""
+        return self._statuses[-1].message.lifecycle if self._statuses else None
+
+    def first(self, condition: Callable[[Status], bool], since_ns: int, what: str) -> Heard[Status]:
+        """The first status after a time of which a condition holds. Raises TrialError when none comes."""
+        deadline = time.monotonic() + LIMIT_S
+        while time.monotonic() < deadline:
+            for heard in list(self._statuses):
+                if heard.at_ns >= since_ns and condition(heard.message):
+                    return heard
+            time.sleep(LOOK_S)
+        raise TrialError(f"the host did not say within {LIMIT_S:g} s: {what}; last: {self.lifecycle()}")
+
+    def _listen(self) -> None:
+        decoder = msgspec.msgpack.Decoder(HostMessage)
+        while not self._over.is_set():
+            try:
+                said = decoder.decode(self._socket.recv(MAX_BYTES))
+            except TimeoutError:
+                continue
+            except (OSError, msgspec.DecodeError):  # the host is gone
+                self._over.wait(0.1)
+                continue
+            if said.status is not None:
+                self._statuses.append(Heard(time.monotonic_ns(), said.status))

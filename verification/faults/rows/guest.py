@@ -1,0 +1,215 @@
+"""What needs a machine of its own: modules on a kernel's CAN bus outlive the host, and the wall clock is set.
+
+The modules are emulators in a process that lives through all trials, at 25 Hz; the listener has the kernel's time of
+every frame. Host and control are the product's own processes.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, parse_node
+from snakesim_hal.model.scenario import Override, load
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.programs import host_program as host_process
+from snakesim_testing.can.listened_bus import (
+    JOINTS,
+    NODES,
+    RATE_HZ,
+    SCENARIO,
+    Bench,
+    Heard,
+    bench,
+    first_in,
+    passed_for_module_ms,
+    stop_commands,
+)
+from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
+from snakesim_testing.hal.small_robots import write_files
+from verification.faults.observer import Observer, TrialError
+from verification.faults.robot import START_LIMIT_S, Robot, robot
+from verification.faults.row import Request, Trial
+
+CHANNEL = "vcan0"
+ARM_LIMIT_S = 120.0
+LIVE_S = 0.3
+LEFT_S = 0.8
+MAX_RETRIES = 10  # of each trial, on average
+LOOK_S = 0.4
+WATCHDOG_MS = 100.0
+STEP_S = 3600.0
+AFTER_STEP_S = 1.0
+ATTEMPTS = 3
+
+
+def host_gone(number: signal.Signals, request: Request) -> Iterator[Trial]:
+    """SIGKILL or SIGSTOP for the host. The value: from the last setpoint to the fault, in the module's own time."""
+    rng, by_kernel_ms, done = random.Random(7), list[float](), 0
+    with bench(request.folder, CHANNEL) as robot:
+        robot.modules()
+        robot.control()
+        while done < request.trials:
+            trial: Trial | None = None
+            try:
+                with _armed_host(request, robot) as pid:
+                    robot.listener.forget()
+                    time.sleep(LIVE_S + rng.random() / RATE_HZ)
+                    trial = _left_alone(robot, pid, number, by_kernel_ms)
+            except TrialError as error:  # it could not be armed: with a new host, perhaps
+                print(f"    made again: {error}", flush=True)
+            if trial is not None:
+                done += 1
+                yield trial
+                continue
+            request.retry()
+            if request.retried > MAX_RETRIES * request.trials:
+                raise TrialError(f"this machine is too busy: the robot stopped by itself {request.retried} times")
+    request.note(
+        f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
+        f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
+        f"{max(by_kernel_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
+    )
+
+
+host_killed, host_frozen = (partial(host_gone, number) for number in (signal.SIGKILL, signal.SIGSTOP))
+
+
+def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: list[float]) -> Trial | None:
+    """None: the robot had stopped already when the signal came."""
+    listener, fault = robot.listener, {ModuleState.FAULT}
+    now_ns = time.time_ns()
+    os.kill(pid, number)
+    time.sleep(LEFT_S)  # also for the heartbeats after it, by which the modules' own time is told
+    heard = listener.listen()
+    if not _went_well_until(heard, now_ns):
+        return None
+    stopped = first_in(heard, fault, now_ns)
+    if len(stopped) < JOINTS:
+        return Trial(value=None, failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}")
+    by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
+    failures: list[str] = []
+    causes = {h.says()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
+    if causes - {LastStop.WATCHDOG}:
+        failures.append(f"stopped by {causes}")
+    own_ms: list[float] = []
+    for node in NODES:
+        points = [h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node]
+        own_ms.append(passed_for_module_ms(heard, node, max(points), stopped[node].at_ns))
+    return Trial(value=max(own_ms), failure="; ".join(failures), recovered=True)
+
+
+def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
+    """Whether every module had a setpoint within the last three periods, and nobody had been told to stop."""
+    recent_ns = now_ns - round(3e9 / RATE_HZ)
+    driven = {parse_node(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
+    return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
+
+
+@contextlib.contextmanager
+def _armed_host(request: Request, robot: Bench) -> Iterator[int]:
+    """A host in a process of its own, once it has armed every module."""
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload([__name__])
+    process = processes.Process(target=_become_host, args=(robot.host_arguments, robot.folder))
+    process.start()
+    try:
+        link = Link(robot.endpoint, robot.config.robot.name)
+        with open_session(link, connect_timeout_s=ARM_LIMIT_S) as session:
+            _arm(request, robot, Observer(session))
+            assert process.pid is not None
+            yield process.pid
+    finally:
+        process.kill()
+        process.join()
+
+
+def _arm(request: Request, robot: Bench, observer: Observer) -> None:
+    """Until every module says that it is armed. Looks rarely: this machine is slow, and modules and host need it."""
+    deadline = time.monotonic() + ARM_LIMIT_S
+    while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
+        if time.monotonic() > deadline:
+            raise TrialError(f"not armed within {ARM_LIMIT_S:g} s: {observer.in_words()}; {robot.said('host')[-300:]}")
+        if observer.state() != "armed":
+            observer.arm(ARM_LIMIT_S)
+        robot.listener.forget()
+        observer.watch(LOOK_S)
+    request.retry(observer.stumbles)
+
+
+def _become_host(arguments: Sequence[str], folder: Path) -> None:
+    """In a new process, forked from one that has imported everything: an emulated machine takes long for that."""
+    os.environ["XDG_STATE_HOME"] = str(folder)
+    output = os.open(folder / "host.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    sys.exit(host_process.main([*arguments, "--parent", str(os.getppid())]))
+
+
+def watchdog(request: Request) -> Iterator[Trial]:
+    """A module whose host is silent from some instant on. The value: until it is passive, in its own exact time."""
+    rng = random.Random(8)
+    for _ in range(request.trials):
+        module: ModuleFirmware = armed()
+        now_us = BOOTED
+        for count in range(rng.randrange(5, 40)):
+            now_us += 10 * MS
+            module.sync(count, QUIET)
+            module.poll(now_us)
+            module.receive_setpoint(setpoint(count), now_us)
+        assert module.state == ModuleState.ARMED, module.state
+        last_us = now_us
+        while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:
+            now_us += MS / 10
+            module.poll(now_us)
+        failure = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
+        yield Trial(value=(now_us - last_us) / MS, failure=failure)
+
+
+def clock_step(request: Request) -> Iterator[Trial]:
+    """An hour ahead, then an hour back, while a robot moves at 25 Hz. The value: faults and stops."""
+    scenario = write_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
+    settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
+    config = load(scenario, [Override(key, value, "the fault table") for key, value in settings.items()]).config
+    with robot(request, config) as (made, observer):
+        for number in range(request.trials):
+            trial = Trial(value=None)
+            for _ in range(ATTEMPTS):
+                trial = _stepped(made, observer, STEP_S if number % 2 == 0 else -STEP_S)
+                if trial.value == 0:
+                    break
+                request.retry()
+                _step_clock(STEP_S if number % 2 else -STEP_S)
+                observer.arm(START_LIMIT_S)
+            yield trial
+        if request.trials % 2:
+            _step_clock(-STEP_S)
+    request.note(
+        f"{JOINTS} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back by turns. A step that "
+        f"met a stop, as an emulated machine brings about by itself, was tried again, at most {ATTEMPTS} times"
+    )
+
+
+def _stepped(made: Robot, observer: Observer, by_s: float) -> Trial:
+    while observer.state() != "armed":
+        observer.arm(START_LIMIT_S)
+    observer.watch(LIVE_S + made.random.random() / RATE_HZ)
+    observer.forget()
+    _step_clock(by_s)
+    observer.watch(AFTER_STEP_S)
+    faults = len(observer.status.faults) if observer.status is not None else 1
+    stops = sum(h.message.sequence is None for h in observer.applied)
+    failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
+    if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
+        failure = failure or f"only {len(observer.applied)} setpoints heard of in {AFTER_STEP_S:g} s"
+    return Trial(value=float(faults + stops), failure=failure)
+
+
+def _step_clock(by_s: float) -> None:
+    time.clock_settime(time.CLOCK_REALTIME, time.clock_gettime(time.CLOCK_REALTIME) + by_s)

@@ -1,0 +1,106 @@
+"""A run: decode sample after sample, let a HAL act on what decodes, and keep count."""
+
+import os
+import random
+import resource
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from snakesim_hal.base.errors import WireError
+from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.messages import (
+    VERSIONS,
+    Answer,
+    EstopRequest,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    LifecycleRequest,
+    Message,
+)
+from snakesim_testing.hal.authority_rig import Rig, armed
+from snakesim_testing.hal.small_robots import PERIOD_NS
+from verification.fuzz.payloads import Maker
+from verification.fuzz.vitals import vitals
+
+LONGEST_REASON = 400  # characters of an error's text, whatever a sender wrote
+PER_ROBOT = 1000  # payloads until a fresh robot is armed
+PER_TICK = 10
+ANSWERS = Decoder(Answer)
+
+
+@dataclass
+class Report:
+    """What became of the samples."""
+
+    outcomes: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])  # by kind of mutation
+    answers: Counter[str] = field(default_factory=Counter[str])  # what a HAL did with what decoded
+    resident_mb: list[float] = field(default_factory=list[float])  # ten times in a run
+    peak_mb: float = 0.0
+    longest_reason: int = 0
+
+    @property
+    def growth_mb(self) -> float:
+        """Memory gained since the first tenth of the run."""
+        return self.resident_mb[-1] - self.resident_mb[0]
+
+
+def taken(hal: Rig, message: Message) -> str:
+    """What became of a message to a HAL without a network, in a word."""
+    authority = hal.authority
+    answer: Answer
+    match message:
+        case JointCommand():
+            return authority.offer_command(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
+        case JointState():
+            authority.observe(message)
+            return "observed"
+        case LeaseRequest():
+            answer = authority.on_lease(message, hal.now_ns)
+        case LifecycleRequest():
+            answer = authority.on_lifecycle(message, hal.now_ns)
+        case EstopRequest():
+            answer = authority.on_estop(message, hal.tick)
+        case _:
+            return "not for a HAL"
+    assert ANSWERS.decode(encode(answer), format_encoding(Answer)) == answer
+    return "yes" if answer.ok else "no"
+
+
+def pass_tick(hal: Rig) -> None:
+    """The end of a tick."""
+    hal.now_ns += PERIOD_NS // 4
+    hal.tick += 1
+    hal.authority.check_deadlines(hal.now_ns, hal.tick)
+    assert all(abs(target) <= 5.0 for target in hal.authority.decide().setpoints.target)
+
+
+def run(payloads: int, seed: int) -> Report:
+    """Raises whatever a decoder or the authority raises that it must not."""
+    maker, report = Maker(random.Random(seed)), Report()
+    decoders: dict[type[Message], Decoder[Any]] = {message: Decoder(message) for message in VERSIONS}
+    hal = armed()
+    for number in range(payloads):
+        if number % PER_ROBOT == 0:
+            hal = armed()
+        sample = maker.make()
+        outcomes = report.outcomes.setdefault(sample.kind, Counter())
+        try:
+            message = decoders[sample.message].decode(sample.payload, sample.encoding)
+        except WireError as error:
+            outcomes[error.reason] += 1
+            report.longest_reason = max(report.longest_reason, len(str(error)))
+            assert len(str(error)) <= LONGEST_REASON, f"a reason of {len(str(error))} characters: {str(error)[:200]}"
+        else:
+            assert type(message) is sample.message
+            outcomes["taken"] += 1
+            report.answers[f"{sample.message.__name__}: {taken(hal, message)}"] += 1
+        if number % PER_TICK == 0:
+            pass_tick(hal)
+        if (number + 1) % max(payloads // 10, 1) == 0:
+            now = vitals(os.getpid())
+            assert now is not None
+            report.resident_mb.append(now.resident_mb)
+    report.peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return report

@@ -1,0 +1,20 @@
+"""Damaged and forged recordings, into every command: some of what `make fuzz` tries."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from verification.fuzz.recordings import COMMANDS, DAMAGES, fuzz, table
+
+pytest.importorskip("viser", reason="needs the extra `console`")
+pytest.importorskip("pyarrow", reason="needs the extra `report`")
+PEAK_MB, CPU_S = 700, 20.0  # MuJoCo's renderer takes 260 MB; what a bomb may unpack to takes a few seconds
+
+
+@pytest.mark.slow
+def test_no_recording_harms_a_command_and_none_keeps_a_loss_to_itself(tmp_path: Path) -> None:
+    verdict = fuzz(tmp_path, copies=len(DAMAGES), seed=1, commands=2)
+    assert not verdict.violations, table(verdict)
+    assert verdict.codes.keys() == COMMANDS.keys() and verdict.peak_mb < PEAK_MB and verdict.longest_cpu_s < CPU_S
+    assert {0, 2, 3} <= sum((codes for codes in verdict.codes.values()), Counter[int]()).keys()

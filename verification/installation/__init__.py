@@ -1,0 +1,1 @@
+"""Installed from wheels, with and without extras."""

@@ -1,0 +1,192 @@
+"""Bad links between a robot and its controller, measured: `python -m verification.links [--write]`; needs root."""
+
+import argparse
+import os
+import platform
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
+from snakesim_operator.results.run_log import RunRecord
+from verification.links.lab import Lab, lab
+
+PAGE = Path(__file__).parents[2] / "docs" / "lab-links.md"
+ARMED_S = 10.0
+ARM_LIMIT_S = 20.0
+WRITTEN_S = 1.0  # until rows are on disk
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A link that is bad in one way, for as long as the robot is armed."""
+
+    name: str
+    loss: float = 0.0
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    rate_hz: int = 100
+
+
+# Each way, so that a round trip takes twice as long, and is lost about twice as often. A lease is longer at 50 Hz.
+CONDITIONS = (
+    Condition("good"),
+    Condition("1 % of packets lost", loss=0.01),
+    Condition("5 % of packets lost", loss=0.05),
+    Condition("5 +- 2.5 ms", delay_s=0.005, jitter_s=0.0025),
+    Condition("10 +- 5 ms", delay_s=0.01, jitter_s=0.005),
+    Condition("20 +- 10 ms", delay_s=0.02, jitter_s=0.01),
+    Condition("20 +- 10 ms, at 50 Hz", delay_s=0.02, jitter_s=0.01, rate_hz=50),
+    Condition("5 % of packets lost, at 50 Hz", loss=0.05, rate_hz=50),
+)
+
+
+def held(condition: Condition, trials: int) -> str:
+    """A line of the table: how long an armed robot keeps going, how fast, and what ends it."""
+    armed_s: list[float] = []
+    ended: list[str] = []
+    with tempfile.TemporaryDirectory() as folder, lab(Path(folder), f"rate_hz={condition.rate_hz}") as made:
+        made.link.make(loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s)
+        for _ in range(trials):
+            try:
+                made.arm(ARM_LIMIT_S)
+            except AssertionError:
+                armed_s.append(0.0)
+                ended.append("not armed")
+                continue
+            began = time.monotonic()
+            while time.monotonic() - began < ARMED_S and (status := made.status) and status.lifecycle == "armed":
+                time.sleep(0.001)
+            armed_s.append(time.monotonic() - began)
+            status = made.status
+            if status is not None and status.lifecycle == "fault":
+                ended.append(status.faults[0].what)
+            else:
+                made.disarm()
+        time.sleep(WRITTEN_S)
+        speed, latency = moved(Path(folder))
+    names = ", ".join(f"{name} {ended.count(name)}" for name in dict.fromkeys(ended)) or "-"
+    median_s, min_s = statistics.median(armed_s), min(armed_s)
+    kept = sum(seconds >= ARMED_S for seconds in armed_s)
+    return f"| {condition.name} | {kept} of {trials} | {median_s:.1f} | {min_s:.2f} | {names} | {speed} | {latency} |"
+
+
+def moved(folder: Path) -> tuple[str, str]:
+    """Speed while armed, and the time from state to command, as text."""
+    if not (folder / BLACK_BOX).is_file():
+        return "-", "-"
+    host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
+    record = RunRecord.load(folder)
+    steps_m = np.hypot(*np.diff(record.position_w[:, :2], axis=0).T)
+    steps_s = np.diff(record.time_s)
+    driven = (steps_s < 0.1) & np.isfinite(steps_m) & (np.abs(record.torque_nm[1:]).max(axis=1) > 0.05)
+    speed = steps_m[driven].sum() / max(steps_s[driven].sum(), 1e-9)
+    p50, p99 = (host.state_to_command_us[p] for p in ("p50", "p99"))
+    return f"{speed:.2f}", "-" if p50 is None or p99 is None else f"{p50 / 1000:.1f} / {p99 / 1000:.1f}"
+
+
+def event(name: str, trials: int, break_it: Callable[[Lab], None], mend: Callable[[Lab], None], broken_s: float) -> str:
+    """A line of the other table: until the robot has stopped, and from the repair until it is armed again."""
+    stopped_ms: list[float] = []
+    again_s: list[float] = []
+    with tempfile.TemporaryDirectory() as folder, lab(Path(folder)) as made:
+        for _ in range(trials):
+            made.arm()
+            time.sleep(1.0)
+            assert made.status is not None and made.status.lifecycle == "armed", made.status
+            began = time.monotonic()
+            break_it(made)
+            stopped_ms.append(1000 * made.until(lambda status: status.lifecycle == "fault", "stopped"))
+            time.sleep(max(broken_s - (time.monotonic() - began), 0.0))
+            mend(made)
+            again_s.append(made.arm())
+    stopped = f"{statistics.median(stopped_ms):.0f} / {max(stopped_ms):.0f}"
+    return f"| {name} | {trials} | {stopped} | {statistics.median(again_s):.2f} / {max(again_s):.2f} |"
+
+
+def events(trials: int) -> list[str]:
+    """What breaks, and is mended."""
+    cut, mend = (lambda made: made.link.make(cut=True)), (lambda made: made.link.make())
+    return [
+        event("link cut for 0.5 s", trials, cut, mend, 0.5),
+        event("link cut for 5 s; the machine rejoins", max(trials // 4, 1), cut, mend, 5.0),
+        event("router killed, and a new one started", trials, Lab.kill_router, Lab.start_router, 0.2),
+    ]
+
+
+def has_netem() -> bool:
+    """Whether this kernel has the queueing discipline `netem`."""
+    probe = ["unshare", "--net", "tc", "qdisc", "add", "dev", "lo", "root", "netem", "delay", "1ms"]
+    return subprocess.run(probe, capture_output=True, check=False).returncode == 0
+
+
+HEAD = """\
+# Bad links between a robot and its controller
+
+Written by `python -m verification.links --write --trials {trials}` (root) on {day};
+{cpus} cores, Linux {kernel}, load {load}.
+
+Three machines as network namespaces: the host of `triplet` at 100 Hz in real time with the simulator, a router,
+and guidance, navigation and control. The link between router and controller is bad. This kernel {netem}:
+the link is a pair of TAP interfaces with a process between them (`verification/links/relay.py`) that drops and delays
+Ethernet frames, **each way**, so that a round trip takes twice the delay. TCP runs unchanged above. Frames keep
+their order. The host is armed and watched over a socket pair, so nothing that happens to the network hides what
+the host does.
+All machines share the cores of one; host, controller, router and link run with real-time priority.
+
+## A link that is bad all the time
+
+How many of the trials lasted {armed:g} s, how long the robot stayed armed, and what ended it. A lease lasts 50
+ms at 100 Hz, and 100 ms at 50 Hz: a controller whose command comes later than that stops the robot, whatever
+the cause. One lost packet takes TCP at least the time of the next ones to notice, and often a timer of 200 ms.
+A delay of 20 +- 10 ms on one interface, as `netem` makes it, is about the round trip of the row 10 +- 5 ms.
+
+| link | lasted | armed, median s | shortest s | ended by | m/s while driven | state to command, p50 / p99 ms |
+|---|---|---|---|---|---|---|
+"""
+EVENTS = """
+## A link or a router that breaks, and comes back
+
+Until the host has stopped the robot, and from the repair until it is armed again (`reset`, then `arm`, by an operator
+who does not wait); median / worst.
+
+| what | trials | stopped after, ms | armed again after, s |
+|---|---|---|---|
+"""
+
+
+def main() -> None:
+    """Measure; print, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
+    parser.add_argument("--trials", type=int, default=20)
+    wanted = parser.parse_args()
+    head = HEAD.format(
+        trials=wanted.trials,
+        day=date.today(),
+        cpus=os.cpu_count(),
+        kernel=platform.release(),
+        armed=ARMED_S,
+        netem="has `netem`, but for the same link on every kernel" if has_netem() else "has no `netem`",
+        load=f"{os.getloadavg()[1]:.1f}",
+    )
+    lines: list[str] = []
+    for condition in CONDITIONS:
+        lines.append(held(condition, max(wanted.trials // 4, 1)))
+        print(lines[-1], flush=True)
+    happened = events(wanted.trials)
+    print("\n".join(happened))
+    if wanted.write:
+        PAGE.write_text(head + "\n".join(lines) + "\n" + EVENTS + "\n".join(happened) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,20 @@
+"""Hidden faults of emulated robots, one trial of each kind; `python -m verification.commissioning_trials` has more."""
+
+import pytest
+
+from verification.commissioning_trials import NONE, check_trial, identify_trials
+
+
+@pytest.mark.parametrize("fault", ["backlash", NONE])
+def test_a_hidden_fault_is_named_and_no_sound_joint_is_blamed_or_unknown(fault: str) -> None:
+    trial = check_trial(4, fault, modules=4, seconds=6.5)
+    assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
+    assert fault == NONE or trial.found, [row.summary for row in trial.rows]
+
+
+@pytest.mark.slow
+def test_backlash_spoils_no_values_of_other_joints() -> None:
+    named, unnamed = identify_trials(4, "duration_s=12", backlash=True)
+    assert named.named == [named.loose]
+    for trial in (named, unnamed):
+        assert trial.covered == trial.written and trial.constants_off == 0
