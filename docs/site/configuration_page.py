@@ -18,6 +18,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scene import SceneFile
 from snakesim_operator.features.evaluate.suite import Suite
 from snakesim_operator.features.lab.lab_file import LabFile
+from snakesim_operator.this_computer.scenario_keys import section_type
 
 PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
 INTRODUCTION = """# Configuration
@@ -67,7 +68,7 @@ def documented_structs() -> dict[str, type[msgspec.Struct]]:
         for name in list_installed(group):
             plugin = find_plugin(group, name)
             if plugin.__module__.startswith("snakesim_"):
-                structs[f"[{section}.{name}]"] = plugin.Settings
+                structs[f"[{section}.{name}]"] = section_type(plugin)
     return structs
 
 
@@ -95,8 +96,8 @@ def make_page() -> str:
                 continue
             path = f"{section}.{name}" if group != PHYSICS_MODELS else name
             title = f"`[{path}]`" if group != PHYSICS_MODELS else f"`{name}`"
-            lines += [f"### {title}", "", _first_paragraph(plugin.Settings), "", *_table(plugin.Settings)]
-            lines += _inner_tables(plugin.Settings, path)
+            lines += [f"### {title}", "", _first_paragraph(section_type(plugin)), "", *_table(section_type(plugin))]
+            lines += _inner_tables(section_type(plugin), path)
     text = "\n".join(lines)
     while "\n\n\n" in text:
         text = text.replace("\n\n\n", "\n\n")

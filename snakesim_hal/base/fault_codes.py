@@ -153,5 +153,5 @@ REFUSAL_CODES = {
     "cannot": ErrorCode("This fault cannot be injected here.", "The backend does not support it.", "Use another one."),
     "wrong_part": ErrorCode("Another process carries this fault out.", "A wrong key.", "Send it to that process."),
     "wrong_controller": ErrorCode("Another controller runs.", "A different run.", "Read the present parameters."),
-    "bad_settings": ErrorCode("The controller refuses the parameters.", "A wrong value.", "See the answer's reason."),
+    "bad_parameters": ErrorCode("The controller refuses the parameters.", "A wrong value.", "See the answer's reason."),
 }

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
+from snakesim_hal.controller import Controller, decode_parameters
 from snakesim_hal.model.field_docs import FieldDoc, document_fields
 from snakesim_hal.model.field_types import alternatives
 from snakesim_hal.model.field_words import item_types
@@ -94,7 +95,7 @@ def _keys_of_physics_model(model: str, values: Any, name: str) -> Iterator[Key]:
         yield from _keys_not_checked(values, name)
         return
     checked = plugin_settings(plugin, values, "the scenario", name)
-    yield from _keys_of_struct(plugin.Settings, msgspec.to_builtins(checked), f"{name}.")
+    yield from _keys_of_struct(section_type(plugin), msgspec.to_builtins(checked), f"{name}.")
 
 
 def _keys_inside(info: inspect.Type, value: Any, name: str, *, is_pattern: bool = False) -> Iterator[Key]:
@@ -162,7 +163,7 @@ def _keys_of_plugins(loaded: Loaded, section: str, group: str, named: str) -> It
             yield Key(key, replace(ANY_VALUE, name=name, type_words="table"), values)
             yield from _keys_not_checked(values, key)
             continue
-        description = (plugin.Settings.__doc__ or "").partition("\n")[0]
+        description = (section_type(plugin).__doc__ or "").partition("\n")[0]
         yield Key(key, replace(ANY_VALUE, name=name, type_words="table", description=description), values)
         yield from _keys_of_settings(loaded, plugin, values, key)
 
@@ -174,9 +175,25 @@ def _name_in(named: str, section: str) -> list[str]:
 
 
 def _keys_of_settings(loaded: Loaded, plugin: Any, given: dict[str, Any], section: str) -> Iterator[Key]:
-    required = [doc.name for doc in document_fields(plugin.Settings) if doc.default is None]
+    required = [doc.name for doc in document_fields(section_type(plugin)) if doc.default is None]
     if all(name in given for name in required):
-        checked = plugin_settings(plugin, given, loaded.table.source, section, loaded.table.origin)
-        yield from _keys_of_struct(plugin.Settings, msgspec.to_builtins(checked), f"{section}.")
+        checked = _check_section(plugin, given, loaded, section)
+        yield from _keys_of_struct(section_type(plugin), msgspec.to_builtins(checked), f"{section}.")
     else:  # of a plugin that the scenario does not use
-        yield from _keys_of_struct(plugin.Settings, given, f"{section}.")
+        yield from _keys_of_struct(section_type(plugin), given, f"{section}.")
+
+
+def section_type(plugin: Any) -> type[msgspec.Struct]:
+    """Return the Struct of a plugin's section: the parameters of a controller, or the settings of another plugin."""
+    if isinstance(plugin, type) and issubclass(plugin, Controller):
+        return plugin.Parameters
+    return plugin.Settings
+
+
+def _check_section(plugin: Any, given: dict[str, Any], loaded: Loaded, section: str) -> msgspec.Struct:
+    """Return the decoded section of a plugin. Raises ConfigError for a wrong value."""
+    source = loaded.table.source
+    origin = loaded.table.origin
+    if isinstance(plugin, type) and issubclass(plugin, Controller):
+        return decode_parameters(plugin, given, source, section, origin)
+    return plugin_settings(plugin, given, source, section, origin)

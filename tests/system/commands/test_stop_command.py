@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
-from snakesim_hal.base.errors import RefusedError
+import pytest
+
+from snakesim_hal.base.errors import ConfigError, RefusedError
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
 from snakesim_operator.base.targets import RobotSelection
+from snakesim_operator.cli import main
 from snakesim_operator.robot_commands import command, stop
 from snakesim_testing.hal.local_network import Follower, following, running
 from snakesim_testing.hal.small_robots import run_config
@@ -49,3 +52,11 @@ def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
             with raises_error(RefusedError, code="robot/not-confirmed"):
                 command.disarm(RobotSelection(run.link.endpoint, "lab/other"))
         assert run.status.lifecycle == "armed"
+
+
+def test_an_emergency_stop_looks_up_no_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_group: str) -> list[str]:
+        raise ConfigError("entry points were looked up")
+
+    monkeypatch.setattr("snakesim_hal.model.plugins.list_installed", refuse)
+    assert main(["estop", "--endpoint", "tcp/127.0.0.1:9"]) == 1

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import pytest
 
 from docs.site.commands_page import PAGE, make_page
-from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import COMMANDS, list_installed, offer_plugin
 from snakesim_hal.programs.commands import Command, Noun
 from snakesim_operator.cli import CommandParser, MainParser, find_subparsers, main, make_parser
@@ -133,11 +132,3 @@ def test_a_command_without_its_noun_is_reported_and_the_others_work(
         parser.add_installed()
     assert "no Noun 'arm_rest' is registered" in capsys.readouterr().err
     assert isinstance(parser, CommandParser) and parser.has_command(["robot", "check"])
-
-
-def test_an_emergency_stop_looks_up_no_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_group: str) -> list[str]:
-        raise ConfigError("entry points were looked up")
-
-    monkeypatch.setattr("snakesim_hal.model.plugins.list_installed", refuse)
-    assert main(["estop", "--endpoint", "tcp/127.0.0.1:9"]) == 1

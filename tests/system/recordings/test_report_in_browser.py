@@ -6,10 +6,15 @@ import pytest
 
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.operator.browser import CHROMIUM, MISSING, chromium
-from snakesim_testing.operator.recorded_triplet import Reader, read
+from snakesim_testing.operator.recorded_triplet import Reader, read, triplet
 
 DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
 OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return triplet()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
