@@ -1,10 +1,11 @@
 """Measured ratios: each compares SnakeSIM with the least that could do the same job, in one run, on one machine.
 
-`python -m benchmarks` prints them all; absolute times on a shared machine mean little, so medians of ratios are quoted.
+`python -m benchmarks` prints all of them. Absolute times on a shared machine mean little, so the table quotes medians
+of ratios.
 """
 
 from snakesim_hal.base.arithmetic import pin
 
-pin()  # before NumPy: so that a run in this process stays in it, where it can be measured
+pin()  # before NumPy is imported: a run in this process then stays on one thread, where it can be measured
 
 import snakesim_testing.isolation  # noqa: E402, F401 - latched stops and lists of robots stay apart from the user's

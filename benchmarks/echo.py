@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import zenoh
 
@@ -14,74 +15,99 @@ from snakesim_testing.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 BLOCK = zenoh.CongestionControl.BLOCK
+CONNECT_TIMEOUT_MS = 10000
+START_TIMEOUT_S = 20.0  # for the other process to import Zenoh and to connect
+ECHO_ROUNDS = 2000
 
 
-def _config(endpoint: str, *, listen: bool) -> zenoh.Config:
-    return zenoh.Config.from_json5(
-        json.dumps(
-            {
-                "mode": "router" if listen else "client",
-                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-                "listen": {"endpoints": [endpoint] if listen else []},
-                "connect": {"endpoints": [] if listen else [endpoint], "timeout_ms": 10000},
-            }
-        )
-    )
-
-
-def publisher_of(session: zenoh.Session, key: str, congestion: zenoh.CongestionControl = BLOCK) -> zenoh.Publisher:
-    """Of what nothing else is as urgent as."""
+def declare_publisher(session: zenoh.Session, key: str, congestion: zenoh.CongestionControl = BLOCK) -> zenoh.Publisher:
+    """Declare a publisher with the highest priority, as SnakeSIM's own publishers of state and commands have it."""
     return session.declare_publisher(
         key, express=True, priority=zenoh.Priority.REAL_TIME, congestion_control=congestion
     )
 
 
-def answer(session: zenoh.Session, reply: bytes, congestion: zenoh.CongestionControl = BLOCK) -> None:
-    """Answer every request, until somebody ends this process."""
-    publisher = publisher_of(session, REPLY, congestion)
+def answer_requests(session: zenoh.Session, reply: bytes, congestion: zenoh.CongestionControl = BLOCK) -> None:
+    """Send the reply for every request, until the process is killed."""
+    publisher = declare_publisher(session, REPLY, congestion)
     requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))  # a temporary one would be closed
     for _ in requests:
         publisher.put(reply)
 
 
-def echo_us(request: bytes, reply: bytes, rounds: int = 2000, period_s: float = 0.0) -> float:
-    """Median round trip of `request` one way and `reply` back, in microseconds; one every `period_s`."""
-    return statistics.median(echo_times_us(request, reply, rounds, period_s))
+def measure_echo_us(request: bytes, reply: bytes, rounds: int = ECHO_ROUNDS, period_s: float = 0.0) -> float:
+    """Return the median round trip of `measure_echo_times_us`."""
+    return statistics.median(measure_echo_times_us(request, reply, rounds, period_s))
 
 
-def echo_times_us(
+def measure_echo_times_us(
     request: bytes, reply: bytes, rounds: int, period_s: float, prefix: Sequence[str] = ()
 ) -> list[float]:
-    """Every round trip. prefix: of the command that starts the other process."""
+    """Measure round trips to another process, in µs.
+
+    Args:
+        request: the bytes on the way there.
+        reply: bytes on the way back; only their number counts.
+        rounds: number of round trips.
+        period_s: time between two requests; 0.0: each follows the reply to the one before.
+        prefix: words before the command that starts the other process, such as `chrt -f 40`.
+
+    Raises:
+        TimeoutError: the other process does not answer.
+    """
     endpoint = free_endpoint()
-    with zenoh.open(_config(endpoint, listen=True)) as session:
-        publisher = publisher_of(session, REQUEST)
+    with zenoh.open(_make_zenoh_config(endpoint, listen=True)) as session:
+        publisher = declare_publisher(session, REQUEST)
         replies = session.declare_subscriber(REPLY, zenoh.handlers.RingChannel(4))
         command = python_command("-m", "benchmarks.echo", endpoint, str(len(reply)))
-        other = subprocess.Popen([*prefix, *command], env=child_environment())
+        echo_process = subprocess.Popen([*prefix, *command], env=child_environment())
         try:
-            deadline = time.monotonic() + 20
-            while replies.try_recv() is None:  # until the other side answers
-                if time.monotonic() > deadline:
-                    raise TimeoutError("the echo process does not answer")
-                publisher.put(request)
-                time.sleep(0.01)
-            time.sleep(0.1)
-            while replies.try_recv() is not None:
-                pass
-            times: list[float] = []
+            _wait_for_first_reply(publisher, replies, request)
+            times_us: list[float] = []
             for _ in range(rounds):
-                begin = time.perf_counter()
+                begin_s = time.perf_counter()
                 publisher.put(request)
                 replies.recv()
-                times.append((time.perf_counter() - begin) * 1e6)
-                time.sleep(max(begin + period_s - time.perf_counter(), 0.0))
+                times_us.append((time.perf_counter() - begin_s) * 1e6)
+                time.sleep(max(begin_s + period_s - time.perf_counter(), 0.0))
         finally:
-            other.kill()
-            other.wait()
-    return times
+            echo_process.kill()
+            echo_process.wait()
+    return times_us
+
+
+def _make_zenoh_config(endpoint: str, *, listen: bool) -> zenoh.Config:
+    """Return the configuration of a session that listens at the endpoint, or of one that connects to it."""
+    if listen:
+        mode = "router"
+        listen_endpoints = [endpoint]
+        connect_endpoints = []
+    else:
+        mode = "client"
+        listen_endpoints = []
+        connect_endpoints = [endpoint]
+    settings = {
+        "mode": mode,
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "listen": {"endpoints": listen_endpoints},
+        "connect": {"endpoints": connect_endpoints, "timeout_ms": CONNECT_TIMEOUT_MS},
+    }
+    return zenoh.Config.from_json5(json.dumps(settings))
+
+
+def _wait_for_first_reply(publisher: zenoh.Publisher, replies: Any, request: bytes) -> None:
+    """Repeat the request until the other process answers, and drop the replies to the repetitions."""
+    deadline_s = time.monotonic() + START_TIMEOUT_S
+    while replies.try_recv() is None:
+        if time.monotonic() > deadline_s:
+            raise TimeoutError("the echo process does not answer")
+        publisher.put(request)
+        time.sleep(0.01)
+    time.sleep(0.1)
+    while replies.try_recv() is not None:
+        pass
 
 
 if __name__ == "__main__":
-    with zenoh.open(_config(sys.argv[1], listen=False)) as joined:
-        answer(joined, bytes(int(sys.argv[2])))
+    with zenoh.open(_make_zenoh_config(sys.argv[1], listen=False)) as client_session:
+        answer_requests(client_session, bytes(int(sys.argv[2])))

@@ -1,6 +1,7 @@
 """`python -m benchmarks.environments [--write]`: environments beside bare physics and Gymnasium's Swimmer, in a table.
 
-Each number is a median over rounds in which all of them are taken in turn, each ratio that of the ratios of a round.
+Each number is a median over rounds, in which all measurements are taken in turn. Each ratio is the median of the
+ratios of the rounds.
 """
 
 import argparse
@@ -11,6 +12,7 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +28,15 @@ from snakesim_hal.wire.messages import Mode
 
 RESULTS = Path(__file__).parent / "ENVIRONMENTS.md"
 SCENARIOS = ("peg_row", "surveyed_clutter", "mamba_flat", "mamba_hills")
-OF_JOINTS = {"observe": ("angle_rad", "velocity_rad_s", "torque_nm"), "new_field": False, "duration": 3600}
-SKIP = 5  # ticks in a step: 50 ms of robot time; that of Swimmer is 40 ms
-ROUNDS, ROUND_S, TOGETHER_S = 5, 0.5, 1.5
-CORES, MANY = 2, 8  # processors, and environments on them
+JOINT_OBSERVATIONS = {"observe": ("angle_rad", "velocity_rad_s", "torque_nm"), "new_field": False, "duration": 3600}
+FRAME_SKIP = 5  # ticks in a step: 50 ms of robot time; a step of Swimmer has 40 ms
+ROUNDS = 5
+SINGLE_ROUND_S = 0.5  # of one environment on one core
+PARALLEL_ROUND_S = 1.5  # of several processes
+CORES = 2
+VECTOR_SIZE = 8  # environments on these cores
 Step = Callable[[], Any]
-ABOUT = """\
+INTRODUCTION = """\
 Printed by `python -m benchmarks.environments` on {machine}, Python {python}, a shared machine: read the ratios. A step
 is 50 ms of robot time, 5 ticks with 5 physics steps in each; observations are of the joints, and no resets are counted.
 *Physics* is `mj_step` with our law of flat ground, which is Python in every physics step. *Bare* is `mj_step` without
@@ -40,172 +45,242 @@ cores.
 """
 
 
-class Wave:
-    """Targets of a travelling wave."""
+class TravelingWave:
+    """Joint targets of a traveling wave."""
 
     def __init__(self, joints: int) -> None:
-        self._lag_rad, self._k = 0.9 * np.arange(joints)[::-1], 0
+        self._lag_rad = 0.9 * np.arange(joints)[::-1]
+        self._step = 0
 
-    def next(self) -> np.ndarray:
-        """Those of the next step, (joints,)."""
-        self._k += 1
-        return 0.3 * np.sin(np.pi * 0.05 * self._k - self._lag_rad)
+    def next_target_rad(self) -> np.ndarray:
+        """Return the joint targets of the next step, (joints,)."""
+        self._step += 1
+        return 0.3 * np.sin(np.pi * 0.05 * self._step - self._lag_rad)
 
 
-def environment(scenario: str, **more: Any) -> Step:
-    """A step of an environment, whose episode does not end."""
-    env = SnakeEnv(scenario, frame_skip=SKIP, **OF_JOINTS, **more)
-    wave = Wave(len(env.action_names))
+def make_environment_step(scenario: str, **options: Any) -> Step:
+    """Return a function that makes one step of an environment whose episode does not end."""
+    env = SnakeEnv(scenario, frame_skip=FRAME_SKIP, **JOINT_OBSERVATIONS, **options)
+    wave = TravelingWave(len(env.action_names))
     env.reset(seed=1)
-    return lambda: env.step(wave.next())
+    return lambda: env.step(wave.next_target_rad())
 
 
-def physics(scenario: str, *, ground: bool) -> Step:
-    """The same without sensors, limiter and rewards. ground: with our law of flat ground, else `mj_step` alone."""
+def make_physics_step(scenario: str, *, ground: bool) -> Step:
+    """Return a function that makes the same step without sensors, command limiter and rewards.
+
+    Args:
+        scenario: name of the scenario.
+        ground: whether our law of flat ground is computed; otherwise the step is `mj_step` alone.
+    """
     config = load(scenario).config
-    backend, joints = open_simulator(config), config.robot.chain.modules
-    modes, full_nm = [Mode.POSITION] * joints, [config.robot.limits.torque_nm] * joints
-    wave, steps = Wave(joints), backend.sim.steps_per_tick
+    backend = open_simulator(config)
+    joints = config.robot.chain.modules
+    modes = [Mode.POSITION] * joints
+    limits_nm = [config.robot.limits.torque_nm] * joints
+    wave = TravelingWave(joints)
+    steps_per_tick = backend.sim.steps_per_tick
 
     def step() -> None:
-        backend.enact(SafeSetpoints(modes, wave.next().tolist(), full_nm), "armed")
-        for _ in range(SKIP):
+        backend.enact(SafeSetpoints(modes, wave.next_target_rad().tolist(), limits_nm), "armed")
+        for _ in range(FRAME_SKIP):
             if ground:
-                backend.physics.step(steps)
+                backend.physics.step(steps_per_tick)
             else:
-                mujoco.mj_step(backend.sim.model, backend.data, steps)
+                mujoco.mj_step(backend.sim.model, backend.data, steps_per_tick)
 
     return step
 
 
-def swimmer() -> Step:
-    """Gymnasium's own: two joints and a body in a plane."""
+def make_swimmer_step() -> Step:
+    """Return a function that makes one step of Gymnasium's Swimmer: two joints and a body in a plane."""
     env = gymnasium.make("Swimmer-v5").unwrapped
     env.reset(seed=1)
     action = np.array([0.3, -0.3], dtype=np.float32)
     return lambda: env.step(action)
 
 
-def steps_per_s(step: Step, seconds: float, clock: Callable[[], float] = time.process_time) -> float:
-    """How often a step is made in a second of the clock."""
-    count, begun = 0, clock()
-    while (spent := clock() - begun) < seconds:
+def measure_steps_per_s(step: Step, seconds: float, clock: Callable[[], float] = time.process_time) -> float:
+    """Repeat a step, and return the number of steps in a second of the clock.
+
+    Args:
+        step: makes one step.
+        seconds: how long to repeat it, by the clock.
+        clock: returns a time in s; processor time of this process unless given.
+    """
+    count = 0
+    begin_s = clock()
+    while (elapsed_s := clock() - begin_s) < seconds:
         step()
         count += 1
-    return count / spent
+    return count / elapsed_s
 
 
-def cpu_s(process: int) -> float:
-    """Processor time of a process so far."""
-    words = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+def read_cpu_s(process: int) -> float:
+    """Return the processor time that a process has used so far, in s."""
+    stat = Path(f"/proc/{process}/stat").read_text(encoding="utf-8")
+    fields = stat.rpartition(")")[2].split()  # those after the program's name, which may hold spaces
+    user_ticks = int(fields[11])
+    system_ticks = int(fields[12])
+    return (user_ticks + system_ticks) / os.sysconf("SC_CLK_TCK")
 
 
-def vector(scenario: str) -> tuple[float, float]:
-    """Steps of all environments of a vector: per second of the wall clock, and per second of all its processes."""
+def measure_vector(scenario: str) -> tuple[float, float]:
+    """Measure a vector of environments in several processes.
+
+    Returns:
+        Steps of all environments together: per second of wall time, and per second of processor time.
+    """
     envs = gymnasium.make_vec(
         "snakesim.environments:SnakeSIM/Scenario-v0",
-        num_envs=MANY,
+        num_envs=VECTOR_SIZE,
         scenario=scenario,
-        frame_skip=SKIP,
-        **OF_JOINTS,
+        frame_skip=FRAME_SKIP,
+        **JOINT_OBSERVATIONS,
     )
     shape = envs.action_space.shape
     assert shape is not None
-    processes = [os.getpid(), *(child.pid for child in multiprocessing.active_children() if child.pid)]
-    wave = Wave(shape[-1])
+    processes = [os.getpid()]
+    processes += [child.pid for child in multiprocessing.active_children() if child.pid]
+    wave = TravelingWave(shape[-1])
     envs.reset(seed=1)
-    before_s, begun = sum(map(cpu_s, processes)), time.perf_counter()
-    rate = steps_per_s(lambda: envs.step(np.broadcast_to(wave.next(), shape)), TOGETHER_S, time.perf_counter)
-    wall_s, spent_s = time.perf_counter() - begun, sum(map(cpu_s, processes)) - before_s
+
+    def step() -> None:
+        envs.step(np.broadcast_to(wave.next_target_rad(), shape))
+
+    cpu_before_s = sum(map(read_cpu_s, processes))
+    begin_s = time.perf_counter()
+    vector_steps_per_s = measure_steps_per_s(step, PARALLEL_ROUND_S, time.perf_counter)
+    wall_s = time.perf_counter() - begin_s
+    cpu_s = sum(map(read_cpu_s, processes)) - cpu_before_s
     envs.close()
-    return MANY * rate, MANY * rate * wall_s / spent_s
+    steps_per_s = VECTOR_SIZE * vector_steps_per_s
+    return steps_per_s, steps_per_s * wall_s / cpu_s
 
 
-def physics_for(scenario: str, ground: bool) -> float:
-    """In a process of its own."""
-    return steps_per_s(physics(scenario, ground=ground), TOGETHER_S, time.perf_counter)
+def measure_physics(scenario: str, ground: bool) -> float:
+    """Return the steps of the physics per second of wall time, on one core. Runs in a worker process."""
+    return measure_steps_per_s(make_physics_step(scenario, ground=ground), PARALLEL_ROUND_S, time.perf_counter)
 
 
-def physics_together(scenario: str, *, ground: bool) -> float:
-    """Steps per second of the wall clock, of a process a core together."""
+def measure_parallel_physics(scenario: str, *, ground: bool) -> float:
+    """Return the steps of the physics per second of wall time, of one process a core together."""
     with ProcessPoolExecutor(CORES) as pool:
-        return sum(pool.map(physics_for, [scenario] * CORES, [ground] * CORES))
+        return sum(pool.map(measure_physics, [scenario] * CORES, [ground] * CORES))
 
 
-def medians(rounds: list[list[float]]) -> list[float]:
-    """Of each column."""
+def compute_column_medians(rounds: list[list[float]]) -> list[float]:
+    """Return the median of each column."""
     return [statistics.median(column) for column in zip(*rounds, strict=True)]
 
 
-def ratio(rounds: list[list[float]], ours: int, theirs: int) -> str:
-    """Of two columns, round by round."""
-    return f"{statistics.median(of[ours] / of[theirs] for of in rounds):.2f}"
+def format_ratio(rounds: list[list[float]], ours: int, theirs: int) -> str:
+    """Return the median ratio of two columns, which is taken round by round."""
+    return f"{statistics.median(values[ours] / values[theirs] for values in rounds):.2f}"
 
 
-def row(scenario: str) -> str:
-    """One scenario, on one core and on two."""
+def format_scenario_row(scenario: str) -> str:
+    """Measure one scenario on one core and on two, and return its row of the table."""
     steps = [
-        environment(scenario),
-        environment(scenario, safe=False),
-        physics(scenario, ground=True),
-        physics(scenario, ground=False),
+        make_environment_step(scenario),
+        make_environment_step(scenario, safe=False),
+        make_physics_step(scenario, ground=True),
+        make_physics_step(scenario, ground=False),
     ]
-    alone = [[steps_per_s(step, ROUND_S) for step in steps] for _ in range(ROUNDS)]
-    both = [
-        [*vector(scenario), *(physics_together(scenario, ground=ground) for ground in (True, False))]
-        for _ in range(ROUNDS)
-    ]
-    ours, unsafe, law, bare = medians(alone)
-    wall, cpu, *_ = medians(both)
+    one_core: list[list[float]] = []  # a row for each round, a column for each of the steps
+    for _ in range(ROUNDS):
+        one_core.append([measure_steps_per_s(step, SINGLE_ROUND_S) for step in steps])
+    two_cores: list[list[float]] = []
+    for _ in range(ROUNDS):
+        wall_rate, cpu_rate = measure_vector(scenario)
+        physics_rate = measure_parallel_physics(scenario, ground=True)
+        bare_rate = measure_parallel_physics(scenario, ground=False)
+        two_cores.append([wall_rate, cpu_rate, physics_rate, bare_rate])
+    environment, without_limiter, physics, bare = compute_column_medians(one_core)
+    vector_wall, vector_cpu, *_ = compute_column_medians(two_cores)
     return (
-        f"| `{scenario}` | {ours:.0f} | {unsafe:.0f} | {law:.0f} | {bare:.0f} | {ratio(alone, 0, 2)} | "
-        f"{ratio(alone, 0, 3)} | {cpu:.0f} | {wall:.0f} | {ratio(both, 0, 2)} | {ratio(both, 0, 3)} |"
+        f"| `{scenario}` | {environment:.0f} | {without_limiter:.0f} | {physics:.0f} | {bare:.0f} | "
+        f"{format_ratio(one_core, 0, 2)} | {format_ratio(one_core, 0, 3)} | {vector_cpu:.0f} | {vector_wall:.0f} | "
+        f"{format_ratio(two_cores, 0, 2)} | {format_ratio(two_cores, 0, 3)} |"
     )
 
 
-def per_freedom() -> list[str]:
-    """Rows that compare with Swimmer: a step of the solver, and a second of robot time, times degrees of freedom."""
-    config = load(SCENARIOS[0]).config
-    model, theirs = open_simulator(config).sim, gymnasium.make("Swimmer-v5").unwrapped
-    each = [
-        (SCENARIOS[0], environment(SCENARIOS[0]), model.model.nv, SKIP * model.steps_per_tick, SKIP / config.rate_hz),
-        ("Swimmer-v5", swimmer(), theirs.model.nv, theirs.frame_skip, theirs.dt),  # pyright: ignore
+@dataclass(frozen=True)
+class ComparedEnvironment:
+    """An environment in the table that compares with Swimmer."""
+
+    name: str
+    step: Step
+    degrees_of_freedom: int
+    physics_steps: int  # in one step
+    step_s: float  # robot time of one step
+
+
+def format_rows_per_degree_of_freedom() -> list[str]:
+    """Measure the first scenario and Gymnasium's Swimmer, and return their rows.
+
+    The columns are comparable because they count physics steps, and seconds of robot time, times degrees of freedom.
+    """
+    scenario = SCENARIOS[0]
+    config = load(scenario).config
+    sim = open_simulator(config).sim
+    swimmer: Any = gymnasium.make("Swimmer-v5").unwrapped
+    compared = [
+        ComparedEnvironment(
+            name=scenario,
+            step=make_environment_step(scenario),
+            degrees_of_freedom=sim.model.nv,
+            physics_steps=FRAME_SKIP * sim.steps_per_tick,
+            step_s=FRAME_SKIP / config.rate_hz,
+        ),
+        ComparedEnvironment(
+            name="Swimmer-v5",
+            step=make_swimmer_step(),
+            degrees_of_freedom=swimmer.model.nv,
+            physics_steps=swimmer.frame_skip,
+            step_s=swimmer.dt,
+        ),
     ]
-    rounds = [[steps_per_s(step, ROUND_S) for _, step, *_ in each] for _ in range(ROUNDS)]
-    return [
-        f"| `{name}` | {freedoms} | {rate:.0f} | {solver} | {rate * solver * freedoms / 1e3:.0f} | "
-        f"{rate * robot_s * freedoms:.0f} |"
-        for (name, _, freedoms, solver, robot_s), rate in zip(each, medians(rounds), strict=True)
-    ]
+    rounds: list[list[float]] = []
+    for _ in range(ROUNDS):
+        rounds.append([measure_steps_per_s(environment.step, SINGLE_ROUND_S) for environment in compared])
+    rows: list[str] = []
+    for environment, rate in zip(compared, compute_column_medians(rounds), strict=True):
+        freedoms = environment.degrees_of_freedom
+        rows.append(
+            f"| `{environment.name}` | {freedoms} | {rate:.0f} | {environment.physics_steps} | "
+            f"{rate * environment.physics_steps * freedoms / 1e3:.0f} | {rate * environment.step_s * freedoms:.0f} |"
+        )
+    return rows
 
 
 def main() -> int:
     """Print every line as soon as it is known."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help=f"keep the table in {RESULTS.name}")
-    write = parser.parse_args().write
-    text: list[str] = []
+    arguments = parser.parse_args()
+    lines: list[str] = []
 
-    def say(line: str) -> None:
+    def report(line: str) -> None:
         print(line, flush=True)
-        text.append(line)
+        lines.append(line)
 
-    say("# Environments: steps per second\n")
-    say(ABOUT.format(machine=platform.machine(), python=platform.python_version()))
-    one, two = "steps per CPU s | without limiter | physics | bare", "vector of 8, per CPU s | per s"
-    say(f"| scenario | {one} | of physics | of bare | {two} | of physics | of bare |")
-    say("|---|---|---|---|---|---|---|---|---|---|---|")
+    report("# Environments: steps per second\n")
+    report(INTRODUCTION.format(machine=platform.machine(), python=platform.python_version()))
+    one_core = "steps per CPU s | without limiter | physics | bare | of physics | of bare"
+    two_cores = f"vector of {VECTOR_SIZE}, per CPU s | per s | of physics | of bare"
+    report(f"| scenario | {one_core} | {two_cores} |")
+    report("|---|---|---|---|---|---|---|---|---|---|---|")
     for scenario in SCENARIOS:
-        say(row(scenario))
-    say("\nPer degree of freedom, beside Gymnasium's swimmer (no limiter, noise, obstacles or motors), per CPU s:\n")
+        report(format_scenario_row(scenario))
+    report("\nPer degree of freedom, beside Gymnasium's swimmer (no limiter, noise, obstacles or motors), per CPU s:\n")
     columns = "degrees of freedom | steps | physics steps in each | 1000 physics steps x freedoms | robot s x freedoms"
-    say(f"| environment | {columns} |")
-    say("|---|---|---|---|---|---|")
-    for line in per_freedom():
-        say(line)
-    if write:
-        RESULTS.write_text("\n".join(text) + "\n", encoding="utf-8")
+    report(f"| environment | {columns} |")
+    report("|---|---|---|---|---|---|")
+    for row in format_rows_per_degree_of_freedom():
+        report(row)
+    if arguments.write:
+        RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.forces`: every controller in the case study, and why solved forces do not come true."""
+"""`python -m benchmarks.forces`: every controller in the case study, and why desired and measured forces differ."""
 
 import sys
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -18,117 +19,144 @@ from snakesim_testing.hal.small_robots import clock, command
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.runs.whole_run import run as run_in_process
 
-TICKS_A_BLOCK = 50
+TICKS_A_BLOCK = 50  # measured in one go, before the next kind of measurement has its turn
+LONG_NUMBER = 10**6  # a tick and sequence number of a run of some hours: it takes more bytes than 0
 
 
-def config_of(*sets: str) -> RunConfig:
-    """The scenario that is measured, with `--set` texts."""
+def load_config(*sets: str) -> RunConfig:
+    """Load the scenario that is measured, changed by texts as of `--set`."""
     return load("triplet", [parse_set(text) for text in sets]).config
 
 
 def open_simulator(config: RunConfig) -> SimBackend:
-    """As the host opens it."""
+    """Open the simulator as the host opens it."""
     settings = plugin_settings(SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim")
     return SimBackend(config, settings)
 
 
-class Publishing:
-    """What the host does with samples, and nothing else."""
+class SamplePublisher:
+    """Publishes samples and the clock as the host does, and does nothing else."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._publishers: dict[str, Publisher[JointCommand]] = {}
 
-    def put(self, tick: int, samples: Samples) -> None:
+    def publish(self, tick: int, samples: Samples) -> None:
         """Publish every sample and the clock."""
-        now = clock(tick, arm_session=1, clock_mode="free", newest=dict.fromkeys(samples.others, tick))
+        newest = dict.fromkeys(samples.others, tick)
+        now = clock(tick, arm_session=1, clock_mode="free", newest=newest)
         for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, now)):
             if key not in self._publishers:
                 self._publishers[key] = self._session.publisher(key, type(message))  # pyright: ignore
             self._publishers[key].put(message)  # pyright: ignore
 
 
-class BareLoop:
-    """The same motion on the same model, computed by the physics alone."""
+class BareSimulation:
+    """Repeats a motion on the same model, by the physics alone."""
 
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
 
-    def tick_us(self, points: Sequence[SafeSetpoints]) -> float:
-        """Mean time of a control period over these setpoints; handing them over is not counted."""
-        physics, steps = self._backend.physics, self._backend.sim.steps_per_tick
-        spent = 0.0
-        for now in points:
-            self._backend.enact(now, "armed")
-            begin = time.perf_counter()
+    def measure_physics_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
+        """Return the mean time of a control period over these setpoints, without the handing over of setpoints."""
+        physics = self._backend.physics
+        steps = self._backend.sim.steps_per_tick
+        spent_s = 0.0
+        for tick_setpoints in setpoints:
+            self._backend.enact(tick_setpoints, "armed")
+            begin_s = time.perf_counter()
             physics.step(steps)
-            spent += time.perf_counter() - begin
-        return spent / len(points) * 1e6
+            spent_s += time.perf_counter() - begin_s
+        return spent_s / len(setpoints) * 1e6
 
-    def mujoco_us(self, points: Sequence[SafeSetpoints]) -> float:
-        """The same for `mj_step`, from the states of that motion: without ground and friction, which are ours."""
-        model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
-        whole = mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(model, whole))
-        spent = 0.0
-        for now in points:
-            self._backend.enact(now, "armed")
-            mujoco.mj_getState(model, data, state, whole)
-            begin = time.perf_counter()
+    def measure_mujoco_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
+        """Return the mean time of `mj_step` for a control period, from the states of the same motion.
+
+        `mj_step` alone leaves out our ground and friction, so each period is first measured, then reset to its
+        beginning and done again with them.
+        """
+        model = self._backend.sim.model
+        data = self._backend.data
+        steps = self._backend.sim.steps_per_tick
+        state_kind = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(model, state_kind))
+        spent_s = 0.0
+        for tick_setpoints in setpoints:
+            self._backend.enact(tick_setpoints, "armed")
+            mujoco.mj_getState(model, data, state, state_kind)
+            begin_s = time.perf_counter()
             for _ in range(steps):
                 mujoco.mj_step(model, data)
-            spent += time.perf_counter() - begin
-            mujoco.mj_setState(model, data, state, whole)
+            spent_s += time.perf_counter() - begin_s
+            mujoco.mj_setState(model, data, state, state_kind)
             self._backend.physics.step(steps)
-        return spent / len(points) * 1e6
+        return spent_s / len(setpoints) * 1e6
 
 
-def motion(config: RunConfig) -> tuple[list[SafeSetpoints], float]:
-    """Every setpoint of a run of the scenario, and the mean µs of the controller alone; all in this process."""
-    whole = run_in_process(config)
-    limits = [joint.torque_limit_nm for joint in whole.record.description.joints]
-    points = [
-        SafeSetpoints([Mode(code) for code in mode], target, limits)
-        for mode, target in zip(whole.record.mode.tolist(), whole.record.target.tolist(), strict=True)
-    ]
-    return points, sum(whole.update_us) / len(whole.update_us)
+def record_motion(config: RunConfig) -> tuple[list[SafeSetpoints], float]:
+    """Run the scenario in this process.
+
+    Returns:
+        The setpoints of every tick, and the mean time of the controller alone, in µs.
+    """
+    whole_run = run_in_process(config)
+    record = whole_run.record
+    limits_nm = [joint.torque_limit_nm for joint in record.description.joints]
+    setpoints: list[SafeSetpoints] = []
+    for mode_codes, target in zip(record.mode.tolist(), record.target.tolist(), strict=True):
+        modes = [Mode(code) for code in mode_codes]
+        setpoints.append(SafeSetpoints(modes, target, limits_nm))
+    controller_us = sum(whole_run.update_us) / len(whole_run.update_us)
+    return setpoints, controller_us
 
 
-def sensing(config: RunConfig) -> tuple[list[float], list[float], list[float]]:
-    """Per block, the time of a tick (in µs) with all sensors published, of its physics alone, and of MuJoCo alone."""
-    full, physics, beneath = open_simulator(config), BareLoop(config), BareLoop(config)
-    points, _ = motion(config)
-    published: list[float] = []
-    alone: list[float] = []
-    mujoco_alone: list[float] = []
-    endpoint = free_endpoint()  # what is published really goes over the wire
+@dataclass
+class TickTimes:
+    """Mean times of a tick in µs, one entry for each block of ticks."""
+
+    published_us: list[float] = field(default_factory=list[float])  # with all sensors published
+    physics_us: list[float] = field(default_factory=list[float])  # of the physics alone
+    mujoco_us: list[float] = field(default_factory=list[float])  # of `mj_step` alone
+
+
+def measure_tick_times(config: RunConfig) -> TickTimes:
+    """Measure the ticks of the same motion three times: published, physics alone, and MuJoCo alone."""
+    full = open_simulator(config)
+    physics = BareSimulation(config)
+    bare_mujoco = BareSimulation(config)
+    setpoints, _ = record_motion(config)
+    times = TickTimes()
+    endpoint = free_endpoint()  # published messages really go over the network
     with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
         first = full.sample(0, 0)
         readers = [other.reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.others.items())]
-        publishing = Publishing(session)
+        publisher = SamplePublisher(session)
         tick = 0
-        for start in range(0, len(points) - TICKS_A_BLOCK + 1, TICKS_A_BLOCK):
-            block = points[start : start + TICKS_A_BLOCK]
-            begin = time.perf_counter()
-            for now in block:
+        for start in range(0, len(setpoints) - TICKS_A_BLOCK + 1, TICKS_A_BLOCK):
+            block = setpoints[start : start + TICKS_A_BLOCK]
+            begin_s = time.perf_counter()
+            for tick_setpoints in block:
                 tick += 1
-                publishing.put(tick, full.sample(tick, tick * config.period_ns))
-                full.enact(now, "armed")
+                publisher.publish(tick, full.sample(tick, tick * config.period_ns))
+                full.enact(tick_setpoints, "armed")
                 full.advance()
-            published.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
-            alone.append(physics.tick_us(block))
-            mujoco_alone.append(beneath.mujoco_us(block))
-        assert all(reader.drain() for reader in readers), "nobody heard what was published"
+            times.published_us.append((time.perf_counter() - begin_s) / TICKS_A_BLOCK * 1e6)
+            times.physics_us.append(physics.measure_physics_us(block))
+            times.mujoco_us.append(bare_mujoco.measure_mujoco_us(block))
+        assert all(reader.drain() for reader in readers), "a published message did not arrive"
     full.close()
-    return published, alone, mujoco_alone
+    return times
 
 
-def wire_bytes(config: RunConfig) -> tuple[bytes, bytes]:
-    """All state of one tick, and one command, as they stand on the wire."""
+def encode_tick(config: RunConfig) -> tuple[bytes, bytes]:
+    """Return the bytes of the whole state of one tick, and those of one command, as they are sent."""
     backend = open_simulator(config)
-    samples, robot = backend.sample(0, 0), backend.describe()
+    samples = backend.sample(0, 0)
+    robot = backend.describe()
     backend.close()
     limits_nm = [joint.torque_limit_nm for joint in robot.joints]
-    held = command(robot, samples.joints.angle_rad, tick=10**6, sequence=10**6, torque_limit_nm=limits_nm)
+    hold_command = command(
+        robot, samples.joints.angle_rad, tick=LONG_NUMBER, sequence=LONG_NUMBER, torque_limit_nm=limits_nm
+    )
     state = encode(samples.joints) + b"".join(encode(message) for message in samples.others.values())
-    return state, encode(held)
+    return state, encode(hold_command)

@@ -1,14 +1,21 @@
-"""How large an installation is: the files of its dependencies."""
+"""The size of an installation: the files of SnakeSIM's dependencies."""
 
 from importlib.metadata import distribution
 
 from verification.installation.distributions import required
 
+BYTES_A_MB = 1e6
 
-def install_mb(extra: str = "") -> dict[str, float]:
-    """By distribution, in megabytes. extra: empty for a plain install."""
-    sizes: dict[str, float] = {}
+
+def measure_install_mb(extra: str = "") -> dict[str, float]:
+    """Return the size in megabytes of each distribution that SnakeSIM needs.
+
+    Args:
+        extra: an optional extra such as `sim`; empty for a plain installation.
+    """
+    sizes_mb: dict[str, float] = {}
     for name in required(extra):
         paths = [file.locate() for file in distribution(name).files or ()]
-        sizes[name] = sum(path.stat().st_size for path in paths if path.is_file()) / 1e6  # pyright: ignore
-    return sizes
+        size_bytes = sum(path.stat().st_size for path in paths if path.is_file())  # pyright: ignore
+        sizes_mb[name] = size_bytes / BYTES_A_MB
+    return sizes_mb

@@ -1,4 +1,4 @@
-"""A controller that holds the pose and writes down when it had each command ready."""
+"""A controller that holds the pose and writes the time of each finished command to a file."""
 
 import time
 
@@ -9,13 +9,14 @@ from snakesim_hal.wire.messages import Description
 
 
 class StampedParameters(FileStruct, frozen=True, kw_only=True):
-    """The file to write to."""
+    """The file that gets the times."""
 
     path: str
+    """The file; it gets one time a line, in s since the epoch."""
 
 
 class Stamped(Controller[StampedParameters]):
-    """`--controller benchmarks/stamped.py:Stamped --set control.path=FILE`."""
+    """Holds the pose; selected with `--controller benchmarks/stamped.py:Stamped --set control.path=FILE`."""
 
     Parameters = StampedParameters
 
@@ -25,7 +26,7 @@ class Stamped(Controller[StampedParameters]):
         self._file = open(parameters.path, "w", buffering=1, encoding="ascii")  # noqa: PTH123, SIM115 - open until the end
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return setpoints that hold the first pose, and write down the time."""
+        """Return setpoints that hold the pose of the start, and write down the time."""
         command = self._hold.update(observation)
         self._file.write(f"{time.time():.6f}\n")
         return command

@@ -1,4 +1,4 @@
-"""Whole runs, as a user starts them: time of a lockstep tick, latency in real time, and the highest rate."""
+"""Whole runs, started as a user starts them: time of a lockstep tick, latency in real time, and the highest rate."""
 
 import subprocess
 import sys
@@ -11,51 +11,69 @@ from snakesim_hal.base.process import child_environment, python_command
 from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 
-TRIES = 3
+ATTEMPTS = 3  # a machine that pauses for 50 ms stops a run in real time
+RUN_TIMEOUT_S = 300
 RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
+MIN_ANSWERED_FRACTION = 0.99  # of the ticks, for a rate that counts as reached
+CONTROL_IN_HOST = ("--set", "services.control.place=host")
 
 
 def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
-    """One `snakesim run`; another when it was stopped, as a machine that stands still for 50 ms does to it."""
+    """Do one `snakesim run` and return its summary. A run that was stopped is tried again.
+
+    Raises:
+        CalledProcessError: the last attempt was stopped, too.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        typed = python_command("-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments)
-        for left in reversed(range(TRIES)):
-            ended = subprocess.run(
-                typed, env=child_environment(), check=left == 0, stdout=subprocess.DEVNULL, timeout=300
+        command = python_command("-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments)
+        for attempts_left in reversed(range(ATTEMPTS)):
+            completed = subprocess.run(
+                command,
+                env=child_environment(),
+                check=attempts_left == 0,
+                stdout=subprocess.DEVNULL,
+                timeout=RUN_TIMEOUT_S,
             )
-            if ended.returncode == 0:
+            if completed.returncode == 0:
                 break
             print(f"stopped, tried again: snakesim run {scenario} {' '.join(arguments)}", file=sys.stderr)
-        return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
+        summary = (out / SUMMARY).read_bytes()
+        return msgspec.json.decode(summary, type=RunSummary)
 
 
-def lockstep_tick_us(timestep_s: str, *more: str) -> float:
-    """Wall time of one tick of a whole lockstep run with guidance, navigation, control and recorder as processes."""
-    summary = run(
-        "--clock-mode", "lockstep", "--duration", "10", "--set", f"backends.sim.timestep_s={timestep_s}", *more
-    )
+def measure_lockstep_tick_us(timestep_s: str, *arguments: str) -> float:
+    """Return the wall time of one tick of a lockstep run with all services and the recorder as processes.
+
+    Args:
+        timestep_s: step of the physics, as text for `--set`.
+        arguments: further arguments of `snakesim run`.
+    """
+    timestep = f"backends.sim.timestep_s={timestep_s}"
+    summary = run("--clock-mode", "lockstep", "--duration", "10", "--set", timestep, *arguments)
     return summary.wall_s / summary.ticks * 1e6
 
 
-BESIDE = ("--set", "services.control.place=host")
+def measure_latency_us(*arguments: str) -> float:
+    """Return the median time from the publication of a state to the reception of its command, in real time."""
+    summary = run("--clock-mode", "realtime", "--duration", "5", *arguments)
+    latency_us = summary.state_to_command_us["p50"]
+    assert latency_us is not None
+    return latency_us
 
 
-def latency_us(*arguments: str) -> float:
-    """State published to command received, median, in real time."""
-    found = run("--clock-mode", "realtime", "--duration", "5", *arguments).state_to_command_us["p50"]
-    assert found is not None
-    return found
+def find_highest_rate_hz(*arguments: str) -> tuple[int, dict[int, float]]:
+    """Find the highest control rate at which 99 % of the ticks get their command within the tick.
 
-
-def highest_rate_hz(*arguments: str) -> tuple[int, dict[int, float]]:
-    """The highest control rate at which 99 % of the ticks got their command within the tick, and that share by rate."""
-    shares: dict[int, float] = {}
-    best = 0
-    for rate in RATES_HZ:
-        summary = run("--clock-mode", "realtime", "--duration", "3", "--set", f"rate_hz={rate}", *arguments)
-        shares[rate] = summary.answered_fraction or 0.0
-        if shares[rate] < 0.99:
+    Returns:
+        That rate (0 if none was reached), and for each rate that was tried the fraction of ticks with a command.
+    """
+    answered_fractions: dict[int, float] = {}
+    highest_hz = 0
+    for rate_hz in RATES_HZ:
+        summary = run("--clock-mode", "realtime", "--duration", "3", "--set", f"rate_hz={rate_hz}", *arguments)
+        answered_fractions[rate_hz] = summary.answered_fraction or 0.0
+        if answered_fractions[rate_hz] < MIN_ANSWERED_FRACTION:
             break
-        best = rate
-    return best, shares
+        highest_hz = rate_hz
+    return highest_hz, answered_fractions

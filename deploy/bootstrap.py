@@ -1,4 +1,4 @@
-"""Builds `.venv` from the hashed locks, given nothing but a Python; `make setup` and `make lock` call it.
+"""Builds `.venv` from the hashed locks, with nothing but a Python interpreter; `make setup` and `make lock` call it.
 
 Standard library only, and plain enough for an old Python to read, so that an old Python gets a clear answer.
 """
@@ -39,7 +39,7 @@ HOW_TO_FETCH = re.compile(
 
 
 def main() -> None:
-    """Parse the command line and do what it asks."""
+    """Parse the command line, and run the requested command."""
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(dest="command")
     commands.required = True
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def set_up(requested: str) -> None:
-    """Make `.venv` hold exactly what the lock says, plus this project in editable form."""
+    """Make `.venv` hold exactly the packages of the lock, plus this project in editable form."""
     reuse = not requested and environment_is_usable()
     python = str(VENV_PYTHON) if reuse else find_python(requested)
     if STAMP.exists():
@@ -86,7 +86,7 @@ def lock(upgrade: bool) -> None:
 
 
 def environment_is_usable() -> bool:
-    """Whether `.venv` was made for this very folder and its Python still runs."""
+    """Return whether `.venv` was made for this very folder and its Python still runs."""
     if not STAMP.exists() or STAMP.read_text(encoding="utf-8").splitlines()[:1] != [str(ROOT)]:
         return False
     return is_new_enough(VENV_PYTHON)
@@ -108,7 +108,7 @@ def find_python(requested: str) -> str:
 
 
 def is_new_enough(python: object) -> bool:
-    """Whether this interpreter runs and is at least `OLDEST`."""
+    """Return whether this interpreter runs and is at least `OLDEST`."""
     version = python_version(python)
     return bool(version) and tuple(map(int, version.split(".")[:2])) >= OLDEST
 
@@ -135,17 +135,17 @@ def install_uv(python: str) -> None:
 
 
 def has_pip(python: str) -> bool:
-    """Whether this interpreter has pip."""
+    """Return whether this interpreter has pip."""
     return bool(probe(python, "-m", "pip", "--version"))
 
 
 def has_venv(python: str) -> bool:
-    """Whether `python -m venv` can put pip into a new environment; Debian splits that off."""
+    """Return whether `python -m venv` can put pip into a new environment; Debian splits that off."""
     return bool(probe(python, "-c", "import venv, ensurepip; print(ensurepip.version())"))
 
 
 def install_debian_venv(python: str) -> None:
-    """Install Debian's package of venv when we are root; otherwise say what to type, and exit."""
+    """Install Debian's package of venv if the user is root; otherwise exit with the command to type."""
     package = "python{}-venv".format(*re.findall(r"^\d+\.\d+", python_version(python)))
     install = [*APT_INSTALL.split(), package]
     if os.geteuid() == 0 and shutil.which("apt-get"):

@@ -42,9 +42,10 @@ class TouchReader:
         """Yield all contacts of links with obstacles, in MuJoCo's order."""
         obstacle_geoms = self._obstacle_geoms
         pairs = self._friction.geom_pairs
-        touching = [
-            i for i, (first, second) in enumerate(pairs) if (first in obstacle_geoms) != (second in obstacle_geoms)
-        ]
+        touching: list[int] = []  # contacts of one obstacle with something else, so with a link
+        for i, (first, second) in enumerate(pairs):
+            if (first in obstacle_geoms) != (second in obstacle_geoms):
+                touching.append(i)
         if not touching:
             return
         # Whole columns are converted at once: a view of each contact would cost more.
@@ -53,10 +54,15 @@ class TouchReader:
         for i in touching:
             first, second = pairs[i]
             if first in obstacle_geoms:
-                obstacle, link, sign = first, second, 1.0
+                obstacle = first
+                link = second
+                sign = 1.0
             else:
-                obstacle, link, sign = second, first, -1.0
-            x, y, z = (sign * along for along in frames[i][:3])  # MuJoCo's is from the first geom to the second
+                obstacle = second
+                link = first
+                sign = -1.0
+            # MuJoCo's normal leads from the first geom to the second.
+            x, y, z = (sign * component for component in frames[i][:3])
             normal_n = self._friction.normal_force_n[i]
             fx, fy, fz = self._friction.friction_force_w.get(i, NO_FORCE)
             yield Touch(

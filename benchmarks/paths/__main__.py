@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.paths.ways import Lab, Way
-from benchmarks.physics import config_of, wire_bytes
+from benchmarks.physics import encode_tick, load_config
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.messages import make_arm_request
@@ -142,7 +142,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--only-slow", action="store_true", help="only the slow link")
     wanted = parser.parse_args()
-    state, command = wire_bytes(config_of())
+    state, command = encode_tick(load_config())
     lines = [
         "# The loop through a lab's network",
         "",

@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 
 import zenoh
 
-from benchmarks.echo import REPLY, REQUEST, answer, publisher_of
+from benchmarks.echo import REPLY, REQUEST, answer_requests, declare_publisher
 from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
 
 DROP = zenoh.CongestionControl.DROP
@@ -34,7 +34,7 @@ def main() -> None:
     sys.setswitchinterval(0.0005)
     with zenoh.open(zenoh.Config.from_file(given.file)) as session:
         if given.part == "answer":
-            answer(session, bytes(given.bytes), DROP)
+            answer_requests(session, bytes(given.bytes), DROP)
         elif given.part == "ask":
             given.out.write_text(json.dumps(_ask(session, bytes(given.bytes), given.rounds)))
         elif given.part == "read":
@@ -45,7 +45,7 @@ def main() -> None:
 
 def _ask(session: zenoh.Session, request: bytes, rounds: int) -> list[float]:
     """Every round trip in microseconds, one every `PERIOD_S`; a lost one counts as a second."""
-    publisher = publisher_of(session, REQUEST, DROP)
+    publisher = declare_publisher(session, REQUEST, DROP)
     replies: SimpleQueue[zenoh.Sample] = SimpleQueue()
     _kept = session.declare_subscriber(REPLY, replies.put)
     times: list[float] = []

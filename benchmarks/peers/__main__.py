@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.echo import echo_times_us
-from benchmarks.physics import config_of, wire_bytes
+from benchmarks.echo import measure_echo_times_us
+from benchmarks.physics import encode_tick, load_config
 from benchmarks.whole import run
 from snakesim_hal.base.process import child_environment, python_command
 from snakesim_hal.programs.single_process import InProcessRun
@@ -70,7 +70,7 @@ def _has_rospy() -> bool:
 
 
 def _measure(*, write: bool) -> int:
-    state, command = wire_bytes(config_of())
+    state, command = encode_tick(load_config())
     prefix = PRIORITY if subprocess.call([*PRIORITY, "true"], stderr=subprocess.DEVNULL) == 0 else ()
     loop = f"{len(state)} {len(command)} {ROUNDS} {1 / RATE_HZ}"
     candidates: dict[str, Callable[[], list[float]]] = {
@@ -130,7 +130,7 @@ def _ours(scenario: str) -> Percentiles:
 def _deciding_us() -> float:
     """Mean time that the authority takes for a command: check, expiry, limits."""
     spent = 0.0
-    with InProcessRun(config_of("duration_s=2", "controller=hold")) as ran:
+    with InProcessRun(load_config("duration_s=2", "controller=hold")) as ran:
         authority = ran.host.authority
 
         def timed(call: Callable[..., object]) -> Callable[..., object]:
@@ -155,7 +155,7 @@ def _zenoh(state: bytes, command: bytes, prefix: tuple[str, ...]) -> list[float]
     if prefix:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(prefix[-1])))
     try:
-        return echo_times_us(state, command, ROUNDS, 1 / RATE_HZ, prefix)
+        return measure_echo_times_us(state, command, ROUNDS, 1 / RATE_HZ, prefix)
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

@@ -98,7 +98,7 @@ class MeasuredContacts:
             return None
         weight = 1.0 / len(self._samples)
         length = math.hypot(*direction_w)
-        # Contacts are told apart by link and obstacle.
+        # A contact is identified by its link and obstacle.
         along_n: dict[tuple[int, str | None], float] = {}
         size_n: dict[tuple[int, str | None], float] = {}
         for _, contacts in self._samples:

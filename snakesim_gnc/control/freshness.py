@@ -140,7 +140,14 @@ def _margin_s(cycle_s: float) -> float:
 
 
 def _check_age(key: str, timestamp_ns: int | None, now_ns: int, limit_s: float) -> str:
-    """Return why a sample is rejected; empty if its age is within the limit. None: the world model lacks the sample."""
+    """Return why a sample is rejected; empty if its age is within the limit.
+
+    Args:
+        key: of the sample.
+        timestamp_ns: of the sample; None: the world model has no such sample.
+        now_ns: robot time.
+        limit_s: maximum age.
+    """
     if timestamp_ns is None:
         return f"{keys.WORLD} was made without {key}"
     age_s = (now_ns - timestamp_ns) * 1e-9

@@ -58,7 +58,7 @@ class GuardedController:
         try:
             yield
         except ControllerError as error:
-            # Its text already says which returned value is not allowed, so that no traceback is needed.
+            # Its text already names which returned value is not allowed, so that no traceback is needed.
             raise self.make_error(str(error)) from error.__cause__
         except (Exception, SystemExit) as error:
             traceback.print_exc()

@@ -58,7 +58,7 @@ CREEP_GAIN = 2.0
 # Torque mode.
 MAX_UNBALANCED_SOFT = 0.03  # fraction of a push that may be unbalanced in torque mode
 SOFT_AFTER_S = 0.1  # how long contacts must have been able to balance a push before
-MIN_SLOPE_SQUARED_PER_M2 = 20.0  # sum of theta'^2 below which a shape says little about where on its path it is
+MIN_SLOPE_SQUARED_PER_M2 = 20.0  # sum of theta'^2 below which the shape hardly depends on the place on the path
 
 # Reports.
 STANDSTILL_SPEED_M_S = 0.01  # a body that was slower than this for STANDSTILL_S is reported to stand still

@@ -30,7 +30,15 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: UnitPush
 
 
 def _describe_push_point(body: PlanarBody, world: World, touches: Touches, k: int, push_n: float) -> WorldContact:
-    """Return contact k as a message; push_n: size of its push, in multiples of its direction d_c."""
+    """Return the message for one contact.
+
+    Args:
+        body: the robot.
+        world: the world model.
+        touches: all contacts.
+        k: index of the contact in `touches`.
+        push_n: size of its push, in multiples of its direction d_c.
+    """
     x, y = touches.places_w[k].tolist()
     direction_x, direction_y = touches.directions_w[k].tolist()
     length = float(np.hypot(direction_x, direction_y))

@@ -11,7 +11,9 @@ from snakesim_hal.wire.outgoing import find_wrong_value
 
 TELEMETRY_S = 0.05  # period of the messages while the state does not change
 MAX_REASON = 500  # characters, as the wire allows
-MAX_NAME = 64  # characters of a controller's name on the wire; the end of a path tells more than its beginning
+MAX_NAME = (
+    64  # characters of a controller's name on the wire; the end of a path identifies it better than its beginning
+)
 
 
 class StateReports:

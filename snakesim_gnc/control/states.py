@@ -22,7 +22,7 @@ def locomotion_state(
     Args:
         silent: how the HAL has stopped sending anything; else empty.
         armed: whether the robot is armed.
-        missing: inputs that control lacks, such as a fresh pose; else empty.
+        missing: inputs that control does not have, such as a fresh pose; else empty.
         rests: why no motion is intended; empty if motion is intended.
         usable_push_points: their number; None for a controller that does not push off obstacles.
         obstacle: what prevents motion according to the controller, such as a jam; else empty.

@@ -143,9 +143,13 @@ def _list_unit_pushes(chain: ChainDynamics) -> list[_UnitPush]:
 def _merge_pushes(
     chain: ChainDynamics, pushes: Sequence[_UnitPush], amounts_n: Floats, covariance: Floats
 ) -> list[EstimatedPush]:
-    """Return the significant pushes. Neighbors on one side that are no further apart than a link are one push.
+    """Merge neighboring unit pushes on one side into one push, and return the significant ones, sorted.
 
-    amounts_n: (p,) force of each push; covariance: (p, p) of the forces.
+    Args:
+        chain: the links.
+        pushes: the p unit pushes.
+        amounts_n: (p,) force of each unit push.
+        covariance: (p, p) of the forces.
     """
     starts_m = np.append(0.0, np.cumsum(chain.lengths_m))  # of the links, along the body
     max_gap_m = MAX_MERGE_RATIO * chain.lengths_m.max()

@@ -28,7 +28,13 @@ class WorldModel:
     """Makes world models from the newest sample of each sensor."""
 
     def __init__(self, robot: Description, known: Sequence[Obstacle], *, reach_m: float = 0.5) -> None:
-        """Create a model of a robot. known: the surveyed obstacles; only those within `reach_m` are passed on."""
+        """Create a world model.
+
+        Args:
+            robot: the description of the robot.
+            known: the surveyed obstacles.
+            reach_m: distance from the robot up to which obstacles are part of the published world model.
+        """
         # The robot.
         self._axes = [joint.axis for joint in robot.joints]
         self._lengths_m = [link.length_m for link in robot.links]
@@ -42,7 +48,15 @@ class WorldModel:
         self._reach_m = reach_m
 
     def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:
-        """Return the world from the newest samples, whose own timestamps it carries. tick, now_ns: of the clock."""
+        """Compute the world model from the newest samples.
+
+        Args:
+            tick: of the clock.
+            now_ns: of the clock; with it the confidence in an old pose is lowered.
+            joints: the joint state, whose timestamp the world model gets.
+            contacts: in the frames of the links; None: there is no contact sensor.
+            pose: of the base, from its sensor.
+        """
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
         origins_w, rotations = link_frames(pose.position_w, rotation, joints.angle_rad, self._axes, self._lengths_m)
         middles_w = origins_w + self._half_m[:, None] * rotations[:, :, 0]

@@ -20,7 +20,7 @@ from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, P
 MessageT = TypeVar("MessageT", Contacts, Imu)
 
 # Standard deviations of x, y and heading, in m and rad.
-MIN_POSE_SD = np.array([0.0005, 0.0005, 0.001])  # of a pose sensor, whatever its file says
+MIN_POSE_SD = np.array([0.0005, 0.0005, 0.001])  # of a pose sensor, even if its file has smaller ones
 START_SD = np.array([0.01, 0.01, 0.02])  # of the pose at which a robot without a pose sensor starts
 GATE_SD = np.array([0.005, 0.005, 0.01])  # added before a pose is judged as implausible
 
@@ -140,7 +140,7 @@ class Localizer:
 
         Args:
             rows: (m, 3) how each measurement changes with x, y and heading.
-            errors_m: (m,) by how much it is larger than the present estimate says.
+            errors_m: (m,) by how much it is larger than by the present estimate.
             sds_m: (m,) its standard deviation.
         """
         across = self.covariance @ rows.T

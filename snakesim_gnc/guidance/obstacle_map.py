@@ -117,7 +117,7 @@ class ObstacleMap:
             if track is None:
                 track = self._start_felt_track(position_w, normal_w)
             self._update_drift(track)
-            # The normal of a cylinder leads through its center; that of a box says little about its place.
+            # The normal of a cylinder leads through its center; that of a box hardly determines its place.
             is_round = track.shape == "cylinder"
             normal_weight = 1.0 / (NORMAL_SD_RAD * track.radius_m) ** 2 if is_round else 0.0
             track.surface.add(position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([normal_weight]))

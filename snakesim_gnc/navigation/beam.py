@@ -260,7 +260,7 @@ class BeamSearch:
         headings_rad = arcs.middle_heading_rad.ravel()[candidates]
         tangents = np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=-1)
 
-        # While the search is still within the body, the margin says nothing yet.
+        # While the search is still within the body, the margin has no meaning yet.
         is_relaid = task.lying_w is not None
         is_within_body = is_relaid and nodes.s_m < parameters.body_length_m - 0.5 * STEP_M
         push_reward = parameters.push_reward_of_body if is_within_body else parameters.push_reward

@@ -148,7 +148,12 @@ def _solve_shifts_m(
 
         sum_i u_i² + w_i (u_i - v_i)² + k |third difference of (p + u l)|²,   k = (smoothing / spacing)^6
 
-    p: path (n, 2); l: left (n, 2) unit vectors; v: wanted_m (n,); w: weight (n,).
+    Args:
+        path: (n, 2) p.
+        left: (n, 2) l, unit vectors to the left of the path.
+        wanted_m: (n,) v, the shifts that give the wanted gaps.
+        weight: (n,) w.
+        parameters: smoothing.
     """
     count = len(path)
     window = count - 3

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 
 class SnakesimError(Exception):
-    """Base of all errors of SnakeSIM; the message says what is wrong, and what to do next."""
+    """Base of all errors of SnakeSIM; the message explains what is wrong, and what to do next."""
 
     code = "run/failed"  # stable; a class has its default, and a raise site may give a more specific one
 

@@ -47,7 +47,7 @@ def python_command(*words: str) -> list[str]:
     """Return the command line of a child that runs this interpreter: `python_command("-m", "package.module")`.
 
     With `-P` the child does not search the folder that it runs in for modules. Without it, `python -m` searches that
-    folder first, so that a file `random.py` there would replace the module of that name, whoever wrote the file.
+    folder first, so that a file `random.py` there, even of another user, would replace the module of that name.
     Every child that is started as Python gets its command line here and its variables from `child_environment`.
     """
     return [sys.executable, "-P", *words]

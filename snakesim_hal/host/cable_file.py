@@ -131,19 +131,32 @@ def _goes_round(joint: Joint) -> bool:
     return joint.limits.upper_rad - joint.limits.lower_rad > TURN_RAD - END_STOP_RAD
 
 
-def _find_angle(kept: Mapping[str, StoredCable] | str, joint: Joint, owner: str, now_s: float) -> float | str:
-    """Return the angle at which a joint was last stored in rad, or the reason why it is not known."""
+def _find_angle(stored_cables: Mapping[str, StoredCable] | str, joint: Joint, drive: str, now_s: float) -> float | str:
+    """Return the angle that a joint has, counted over restarts of the host.
+
+    It is the stored angle if that belongs to the same drive. Otherwise it is 0, if a person has just declared in the
+    robot file that the cable is unwound.
+
+    Args:
+        stored_cables: by name of the joint; or the reason why the file could not be read.
+        joint: the joint in the robot file.
+        drive: the drive that the joint has now, with its sign and zero.
+        now_s: wall time in s since the epoch.
+
+    Returns:
+        The angle in rad, or the reason why it is not known.
+    """
     declared = joint.limits.cable_unwound
-    if isinstance(kept, str):
-        reason = kept
+    if isinstance(stored_cables, str):
+        reason = stored_cables
     else:
-        last = kept.get(joint.name)
-        if last is None:
+        stored = stored_cables.get(joint.name)
+        if stored is None:
             reason = "no host has kept it"
-        elif last.drive == owner and last.unwound == declared:
-            return last.angle_rad
+        elif stored.drive == drive and stored.unwound == declared:
+            return stored.angle_rad
         else:
-            reason = f"what is kept is of another drive, sign or zero ({last.drive}, now {owner})"
+            reason = f"what is kept is of another drive, sign or zero ({stored.drive}, now {drive})"
     if not declared:
         return reason
     try:

@@ -2,7 +2,7 @@
 
 In every tick the host samples the sensors and publishes them with the clock. It lets the safety core judge the samples,
 waits for the command that answers them, and lets the safety core decide. Then it hands the setpoints to the backend and
-lets a control period pass. The clock mode says how long it waits:
+lets a control period pass. The clock mode decides how long it waits:
 
 realtime  until the tick's deadline on the monotonic clock; an old command stays active until its lease ends
 lockstep  until every service whose output is due has delivered; the host stays at tick 0 until the first arming

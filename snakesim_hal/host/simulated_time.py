@@ -13,7 +13,7 @@ from typing import NamedTuple
 from snakesim_hal.wire.messages import ClockMode, Description, SimulatorRequest
 
 MEASURED_OVER_NS = 1_000_000_000  # of the real-time factor
-MIN_SPEED_RATIO = 0.95  # of the wanted speed; below, the status says that it is not reached
+MIN_SPEED_RATIO = 0.95  # of the wanted speed; below, the status reports that it is not reached
 
 
 class Refusal(NamedTuple):

@@ -24,9 +24,9 @@ def make_applied_command(description: Description, tick: int, decision: TickDeci
     )
 
 
-def describe_wait(service: str, lacks: Sequence[str]) -> str:
+def describe_wait(service: str, missing: Sequence[str]) -> str:
     """Return the text that the host waits for a service, and which messages the service is missing."""
-    if not lacks:
+    if not missing:
         return f"waiting for {service}"
-    ways_out = "".join(f" ({WAYS_OUT[key]})" for key in lacks if key in WAYS_OUT)
-    return f"waiting for {service}, which has no {', '.join(lacks)} yet{ways_out}"
+    ways_out = "".join(f" ({WAYS_OUT[key]})" for key in missing if key in WAYS_OUT)
+    return f"waiting for {service}, which has no {', '.join(missing)} yet{ways_out}"

@@ -343,7 +343,7 @@ def _explain_wrong(violation: Violation, table: Table, dotted: str) -> str:
     if unit and isinstance(value, int | float):
         shown += f" {unit}"
     reason = ""
-    if not why.startswith(("Expected `int", "Expected `float")):  # the expected range says more
+    if not why.startswith(("Expected `int", "Expected `float")):  # the expected range explains more
         reason = f": {shorten(_lower_first(why))}"
     return f"{origin}: `{dotted}` = {shown} is not allowed{reason}; expected {in_words(info)}."
 

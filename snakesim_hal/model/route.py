@@ -160,7 +160,7 @@ def sine_points(amplitude_m: float, wavelength_m: float, length_m: float, spacin
 def next_on_route(route: Route, from_w: tuple[float, float], from_s_m: float, distance_m: float) -> float:
     """Return the arc length of the route's next point at a straight distance from a point.
 
-    The fixed-point iteration moves along the route by what the straight distance still lacks.
+    The fixed-point iteration moves along the route by the straight distance that is still missing.
 
     Args:
         route: the curve.

@@ -305,7 +305,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     def dead_reckons(self, robot: Description) -> bool:
         """Return whether guidance estimates the pose by dead reckoning.
 
-        It does if the mission says so, and also if neither the robot nor a service measures the pose.
+        It does if the mission demands it, and also if neither the robot nor a service measures the pose.
         """
         if self.mission.localization == "dead_reckoning":
             return True

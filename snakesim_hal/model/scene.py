@@ -391,8 +391,9 @@ def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: 
     for number, s_m in enumerate(used_s_m, start=row.first):
         tangent = route.tangent_w(s_m)
         left = np.array([-tangent[1], tangent[0]])
-        push = left if left @ forward > 0 else -left  # direction of the force from the peg on the body
-        center = route.position_w(s_m) - push * (row.corridor_m + row.radius_m)
+        is_forward = left @ forward > 0
+        push_direction = left if is_forward else -left  # of the force from the peg on the body
+        center = route.position_w(s_m) - push_direction * (row.corridor_m + row.radius_m)
         center_m = (float(center[0]), float(center[1]))
         obstacle = make_peg(f"peg_{index}_{number}", center_m, row.radius_m, row.height_m)
         pegs.append(_with_material(obstacle, row))

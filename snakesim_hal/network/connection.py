@@ -23,7 +23,7 @@ from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
 ENVELOPE_BYTES = 4096  # room around a payload for its key, its encoding and the numbers of an image
 
-# Every session has these settings, whatever its session file says.
+# Every session has these settings, and its session file cannot change them.
 REQUIRED_SETTINGS: dict[str, Any] = {
     "scouting/delay": 0,
     "scouting/multicast/enabled": False,

@@ -1,7 +1,7 @@
 """A Zenoh session file: how a machine joins its lab's network. Stock Zenoh reads it too; nothing of ours is in it.
 
 It names the router, and the certificates if there are any. What every session of SnakeSIM needs is set on top; a file
-that says otherwise is refused, because the same file would behave differently in another program.
+with other values is refused, because the same file would behave differently in another program.
 """
 
 import json

@@ -5,7 +5,7 @@ connections, idle sessions, floods) leave this path open. A datagram is
 
     request  b"SNAKSTOP", 16 bytes chosen by the sender, name of the requester in UTF-8 (at most 64 bytes)
     answer   b"SNAKDONE", the same 16 bytes, in UTF-8: the robot's namespace, a line feed, the result
-    test     b"SNAKTEST": does nothing, and is not answered; tells a sender whether the port is closed
+    test     b"SNAKTEST": does nothing, and is not answered; shows a sender whether the port is closed
 
 The kernel drops all other datagrams before they are queued, so a flood of them takes no room from a stop; and a
 flood of requests is a stop. Restrict access to the port by the network: stopping a robot needs no permission.

@@ -14,20 +14,28 @@ from snakesim_hal.programs.service_program import ProcessOptions, process_option
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Forward between all connected sessions, until a stop signal."""
+    """Forward messages between all connected sessions, until a stop signal.
+
+    Args:
+        argv: the command line without the program; None: that of this process.
+
+    Returns:
+        The exit code.
+    """
     parser = argparse.ArgumentParser(description="Run a Zenoh router on a run's endpoint.")
     add_scenario(parser)
     add_network(parser)
     add_insecure(parser)
     add_parent(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim start router", lambda: _forward(process_options(arguments, hosts=True)))
+    return run_tool("snakesim start router", lambda: _run_router(process_options(arguments, hosts=True)))
 
 
-def _forward(given: ProcessOptions) -> int:
+def _run_router(options: ProcessOptions) -> int:
+    """Keep a listening session open: Zenoh forwards in its own threads."""
     stopped = threading.Event()
     on_stop_signal(stopped.set)
-    with open_session(replace(given.link, namespace=None)):
+    with open_session(replace(options.link, namespace=None)):
         stopped.wait()
     return 0
 

@@ -1,12 +1,13 @@
-"""A whole run in one process and one thread, without a network: host, guidance, navigation and control take turns.
+"""A whole run in one process and one thread, without a network: host, guidance, navigation and control act in turn.
 
     with InProcessRun(config) as run:
         for _ in run.iterate_ticks():
             ...  # once a tick; run.host.authority, run.network.session() for readers, run.stop()
     record_of(run.host).command_digest
 
-The parts are those of a run in lockstep: the same host with its authority, the same services, the same bytes between
-them. So a configuration drives the motors alike in both, to the bit. What needs processes or a network is refused.
+The parts are those of a run in lockstep: the same host with its authority, the same services, and the same bytes
+between them. So a configuration gives the same motor commands in both, to the last bit. A configuration that needs
+processes or a network is refused.
 """
 
 import itertools
@@ -32,15 +33,16 @@ from snakesim_hal.service import SERVICE_START_LIMIT_S, ServiceLoop
 from snakesim_hal.wire.messages import make_arm_request
 
 AFTER_FAULT_S = 1.5
-ARM_LIMIT_S, ARM_LIMIT_TURNS = 10.0, 100  # both: planning, or a busy computer, may take long for a turn
-TURN_LIMIT_S = 60.0  # of one part in one turn; beyond, it computes without end
+ARM_LIMIT_S = 10.0  # the run gives up when both limits have passed:
+ARM_LIMIT_TURNS = 100  # planning, or a busy computer, may need long for one turn
+TURN_LIMIT_S = 60.0  # of one part in one turn; a part that needs longer is assumed to compute without end
 INTERRUPT_GRACE_S = 1.0  # of the present turn of a part, after Ctrl-C
-OVER = object()
-WHO = "run in one process"
+ENDED = object()  # the host has no further turn
+REQUESTER = "run in one process"  # of the arming
 
 
 def check(config: RunConfig) -> None:
-    """Whether a run needs neither processes of its own nor a network. Raises ConfigError."""
+    """Check that a run needs neither several processes nor a network. Raises ConfigError if it does."""
     where = f"scenario {config.name!r} in one process"
     if config.clock_mode != "lockstep":
         raise ConfigError(
@@ -49,7 +51,7 @@ def check(config: RunConfig) -> None:
         )
     if not config.has_own_control:
         raise ConfigError(
-            f"{where}: nobody commands the robot; it needs a control service that is not external",
+            f"{where}: no controller commands the robot; it needs a control service that is not external",
             code="config/conflict",
         )
     for name, service in config.services.items():
@@ -65,7 +67,7 @@ def check(config: RunConfig) -> None:
 
 
 class InProcessRun:
-    """One run, from `with` to its end."""
+    """One run in this process. Its `with` opens and closes the backend and all services."""
 
     def __init__(self, config: RunConfig, pulse: Pulse | None = None, turn_limit_s: float | None = None) -> None:
         """Check the configuration.
@@ -73,7 +75,7 @@ class InProcessRun:
         Args:
             config: of the run.
             pulse: shows another process whether the run goes on.
-            turn_limit_s: wall time that a part may take in one turn, if not as the configuration says.
+            turn_limit_s: wall time that a part may take in one turn; None: as the configuration allows.
 
         Raises:
             ConfigError: the run needs more than one process.
@@ -83,8 +85,8 @@ class InProcessRun:
         self._limit = StepLimit(SERVICE_START_LIMIT_S, pulse)
         self._turn_limit_s = turn_limit_s or max(TURN_LIMIT_S, config.start_limit_s)
         self.network = LocalNetwork()
-        self.failed: list[str] = []  # services that could not go on, and why
-        self._errors: dict[str, SnakesimError] = {}  # what ended them
+        self.failed: list[str] = []  # services that ended with an error, and the error
+        self._errors: dict[str, SnakesimError] = {}  # by name of the service
         self._loops: dict[str, ServiceLoop] = {}
         self._parts: dict[str, ExitStack] = {}
         self._opened = ExitStack()
@@ -108,94 +110,121 @@ class InProcessRun:
         self._opened.close()
 
     def _open(self, opened: ExitStack) -> None:
-        config = self.config
-        # As in processes of their own: sums of several threads are rounded otherwise, and the digest would differ.
+        """Open the backend, the host and all services, each to be closed by the stack.
+
+        Raises:
+            RefusedError: the backend moves real hardware.
+        """
+        # Services in their own processes use one thread, too. Several threads would round sums differently.
         opened.enter_context(threadpool_limits(1))
+        self._open_host(opened)
+        for name in self.config.services:
+            self._open_service(name, opened)
+
+    def _open_host(self, opened: ExitStack) -> None:
+        config = self.config
         backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         if not backend.describe().emulated:
             raise RefusedError(
-                f"backend {config.backend!r} moves real hardware, which nobody could stop from outside: run it in "
+                f"backend {config.backend!r} moves real hardware, which could not be stopped from outside: run it in "
                 "processes of their own",
                 code="robot/real-hardware",
             )
         session = self.network.session()
         opened.callback(session.close)
-        faulty, faults = create_host_faults(config, backend, session)
+        backend_with_faults, faults = create_host_faults(config, backend, session)
         options = HostOptions(
             max_ticks=round(config.duration_s * config.rate_hz),
             end_after_fault_s=AFTER_FAULT_S,
             clock_mode_after_fault="free",
             faults=faults,
         )
-        self.host = Host(config, faulty, session, options)
+        self.host = Host(config, backend_with_faults, session, options)
         self.network.answer = self.host.handle_queued_input
         opened.callback(self.network.close)
-        for name in config.services:
-            part = self._parts[name] = opened.enter_context(ExitStack())
-            session = self.network.session()
-            part.callback(session.close)
-            loop = self._loops[name] = ServiceLoop(find_service(config, name), config, session)
-            part.callback(loop.close)
+
+    def _open_service(self, name: str, opened: ExitStack) -> None:
+        part = opened.enter_context(ExitStack())
+        session = self.network.session()
+        part.callback(session.close)
+        loop = ServiceLoop(find_service(self.config, name), self.config, session)
+        part.callback(loop.close)
+        self._parts[name] = part
+        self._loops[name] = loop
 
     def iterate_ticks(self, *, before_services: bool = False) -> Generator[None]:
-        """Run. Yields after each turn of all parts, also before the arming. Raises SnakesimError when it cannot begin.
+        """Let all parts act in turn, and arm the robot when it is ready. The joints are safe at the end.
 
-        before_services: yields instead when the samples of a tick are out, and no service has acted on them.
+        Args:
+            before_services: yield when the samples of a tick are published and no service has acted on them, instead
+                of after the turn of all services.
 
-        The joints are safe at the end, also when this generator is closed early.
+        Yields:
+            Once for each turn, also for those before the arming. The generator may be closed early.
+
+        Raises:
+            RefusedError: the robot is not ready to arm in time.
+            SnakesimError: the run cannot continue.
         """
-        limit_s = min(ARM_LIMIT_S, self.config.start_limit_s)
-        give_up = time.monotonic() + limit_s
-        with closing(self.host.iterate_ticks()) as turns:
+        arm_limit_s = min(ARM_LIMIT_S, self.config.start_limit_s)
+        arm_deadline_s = time.monotonic() + arm_limit_s
+        with closing(self.host.iterate_ticks()) as host_turns:
             for turn in itertools.count():
                 with self._limit:  # the backend may be third-party code, and turns this into an error of its own
-                    if next(turns, OVER) is OVER:
+                    if next(host_turns, ENDED) is ENDED:
                         return
                 if turn == 0:
                     for loop in self._loops.values():
                         loop.join()
                 if before_services:
                     yield
-                self._let_act()
+                self._let_services_act()
                 if not self.host.authority.arm_session and not self.failed:
-                    status = self.host.status()
-                    if turn > ARM_LIMIT_TURNS and time.monotonic() > give_up:
-                        raise RefusedError(
-                            f"not ready to arm within {limit_s:g} s: {status.reason}", code="robot/not-ready"
-                        )
-                    if status.ready_to_arm:
-                        self.host.submit_request(make_arm_request(self.host.description, WHO), lambda _answer: None)
+                    is_too_late = turn > ARM_LIMIT_TURNS and time.monotonic() > arm_deadline_s
+                    self._arm_when_ready(is_too_late, arm_limit_s)
                 if not before_services:
                     yield
+
+    def _arm_when_ready(self, is_too_late: bool, limit_s: float) -> None:
+        """Request the arming if the robot is ready. Raises RefusedError if it is too late for that."""
+        status = self.host.status()
+        if is_too_late:
+            raise RefusedError(f"not ready to arm within {limit_s:g} s: {status.reason}", code="robot/not-ready")
+        if status.ready_to_arm:
+            self.host.submit_request(make_arm_request(self.host.description, REQUESTER), lambda _answer: None)
 
     def stop(self) -> None:
         """End the run in order."""
         self.host.stop()
 
     def take_errors(self) -> dict[str, SnakesimError]:
-        """Return what ended each service that could not go on, and forget it.
+        """Return the error that ended each service, by name, and drop the errors here.
 
-        A traceback holds this run, and the run must not hold the traceback too: nothing would release them.
+        The traceback of an error refers to this run. If the run kept the error too, neither could be freed.
         """
-        taken = self._errors
+        errors = self._errors
         self._errors = {}
-        return taken
+        return errors
 
     def too_slow(self) -> list[str]:
-        """Return the services that could not keep up in real time, and what shows it."""
-        loops = self._loops.items()
-        return [f"{name}: {loop.service.too_slow}" for name, loop in loops if loop.service.too_slow]
+        """Return the services that were too slow for real time, each with the measurement that shows it."""
+        slow_services: list[str] = []
+        for name, loop in self._loops.items():
+            if loop.service.too_slow:
+                slow_services.append(f"{name}: {loop.service.too_slow}")
+        return slow_services
 
     def hurry(self) -> None:
-        """Wait no longer for a part that does not return. May be called by a signal handler."""
+        """Interrupt a part that does not return within INTERRUPT_GRACE_S. May be called by a signal handler."""
         self._limit.hurry(INTERRUPT_GRACE_S)
 
-    def _let_act(self) -> None:
+    def _let_services_act(self) -> None:
+        """Give every service its turn. One that raises an error is closed, as its process would end."""
         for name, loop in list(self._loops.items()):
             try:
                 self._act_in_time(loop)
-            except SnakesimError as error:  # its process would end here, and the host would go on
+            except SnakesimError as error:
                 report_error(error, f"snakesim {name}")
                 self._errors[name] = error
                 self.failed.append(f"{name} ended: {error}")
@@ -203,6 +232,7 @@ class InProcessRun:
                 self._parts[name].close()
 
     def _act_in_time(self, loop: ServiceLoop) -> None:
+        """Give a service its turn. Raises ServiceError if the turn takes too long."""
         try:
             with self._limit:
                 loop.act()
@@ -211,14 +241,13 @@ class InProcessRun:
             raise ServiceError(self._explain(error), code="backend/step-timeout") from None
 
     def _explain(self, error: StepTooLongError) -> str:
-        """Return why a part was interrupted, and what to do about it."""
+        """Return why a part was interrupted, and what the user can do about it."""
         if self._limit.is_hurried:
             return (
                 f"{describe_interrupted_line(error)} had not returned {INTERRUPT_GRACE_S:g} s after the "
                 "run was told to stop"
             )
         return (
-            f"{describe_interrupted_line(error)} took longer than {self._limit.limit_s:g} s in one tick; if "
-            "it needs so long, allow it "
-            "with --set start_limit_s=600"
+            f"{describe_interrupted_line(error)} took longer than {self._limit.limit_s:g} s in one tick; if it needs "
+            "so long, allow it with --set start_limit_s=600"
         )

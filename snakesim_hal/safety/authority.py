@@ -379,6 +379,7 @@ class Authority:
     # --- lifecycle -------------------------------------------------------------------------------------------
 
     def _arm(self, request: LifecycleRequest, now_ns: int) -> Answer:
+        """Arm the robot and begin an arm session; or refuse the request with all conditions that are not met."""
         unmet = self._find_unmet_conditions(now_ns)
         unmet += lifecycle.find_address_mismatches(request, self.description)
         if self.unchecked and not request.unchecked:

@@ -31,7 +31,7 @@ def encode_checked(key: str, message: Message, own: CustomMessage | None = None)
     Args:
         key: where it is sent, relative to the robot's namespace.
         message: the message.
-        own: what the robot's description says of the message of a custom sensor; None means that its class says it.
+        own: the description of a custom sensor's message by the robot; None: its class describes it.
 
     Raises:
         WireError: readers would reject it; names field, value, and what is allowed.

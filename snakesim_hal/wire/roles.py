@@ -14,7 +14,7 @@ from snakesim_hal.wire import keys
 
 
 class Role(StrEnum):
-    """What a process is to a robot. Its certificate says so."""
+    """What a process is to a robot. Its certificate names the role."""
 
     ROBOT = "robot"
     GNC = "gnc"

@@ -1,4 +1,4 @@
-"""A lab's Dask cluster, to which evaluations and training send their runs."""
+"""Connects to a lab's Dask cluster, to which evaluations and training send their runs."""
 
 import re
 from collections.abc import Iterator
@@ -10,11 +10,11 @@ from snakesim_hal.base.errors import ConfigError, NotConnectedError, shorten
 if TYPE_CHECKING:  # takes a second to import, and most commands only check an address
     from distributed import Client
 
-MEET_S = 20.0
+CONNECT_LIMIT_S = 20.0  # for the scheduler to answer, and again for its first worker
 
 
 def check_address(address: str | None) -> None:
-    """Before anything is begun for it. Raises ConfigError."""
+    """Check the form of a scheduler's address. Raises ConfigError if it is not tcp://HOST:PORT or tls://HOST:PORT."""
     if address is not None and not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
         raise ConfigError(
             f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT", code="network/invalid-address"
@@ -23,23 +23,33 @@ def check_address(address: str | None) -> None:
 
 @contextmanager
 def connected(address: str) -> "Iterator[Client]":
-    """Its client. Raises NotConnectedError when there is no answer, ConfigError for an invalid address."""
+    """Open a client of a cluster that has at least one worker.
+
+    Args:
+        address: of the scheduler, tcp://HOST:PORT or tls://HOST:PORT.
+
+    Raises:
+        NotConnectedError: the scheduler does not answer, or it has no worker.
+        ConfigError: the address is invalid, or the certificates for TLS are missing.
+    """
     from distributed import Client
 
     check_address(address)
     _check_certificates(address)
     try:
-        client = Client(address, timeout=MEET_S, set_as_default=False)
+        client = Client(address, timeout=CONNECT_LIMIT_S, set_as_default=False)
     except (OSError, TimeoutError):
         raise NotConnectedError(
-            f"--cluster {address}: no Dask scheduler answers within {MEET_S:g} s", code="network/nothing-listens"
+            f"--cluster {address}: no Dask scheduler answers within {CONNECT_LIMIT_S:g} s",
+            code="network/nothing-listens",
         ) from None
     with client:
         try:
-            client.wait_for_workers(1, timeout=MEET_S)
+            client.wait_for_workers(1, timeout=CONNECT_LIMIT_S)
         except TimeoutError:
             raise NotConnectedError(
-                f"--cluster {address}: no worker within {MEET_S:g} s; start some: dask worker {address} --nthreads 1",
+                f"--cluster {address}: no worker within {CONNECT_LIMIT_S:g} s; start some: "
+                f"dask worker {address} --nthreads 1",
                 code="network/nothing-listens",
             ) from None
         yield client

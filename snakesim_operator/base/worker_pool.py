@@ -2,11 +2,11 @@
 
     with WorkerPool(4) as pool:
         for number, outcome in pool.run(function, calls):
-            ...  # as each call is done
+            ...  # as soon as each call is done
 
-Nothing listens anywhere: each worker has one end of a socket pair, which no other process can open. A worker that dies
-is replaced and its call is tried again. At the end of the `with`, however it ends, all workers are killed and their
-temporary files are removed.
+No port is opened: each worker has one end of a socket pair, which no other process can open. A worker that dies is
+replaced, and its call is tried again. At the end of the `with`, also after an exception, all workers are killed and
+their temporary files are removed.
 """
 
 import contextlib
@@ -29,12 +29,13 @@ from typing import Any, Self
 from snakesim_hal.base import arithmetic
 from snakesim_hal.base.process import child_environment, die_with_parent, python_command
 
-MAX_DEATHS = 5  # of the workers that run a call, until the call is given up
-MAX_RAISES = 3  # of a call, until its exception is its outcome: the fault may have been the worker's
-NICENESS = 10  # robots and consoles that run meanwhile come first
-TEMPORARY_FILES = "TMPDIR"  # the variable that names the folder for them
-BEGIN = f"import sys; from {__name__} import main; sys.exit(main(sys.argv[1:]))"  # not -m: classes are of this module
-UNLOCKED_S = 60.0  # a new folder is locked long before
+MAX_DEATHS = 5  # workers that may die while they run a call, before the call is given up
+MAX_RAISES = 3  # attempts of a call that raises an exception: the cause may have been the worker
+NICENESS = 10  # robots and consoles on the same computer have priority
+TEMPORARY_FOLDER_VARIABLE = "TMPDIR"  # of the environment
+# With `-m`, the classes of this module would be those of `__main__`, and would not be equal to the command's.
+WORKER_PROGRAM = f"import sys; from {__name__} import main; sys.exit(main(sys.argv[1:]))"
+MAX_UNLOCKED_S = 60.0  # a folder of a running pool is locked long before
 FOLDER_PREFIX = "snakesim-workers-"
 
 
@@ -71,14 +72,18 @@ class _Call:
     arguments: Sequence[Any]
     deaths: int = 0
     raises: int = 0
-    deadline_s: float = float("inf")  # on the monotonic clock, once it has begun
+    deadline_s: float = float("inf")  # on the monotonic clock, after the call has begun
 
 
 class WorkerPool:
     """Calls functions in processes, one call at a time in each."""
 
     def __init__(self, count: int | None = None) -> None:
-        """count: how many processes; None: one for each core that this process may use."""
+        """Make a pool without workers; they are started when they are needed.
+
+        Args:
+            count: maximum number of processes; None: one for each core that this process may use.
+        """
         self.size = count or len(os.sched_getaffinity(0))
         self._workers: list[_Worker] = []
         self._folder: Path | None = None
@@ -102,15 +107,15 @@ class WorkerPool:
     def run(
         self, function: Callable[..., Any], calls: Sequence[Sequence[Any]], limit_s: float | None = None
     ) -> Iterator[tuple[int, Outcome]]:
-        """Call the function of a module once for each tuple of arguments.
+        """Call a function once for each tuple of arguments.
 
         Args:
-            function: found by its name in the worker, which imports its module.
-            calls: the arguments of each call. They begin in this order.
-            limit_s: wall time of a call, after which its worker is killed.
+            function: on the top level of a module, which the worker imports.
+            calls: the arguments of each call. Calls begin in this order.
+            limit_s: maximum wall time of a call, after which its worker is killed; None: no limit.
 
         Yields:
-            The place of a call in `calls`, and its outcome, as each is done.
+            The index of a call in `calls` and its outcome, as soon as the call is done.
         """
         waiting = deque(_Call(number, arguments) for number, arguments in enumerate(calls))
         running: dict[_Worker, _Call] = {}
@@ -118,11 +123,12 @@ class WorkerPool:
             while waiting or running:
                 while waiting and len(running) < self.size:
                     call = waiting.popleft()
-                    worker = self._idle_worker(running)
-                    call.deadline_s = float("inf") if limit_s is None else time.monotonic() + limit_s
+                    worker = self._find_idle_worker(running)
+                    if limit_s is not None:
+                        call.deadline_s = time.monotonic() + limit_s
                     worker.send((function, call.arguments))
                     running[worker] = call
-                for worker in self._workers_with_news(running):
+                for worker in self._wait_for_workers(running):
                     call = running.pop(worker)
                     outcome = self._receive(worker, call)
                     if outcome is None:
@@ -130,11 +136,12 @@ class WorkerPool:
                     else:
                         yield call.number, outcome
         finally:
-            for worker in running:  # the caller wants no more: their answers must not be taken for later ones
+            # If the caller stops early, later calls must not receive the outcomes of these.
+            for worker in running:
                 self._discard(worker)
 
     def map(self, function: Callable[..., Any], calls: Sequence[Sequence[Any]]) -> list[Any]:
-        """Return what each call returns, in the order of the calls. Raises what the first failed call raised."""
+        """Return the values of the calls, in their order. Raises the exception of the first call that fails."""
         values: dict[int, Any] = {}
         for number, outcome in self.run(function, calls):
             if isinstance(outcome, Raised):
@@ -142,7 +149,8 @@ class WorkerPool:
             values[number] = outcome.value
         return [values[number] for number in range(len(calls))]
 
-    def _idle_worker(self, running: "dict[_Worker, _Call]") -> "_Worker":
+    def _find_idle_worker(self, running: "dict[_Worker, _Call]") -> "_Worker":
+        """Return a worker without a call; a new one is started if there is none."""
         for worker in self._workers:
             if worker not in running:
                 return worker
@@ -154,17 +162,18 @@ class WorkerPool:
         self._workers.append(worker)
         return worker
 
-    def _workers_with_news(self, running: "dict[_Worker, _Call]") -> "list[_Worker]":
-        """Wait until calls are done, have failed, or take too long; return their workers."""
-        until_s = min(call.deadline_s for call in running.values()) - time.monotonic()
-        timeout_s = None if until_s == float("inf") else max(until_s, 0.0)
+    def _wait_for_workers(self, running: "dict[_Worker, _Call]") -> "list[_Worker]":
+        """Wait until calls are done, have failed, or take too long, and return their workers."""
+        left_s = min(call.deadline_s for call in running.values()) - time.monotonic()
+        timeout_s = None if left_s == float("inf") else max(left_s, 0.0)
         readable = wait([worker.connection for worker in running], timeout_s)
-        now = time.monotonic()
-        return [worker for worker, call in running.items() if worker.connection in readable or now >= call.deadline_s]
+        now_s = time.monotonic()
+        return [worker for worker, call in running.items() if worker.connection in readable or now_s >= call.deadline_s]
 
     def _receive(self, worker: "_Worker", call: _Call) -> Outcome | None:
-        """Return the outcome of a call; None when it is to be tried again."""
-        if not worker.connection.poll():
+        """Return the outcome of a call, or None if the call is tried again."""
+        is_done = worker.connection.poll()
+        if not is_done:
             self._discard(worker)
             return Raised(CallTookTooLongError())
         try:
@@ -172,28 +181,32 @@ class WorkerPool:
         except (EOFError, OSError):
             self._discard(worker)
             call.deaths += 1
-            return Raised(WorkerDiedError()) if call.deaths >= MAX_DEATHS else None
+            if call.deaths < MAX_DEATHS:
+                return None
+            return Raised(WorkerDiedError())
         if isinstance(outcome, Raised):
             call.raises += 1
-            return outcome if call.raises >= MAX_RAISES else None
+            if call.raises < MAX_RAISES:
+                return None
         return outcome
 
     def _discard(self, worker: "_Worker") -> None:
+        """Kill a worker and remove its temporary files."""
         worker.kill()
         self._workers.remove(worker)
         shutil.rmtree(worker.folder, ignore_errors=True)
 
 
 def _remove_abandoned_folders() -> None:
-    """Remove the folders of commands of this user that were killed."""
+    """Remove the folders of this user's pools that were killed, and could not remove them."""
     for folder in Path(gettempdir()).glob(f"{FOLDER_PREFIX}*"):
         with contextlib.suppress(OSError):
             state = folder.lstat()
-            if state.st_uid != os.geteuid() or time.time() - state.st_ctime < UNLOCKED_S:
+            if state.st_uid != os.geteuid() or time.time() - state.st_ctime < MAX_UNLOCKED_S:
                 continue
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails for one that is in use
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises for a folder that is in use
                 shutil.rmtree(folder, ignore_errors=True)
             finally:
                 os.close(handle)
@@ -201,42 +214,48 @@ def _remove_abandoned_folders() -> None:
 
 @dataclass(eq=False)
 class _Worker:
-    """One process, seen from the command that started it."""
+    """A worker process, as the process that started it controls it."""
 
-    folder: Path  # for its temporary files
+    folder: Path  # for the worker's temporary files
     connection: Connection = field(init=False)
 
     def __post_init__(self) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
+        command_end, worker_end = socket.socketpair()
+        with worker_end:
             self._process = subprocess.Popen(
-                python_command("-c", BEGIN, str(theirs.fileno()), str(os.getpid())),
+                python_command("-c", WORKER_PROGRAM, str(worker_end.fileno()), str(os.getpid())),
                 env=child_environment(
-                    arithmetic.common_environment(), arithmetic.ONE_THREAD, {TEMPORARY_FILES: str(self.folder)}
+                    arithmetic.common_environment(),
+                    arithmetic.ONE_THREAD,
+                    {TEMPORARY_FOLDER_VARIABLE: str(self.folder)},
                 ),
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # so that Ctrl-C reaches the command alone, also while this one starts
-                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # Ctrl-C then reaches the command alone, also while the worker starts
+                pass_fds=[worker_end.fileno()],
             )
-        self.connection = Connection(ours.detach())
+        self.connection = Connection(command_end.detach())
 
     def send(self, job: tuple[Callable[..., Any], Sequence[Any]]) -> None:
-        """Have it make a call. One that has died is noticed when its answer is read."""
+        """Send a call to the worker. If the worker has died, this is noticed when its outcome is read."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(job)
 
     def kill(self) -> None:
-        """End it, and wait until it has ended."""
+        """Kill the worker, and wait until it has ended."""
         self._process.kill()
         self._process.wait()
         self.connection.close()
 
 
 def main(argv: Sequence[str]) -> int:
-    """The worker itself. The arguments are its end of the socket pair and its parent's process id."""
+    """Run the worker: receive calls and send their outcomes, until the command closes the connection.
+
+    Args:
+        argv: the handle of the worker's end of the socket pair, and the process id of the command.
+    """
     handle, parent = map(int, argv)
     die_with_parent(parent)
-    os.nice(max(NICENESS - os.nice(0), 0))  # a command under `nice` is not sent further back
+    os.nice(max(NICENESS - os.nice(0), 0))  # a command that was started with `nice` keeps its priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Connection(handle) as connection:
         while True:
@@ -246,13 +265,13 @@ def main(argv: Sequence[str]) -> int:
                 return 0
             try:
                 outcome: Outcome = Returned(function(*arguments))
-            except Exception as error:  # noqa: BLE001 - whatever it is, the caller gets it
+            except Exception as error:  # noqa: BLE001 - the caller gets every exception
                 outcome = Raised(_portable(error))
             connection.send(outcome)
 
 
 def _portable(error: Exception) -> Exception:
-    """The exception, or one with its text if another process could not read it."""
+    """Return the exception, or a RuntimeError with its text if the exception cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # noqa: BLE001 - pickling runs code of the exception's class

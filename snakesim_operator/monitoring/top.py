@@ -3,7 +3,8 @@
 import contextlib
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import msgspec
 
@@ -17,107 +18,154 @@ from snakesim_operator.monitoring.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
 ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
-HEAD = f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'heard':>8}"
-
-TIMES_HEAD = (
+KEY_COLUMNS = f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'heard':>8}"
+TIMES_COLUMNS = (
     f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  {'histogram, from the shortest to the longest'}"
 )
 BARS = "▁▂▃▄▅▆▇█"
 
 
-def top(where: RobotSelection, say: PrintLine = print_line, *, once: bool, as_json: bool) -> int:
-    """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError.
+def top(where: RobotSelection, report: PrintLine = print_line, *, once: bool, as_json: bool) -> int:
+    """Measure the traffic of all selected robots, and print it every second until Ctrl-C.
 
-    once: listen for a moment, print one table, end. as_json: a line of JSON for each table.
+    Args:
+        where: selects the robots.
+        report: gets the lines of the tables.
+        once: measure for ONCE_S, print one table and end.
+        as_json: print a line of JSON for each table.
+
+    Returns:
+        0; or 1 if `once` was given and nothing arrived.
+
+    Raises:
+        NotConnectedError: no robot is reachable.
     """
     with contextlib.ExitStack() as stack:
-        traffics = [_listen(link.namespace, session) for link, session in sessions_on(where, stack)]
-        drawn = 0
+        traffics = [_measure_traffic(link.namespace, session) for link, session in sessions_on(where, stack)]
+        drawn_lines = 0
         while True:
             time.sleep(ONCE_S if once else PERIOD_S)
-            now_ns = time.monotonic_ns()
-            lines = [line for traffic in traffics for line in traffic.lines(now_ns)]
-            latencies = [latency for traffic in traffics for latency in traffic.latencies()]
-            times = {robot: found for traffic in traffics for robot, found in traffic.tick_times().items() if found}
-            descriptions = {robot: found for traffic in traffics for robot, found in traffic.descriptions().items()}
-            left_out = sum(traffic.keys_left_out for traffic in traffics)
+            snapshot = _take_snapshot(traffics)
             if as_json:
-                content = {
-                    "emulated": {robot: found.emulated for robot, found in descriptions.items()},  # missing: unknown
-                    "keys": lines,
-                    "latencies": latencies,
-                    "tick_times": times,
-                    "left_out": left_out,
-                }
-                print_json(msgspec.to_builtins(content), say)
+                _report_json(snapshot, report)
+            elif sys.stdout.isatty() and not once:
+                drawn_lines = overwrite_lines(snapshot.format_table(), drawn_lines)
             else:
-                table = table_of(lines, latencies, times, left_out, descriptions)
-                if sys.stdout.isatty() and not once:
-                    drawn = overwrite_lines(table, drawn)
-                else:
-                    for line in table:
-                        say(line)
+                for line in snapshot.format_table():
+                    report(line)
             if once:
-                return 0 if lines else 1
+                return 0 if snapshot.lines else 1
 
 
-def _listen(namespace: str | None, session: Session) -> Traffic:
-    """Subscribe to everything on a network."""
+def _measure_traffic(namespace: str | None, session: Session) -> Traffic:
+    """Subscribe to everything on a network, and return its traffic.
+
+    Args:
+        namespace: of the only robot; None if the network has several.
+        session: on this network.
+    """
     traffic = Traffic(namespace)
 
-    def take_strange(arrival: Arrival) -> None:
+    def add_unknown_key(arrival: Arrival) -> None:
         if not traffic.is_known(arrival.key):
             traffic.add(arrival)
 
-    # Key by key, because a lab's router may grant no wildcard; the last value of those that are latched, too.
+    # The key space is subscribed key by key, because a lab's router may grant no wildcard.
     for row in keys.SPACE:
         key = row.key if namespace is not None else f"**/{row.key}"
         if row.kind == "latched":
             session.on_latched_arrival(key, traffic.add)
         elif row.kind == "stream":
             session.on_arrival(key, traffic.add)
-    session.on_arrival("**", take_strange)
+    session.on_arrival("**", add_unknown_key)
     return traffic
 
 
-def table_of(
-    lines: list[KeyTraffic],
-    latencies: list[Latency],
-    times: Mapping[str, Mapping[str, Timing]],
-    left_out: int,
-    descriptions: Mapping[str, Description],
-) -> list[str]:
-    """Returns the table as lines of text: robot by robot, what is not of the key space at the end of each."""
-    if not lines:
-        return ["nothing arrives"]
-    text: list[str] = []
-    for robot in dict.fromkeys(line.robot for line in lines):
-        if text:
-            text.append("")
-        name = f"{robot}: {describe_what_moves(descriptions.get(robot))}" if robot else "of no robot:"
-        text += [name, HEAD]
-        text += [_row(line) for line in lines if line.robot == robot]
-        for latency in latencies:
-            if latency.robot == robot:
-                text.append(_latency(latency))
-        if robot in times:
-            text += [TIMES_HEAD, *(_times(name, timing) for name, timing in times[robot].items())]
-    if left_out:
-        text.append(f"and {left_out} messages on still more keys: somebody floods this network")
-    return text
+@dataclass(frozen=True)
+class TrafficSnapshot:
+    """The traffic on all networks at one time."""
+
+    lines: Sequence[KeyTraffic]
+    latencies: Sequence[Latency]
+    tick_times: Mapping[str, Mapping[str, Timing]]  # by robot; without those that have no times yet
+    descriptions: Mapping[str, Description]  # by robot
+    left_out: int  # messages on more keys than are counted
+
+    def format_table(self) -> list[str]:
+        """Return the table as lines of text: robot by robot, with unknown keys at the end of each."""
+        if not self.lines:
+            return ["nothing arrives"]
+        table: list[str] = []
+        for robot in dict.fromkeys(line.robot for line in self.lines):
+            if table:
+                table.append("")
+            table += self._format_robot(robot)
+        if self.left_out:
+            table.append(f"and {self.left_out} messages on still more keys: a client floods this network")
+        return table
+
+    def _format_robot(self, robot: str) -> list[str]:
+        """Return the lines of one robot; the name is empty for keys that belong to no robot."""
+        table: list[str] = []
+        if robot:
+            table.append(f"{robot}: {describe_what_moves(self.descriptions.get(robot))}")
+        else:
+            table.append("of no robot:")
+        table.append(KEY_COLUMNS)
+        table += [_format_key(line) for line in self.lines if line.robot == robot]
+        table += [_format_latency(latency) for latency in self.latencies if latency.robot == robot]
+        if robot in self.tick_times:
+            table.append(TIMES_COLUMNS)
+            table += [_format_timing(name, timing) for name, timing in self.tick_times[robot].items()]
+        return table
 
 
-def _times(name: str, timing: Timing) -> str:
-    """A line of how long something took, with its histogram from the shortest to the longest."""
-    most = max(timing.bins)
-    bars = "".join(" " if not count else BARS[(len(BARS) - 1) * count // most] for count in timing.bins)
-    numbers = "".join(f" {us * 1e-3:>9.3f}" for us in (timing.median_us, timing.p99_us, timing.max_us))
-    return f"{name:<10} {TICK_TIMES.get(name, ''):<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
+def _take_snapshot(traffics: Sequence[Traffic]) -> TrafficSnapshot:
+    """Evaluate the traffic of all networks."""
+    now_ns = time.monotonic_ns()
+    lines: list[KeyTraffic] = []
+    latencies: list[Latency] = []
+    tick_times: dict[str, Mapping[str, Timing]] = {}
+    descriptions: dict[str, Description] = {}
+    left_out = 0
+    for traffic in traffics:
+        lines += traffic.lines(now_ns)
+        latencies += traffic.latencies()
+        tick_times |= {robot: times for robot, times in traffic.tick_times().items() if times}
+        descriptions |= traffic.descriptions()
+        left_out += traffic.keys_left_out
+    return TrafficSnapshot(lines, latencies, tick_times, descriptions, left_out)
 
 
-def _latency(latency: Latency) -> str:
+def _report_json(snapshot: TrafficSnapshot, report: PrintLine) -> None:
+    """Print a snapshot as one line of JSON."""
+    # A robot without a description is missing in `emulated`: whether it is emulated is unknown.
+    emulated = {robot: description.emulated for robot, description in snapshot.descriptions.items()}
+    content = {
+        "emulated": emulated,
+        "keys": snapshot.lines,
+        "latencies": snapshot.latencies,
+        "tick_times": snapshot.tick_times,
+        "left_out": snapshot.left_out,
+    }
+    print_json(msgspec.to_builtins(content), report)
+
+
+def _format_timing(name: str, timing: Timing) -> str:
+    """Return the line of a duration, with its histogram from the shortest to the longest."""
+    max_count = max(timing.bins)
+    bars = ""
+    for count in timing.bins:
+        bars += BARS[(len(BARS) - 1) * count // max_count] if count else " "
+    description = TICK_TIMES.get(name, "")
+    numbers = "".join(f" {time_us * 1e-3:>9.3f}" for time_us in (timing.median_us, timing.p99_us, timing.max_us))
+    return f"{name:<10} {description:<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
+
+
+def _format_latency(latency: Latency) -> str:
+    """Return the line of a robot's latency."""
     text = (
-        f"state to command, as heard here: {latency.heard_median_ms:.2f} ms in the median, "
+        f"state to command, as measured here: {latency.heard_median_ms:.2f} ms in the median, "
         f"at most {latency.heard_p99_ms:.2f} ms for 99 % of {latency.count} commands"
     )
     if latency.motors_median_ms is not None:
@@ -125,14 +173,21 @@ def _latency(latency: Latency) -> str:
     return text
 
 
-def _row(line: KeyTraffic) -> str:
-    def number(value: float | None, form: str, unit: str) -> str:
-        return "-" if value is None else f"{value:{form}}{unit}"
-
-    writer = line.writer or "STRANGER"
+def _format_key(line: KeyTraffic) -> str:
+    """Return the line of one key."""
+    writer = line.writer or "UNKNOWN"
+    rate = _format_number(line.rate_hz, ".1f", "")
+    jitter = _format_number(line.jitter_ms, ".2f", " ms")
+    max_gap = _format_number(line.gap_max_ms, ".1f", " ms")
+    age = _format_number(line.age_ms, ".0f", " ms")
+    last_arrival = _format_number(line.heard_ago_s, ".1f", " s")
     failure = f"  {line.failure}" if line.failure else ""
     return (
-        f"{line.key[:29]:<29} {writer[:17]:<17} {number(line.rate_hz, '.1f', ''):>7} "
-        f"{number(line.jitter_ms, '.2f', ' ms'):>9} {number(line.gap_max_ms, '.1f', ' ms'):>9} {line.bytes:>8} "
-        f"{number(line.age_ms, '.0f', ' ms'):>8} {number(line.heard_ago_s, '.1f', ' s'):>8}{failure}"
+        f"{line.key[:29]:<29} {writer[:17]:<17} {rate:>7} {jitter:>9} {max_gap:>9} {line.bytes:>8} "
+        f"{age:>8} {last_arrival:>8}{failure}"
     )
+
+
+def _format_number(value: float | None, number_format: str, unit: str) -> str:
+    """Return a number with its unit, or `-` for an unknown one."""
+    return "-" if value is None else f"{value:{number_format}}{unit}"

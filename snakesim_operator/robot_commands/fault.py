@@ -25,7 +25,7 @@ class FaultOrder:
 
 
 def list_faults(*, as_json: bool) -> int:
-    """Explain every kind of fault."""
+    """Explain every kind of fault, as text or as JSON. Returns the exit code."""
     if as_json:
         kinds = [
             {"kind": name, "target": target, "about": kind.about}
@@ -39,13 +39,53 @@ def list_faults(*, as_json: bool) -> int:
     return 0
 
 
-def inject_fault(order: FaultOrder, where: RobotSelection, print_line: PrintLine = print_line) -> int:
-    """Send the request to the responsible part. Raises RefusedError if it refuses, NotConnectedError without answer."""
-    kinds = sorted({kind for of_target in KINDS.values() for kind in of_target})
+def inject_fault(order: FaultOrder, where: RobotSelection, report: PrintLine = print_line) -> int:
+    """Inject a fault into a run, or end it.
+
+    Args:
+        order: the command's options.
+        where: selects the robot.
+        report: gets the answer of the process that did it.
+
+    Returns:
+        0, the exit code of the command.
+
+    Raises:
+        ConfigError: there is no such fault, or the options contradict each other.
+        RefusedError: the run does not allow the fault.
+        NotConnectedError: the process that can do it does not answer.
+    """
+    injection = _check_order(order)
+    request = FaultRequest(
+        kind=order.kind,
+        target=order.target,
+        for_s=order.for_s,
+        amount=order.amount,  # without the default, which the process fills in itself
+        end=order.end,
+    )
+    link = only_robot(where, f"fault inject {order.kind} {order.target}")
+    with open_session(link, CONNECT_S) as session:
+        try:
+            answer = session.request(keys.fault_key(injection.part), request, ANSWER_S)
+        except NotConnectedError:
+            raise NotConnectedError(
+                f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "
+                f"shows which services are alive"
+            ) from None
+    if not answer.ok:
+        raise RefusedError(f"not done: {answer.reason}")
+    report(answer.reason)
+    return 0
+
+
+def _check_order(order: FaultOrder) -> Injection:
+    """Return the injection that the options describe. Raises ConfigError for options that cannot be."""
+    kinds = sorted({kind for kinds_of_target in KINDS.values() for kind in kinds_of_target})
     if order.kind not in kinds:
-        meant = suggest_word(order.kind, kinds)
+        suggestion = suggest_word(order.kind, kinds)
         raise ConfigError(
-            f"fault inject {shorten(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all",
+            f"fault inject {shorten(order.kind)}: there is no such kind; {suggestion}"
+            "`snakesim fault list` explains all",
             code="injection/unknown-fault",
         )
     injection = check_injection(
@@ -57,16 +97,4 @@ def inject_fault(order: FaultOrder, where: RobotSelection, print_line: PrintLine
         raise ConfigError(
             f"{order.kind} happens once and has no end; omit --duration and --end", code="injection/unknown-fault"
         )
-    request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
-    with open_session(only_robot(where, f"fault inject {order.kind} {order.target}"), CONNECT_S) as session:
-        try:
-            answer = session.request(keys.fault_key(injection.part), request, ANSWER_S)
-        except NotConnectedError:
-            raise NotConnectedError(
-                f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "
-                f"shows which services are alive"
-            ) from None
-    if not answer.ok:
-        raise RefusedError(f"not done: {answer.reason}")
-    print_line(answer.reason)
-    return 0
+    return injection

@@ -1,4 +1,4 @@
-"""The console beside a run: a child process that dies with it, and that the run does not depend on."""
+"""The console of a run: a child process that ends with the run. If the console fails, the run is not disturbed."""
 
 import contextlib
 import importlib.util
@@ -12,11 +12,11 @@ from snakesim_operator.run import children
 from snakesim_operator.run.run_files import RunFiles
 
 CONSOLE = "snakesim_operator.features.console"
-LOG = "console.log"
+LOG = "console.log"  # in the folder of the run
 
 
 def check_console() -> None:
-    """Raise ConfigError when the console, or what it needs, is not installed."""
+    """Check that the console and the packages that it needs are installed. Raises ConfigError if they are not."""
     if importlib.util.find_spec(CONSOLE) is None:
         raise ConfigError(
             "--console: this installation is one without the console; leave it out", code="extra/not-installed"
@@ -25,13 +25,20 @@ def check_console() -> None:
 
 
 @contextlib.contextmanager
-def console_beside(common: Sequence[str], files: RunFiles, say: Callable[[str], None]) -> Iterator[None]:
-    """Show the run in the browser for as long as the context lives. common: the arguments of each of its processes."""
-    with open_port(None) as listening:  # only the console keeps it open: when that has ended, browsers are told at once
+def console_beside(common: Sequence[str], files: RunFiles, report: Callable[[str], None]) -> Iterator[None]:
+    """Run the console for as long as the context lives.
+
+    Args:
+        common: arguments that every process of the run gets, such as its scenario and endpoint.
+        files: get what the console prints.
+        report: gets the address of the page.
+    """
+    # This process closes the port again: if the console ends, browsers then lose their connection at once.
+    with open_port(None) as listening:
         handle = listening.fileno()
         arguments = [CONSOLE, *common, "--listening", str(handle)]
         child = children.start_child("console", arguments, partial(files.append, LOG), inherits=[handle])
-        say(f"console: {page_address(listening)}")
+        report(f"console: {page_address(listening)}")
     try:
         yield
     finally:

@@ -5,7 +5,6 @@ import fcntl
 import os
 from collections.abc import Callable, Iterator
 from datetime import datetime
-from itertools import count
 from pathlib import Path
 
 from snakesim_hal.base.atomic_write import PARTIAL
@@ -15,117 +14,156 @@ from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
 
 LOCK = "run.lock"  # holds the process id of the run that is writing here
-OLDER = ("telemetry.jsonl", "blackbox.npz")  # of older versions
-LEFT = (CONFIG, HOST_RECORD, BLACK_BOX, RECORDING, SUMMARY, REPORT, *OLDER)
-TIME = "%Y%m%d-%H%M%S"
+FILES_OF_OLDER_VERSIONS = ("telemetry.jsonl", "blackbox.npz")
+RUN_FILES = (CONFIG, HOST_RECORD, BLACK_BOX, RECORDING, SUMMARY, REPORT, *FILES_OF_OLDER_VERSIONS)
+TIME_FORMAT = "%Y%m%d-%H%M%S"
+MAX_OPEN_ATTEMPTS = 10  # of a folder that others rename meanwhile
 
 
 def default_folder(name: str) -> Path:
-    """The default folder of a run: runs/NAME-TIME."""
-    out = Path("runs") / f"{name}-{datetime.now().strftime(TIME)}"
-    return _free(out)
+    """Return the default folder of a run, runs/NAME-TIME, which does not exist yet."""
+    out = Path("runs") / f"{name}-{datetime.now().strftime(TIME_FORMAT)}"
+    return _find_free_path(out)
 
 
 @contextlib.contextmanager
-def locked_folder(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
-    """Lock a folder for a run, after renaming an earlier run there; the kernel unlocks it after a SIGKILL.
+def locked_folder(out: Path, report: Callable[[str], None]) -> Iterator[Path]:
+    """Lock a folder for a run, for as long as the context lives. The kernel unlocks it after a SIGKILL.
 
-    Raises ConfigError when another run has locked it or it is not usable, OSError when it is not writable.
+    An earlier run in the folder is renamed first.
+
+    Args:
+        out: the folder; made if it does not exist.
+        report: gets a sentence if an earlier run was renamed.
+
+    Yields:
+        The absolute path of the folder.
+
+    Raises:
+        ConfigError: another run has locked the folder, or it is not usable.
+        OSError: the folder is not writable.
     """
     out = out.resolve()
-    with contextlib.ExitStack() as held:
-        held.enter_context(_lock(out))
-        if any((out / name).exists() for name in LEFT):
-            aside = _move_aside(out)
-            say(f"{out} held an earlier run: moved to {aside}")
-            held.enter_context(_lock(out))
+    with contextlib.ExitStack() as locks:
+        locks.enter_context(_lock(out))
+        if any((out / name).exists() for name in RUN_FILES):
+            renamed = _rename_earlier_run(out)
+            report(f"{out} held an earlier run: moved to {renamed}")
+            locks.enter_context(_lock(out))
         try:
             yield out
         finally:
-            for partial in out.glob(f"*{PARTIAL}"):  # of a process that was killed while writing
-                with contextlib.suppress(OSError):
-                    partial.unlink()
+            _remove_partial_files(out)
+
+
+def _remove_partial_files(out: Path) -> None:
+    """Remove what processes that were killed while writing have left."""
+    for partial in out.glob(f"*{PARTIAL}"):
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 @contextlib.contextmanager
 def _lock(out: Path) -> Iterator[None]:
+    """Hold the lock file of a folder, which is removed at the end. Raises ConfigError when another run holds it."""
     path = out / LOCK
-    while True:
-        folder = _opened(out)
-        try:
-            handle = os.open(LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644, dir_fd=folder)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                holder = os.pread(handle, 20, 0).decode(errors="replace").strip()
-                os.close(handle)
-                raise ConfigError(
-                    f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
-                    "choose another folder, or end that run",
-                    code="file/in-use",
-                ) from None
-            if _is(handle, path):
-                break
-            # The run that had locked it has just ended, or has moved this folder aside: it is an earlier run's now.
-            with contextlib.suppress(OSError):
-                if os.path.samestat(os.fstat(handle), os.stat(LOCK, dir_fd=folder)):
-                    os.unlink(LOCK, dir_fd=folder)
-            os.close(handle)
-        finally:
-            os.close(folder)
+    lock_handle = None
+    while lock_handle is None:
+        lock_handle = _try_to_lock(out)
     try:
         with contextlib.suppress(OSError):  # a full disk: the lock is valid, but without the process id
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, str(os.getpid()).encode(), 0)
+            os.ftruncate(lock_handle, 0)
+            os.pwrite(lock_handle, str(os.getpid()).encode(), 0)
         yield
     finally:
         with contextlib.suppress(OSError):
-            if _is(handle, path):
+            if _is_same_file(lock_handle, path):
                 path.unlink()
-        os.close(handle)
+        os.close(lock_handle)
 
 
-def _opened(out: Path) -> int:
-    """The folder, made if it is not there."""
-    attempts = 10
+def _try_to_lock(out: Path) -> int | None:
+    """Lock the lock file of a folder once.
+
+    Returns:
+        The handle of the locked file. None if the file at that path is no longer the locked one, because the run that
+        had locked it has just ended or the folder was renamed: then the caller tries again.
+    """
+    folder_handle = _open_folder(out)
+    try:
+        lock_handle = os.open(LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644, dir_fd=folder_handle)
+        try:
+            fcntl.flock(lock_handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(lock_handle, 20, 0).decode(errors="replace").strip()
+            os.close(lock_handle)
+            raise ConfigError(
+                f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
+                "choose another folder, or end that run",
+                code="file/in-use",
+            ) from None
+        if _is_same_file(lock_handle, out / LOCK):
+            return lock_handle
+        with contextlib.suppress(OSError):
+            # In a renamed folder the lock file may still be there: that folder holds an earlier run now.
+            if os.path.samestat(os.fstat(lock_handle), os.stat(LOCK, dir_fd=folder_handle)):
+                os.unlink(LOCK, dir_fd=folder_handle)
+        os.close(lock_handle)
+        return None
+    finally:
+        os.close(folder_handle)
+
+
+def _open_folder(out: Path) -> int:
+    """Return a handle of the folder, which is made if it does not exist. Raises ConfigError."""
+    attempts_left = MAX_OPEN_ATTEMPTS
     while True:
-        attempts -= 1
+        attempts_left -= 1
         try:
             out.mkdir(parents=True, exist_ok=True)
             return os.open(out, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
         except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
-            if not attempts or not isinstance(error, FileNotFoundError):  # it may have been moved aside in between
+            was_just_renamed = isinstance(error, FileNotFoundError)
+            if not attempts_left or not was_just_renamed:
                 raise ConfigError(
                     f"--out {out}: {error.strerror}: {error.filename}; choose another folder", code="file/not-writable"
                 ) from error
 
 
-def _is(handle: int, path: Path) -> bool:
+def _is_same_file(handle: int, path: Path) -> bool:
+    """Return whether the open file is the one at the path."""
     try:
         return os.path.samestat(os.fstat(handle), path.stat())
     except FileNotFoundError:
         return False
 
 
-def _move_aside(out: Path) -> Path:
+def _rename_earlier_run(out: Path) -> Path:
+    """Rename a folder to FOLDER.TIME, with the time of its earlier run, and return the new path. Raises ConfigError."""
     if Path.cwd().is_relative_to(out):
         raise ConfigError(
             f"--out {out} holds an earlier run, and you are in it; choose another folder", code="file/already-exists"
         )
-    began_s = min((out / name).stat().st_mtime for name in LEFT if (out / name).exists())
-    aside = _free(out.with_name(f"{out.name}.{datetime.fromtimestamp(began_s).strftime(TIME)}"))
+    began_s = min((out / name).stat().st_mtime for name in RUN_FILES if (out / name).exists())
+    began = datetime.fromtimestamp(began_s).strftime(TIME_FORMAT)
+    renamed = _find_free_path(out.with_name(f"{out.name}.{began}"))
     try:
-        out.rename(aside)
+        out.rename(renamed)
     except OSError as error:
         raise ConfigError(
-            f"--out {out} holds an earlier run that cannot be moved to {aside}: {error.strerror}; "
+            f"--out {out} holds an earlier run that cannot be moved to {renamed}: {error.strerror}; "
             "choose another folder",
             code="file/already-exists",
         ) from error
-    (aside / LOCK).unlink(missing_ok=True)
-    return aside
+    (renamed / LOCK).unlink(missing_ok=True)
+    return renamed
 
 
-def _free(path: Path) -> Path:
-    """The path, with a number appended if it exists."""
-    return next(p for n in count(1) if not (p := path if n == 1 else path.with_name(f"{path.name}-{n}")).exists())
+def _find_free_path(path: Path) -> Path:
+    """Return the path, with a number appended if it exists."""
+    free_path = path
+    number = 1
+    while free_path.exists():
+        number += 1
+        free_path = path.with_name(f"{path.name}-{number}")
+    return free_path

@@ -1,4 +1,4 @@
-"""`snakesim start host`: the HAL host of a robot alone, with its record. Services join it from any machine."""
+"""`snakesim start host`: the HAL host of a robot alone. Services connect to it, from this or from other machines."""
 
 import argparse
 import contextlib
@@ -13,13 +13,24 @@ from snakesim_operator.run.folder import locked_folder
 
 
 def run_host(arguments: argparse.Namespace) -> int:
-    """Run it to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError."""
-    given = process_options(arguments, hosts=True)
-    config = check_backend(given.config, given.loaded.table)
-    with contextlib.ExitStack() as held:
+    """Run a host to its end.
+
+    Args:
+        arguments: the parsed command line. If it names a folder with `--out`, the host keeps its record there.
+
+    Returns:
+        0 if all ticks were done without a fault, 1 otherwise.
+
+    Raises:
+        SnakesimError: the host cannot begin.
+    """
+    options = process_options(arguments, hosts=True)
+    link = options.link
+    config = check_backend(options.config, options.loaded.table)
+    with contextlib.ExitStack() as opened:
         if arguments.out is not None:
-            arguments.out = held.enter_context(locked_folder(arguments.out, print_line))
+            arguments.out = opened.enter_context(locked_folder(arguments.out, print_line))
             write_config(config, arguments.out / CONFIG)
-        print_line(f"{given.link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
-        print_line(f"network: {given.link.endpoint}, namespace {given.link.namespace}; Ctrl-C ends it")
-        return host(given)
+        print_line(f"{link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
+        print_line(f"network: {link.endpoint}, namespace {link.namespace}; Ctrl-C ends it")
+        return host(options)

@@ -88,7 +88,7 @@ class ControlFailure:
 
 @dataclass(frozen=True)
 class Result:
-    """A run that is over; `summary.ended` says how it ended."""
+    """A run that is over; `summary.ended` is how it ended."""
 
     record: RunRecord  # every tick, and what control and guidance reported
     summary: RunSummary

@@ -1,4 +1,4 @@
-"""The endpoint of a run, which no other run can have, and its stop port."""
+"""Chooses the endpoint of a run, which no other run can have, and opens the run's stop port."""
 
 import contextlib
 import socket
@@ -11,39 +11,57 @@ from snakesim_hal.wire import keys
 from snakesim_operator.base.targets import CONNECT_S, robots_on
 
 LOOPBACK = "127.0.0.1"
-TRIES = 10
+ANY_PORT = 0  # the kernel chooses one
+MAX_ATTEMPTS = 10  # with ports that the kernel chooses
 
 
 def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tuple[Link, socket.socket]:
-    """Where the run's parts meet, and its stop port, which this process keeps bound until the run is over.
+    """Choose the endpoint at which the processes of a run connect, and open the stop port there.
 
-    Two runs that start at the same moment cannot get the same endpoint, because a port has one holder. Without
-    `endpoint` it is the default port, or any other if that is in use.
+    The caller keeps the stop port bound until the run is over. So two runs that start at the same moment cannot get the
+    same endpoint: a port has one holder.
+
+    Args:
+        endpoint: on the loopback interface; None: the default port, or any other if that is in use.
+        lab: the router of a lab to connect to instead; None: the run has a router of its own.
+        namespace: of the robot.
+
+    Returns:
+        The link to the endpoint, and the open stop port.
 
     Raises:
         NotConnectedError: no port is free.
         RefusedError: the loopback interface is down.
     """
     if lab is not None:
-        return lab, open_stop_port(*stop_address(lab.endpoint, listens=False))
+        host, port = stop_address(lab.endpoint, listens=False)
+        return lab, open_stop_port(host, port)
     check_loopback(endpoint or f"tcp/{LOOPBACK}:{DEFAULT_PORT}")
     if endpoint is not None:
-        stop_port = open_stop_port(*stop_address(endpoint, listens=True))
-        return Link(endpoint, namespace), stop_port
-    for wanted in (DEFAULT_PORT, *[0] * TRIES):
-        with contextlib.suppress(NotConnectedError):
-            stop_port = open_stop_port(LOOPBACK, wanted)
-            port: int = stop_port.getsockname()[1]
-            if _is_free(port):
-                return Link(f"tcp/{LOOPBACK}:{port}", namespace), stop_port
-            stop_port.close()
+        host, port = stop_address(endpoint, listens=True)
+        return Link(endpoint, namespace), open_stop_port(host, port)
+    for requested_port in (DEFAULT_PORT, *[ANY_PORT] * MAX_ATTEMPTS):
+        try:
+            stop_port = open_stop_port(LOOPBACK, requested_port)
+        except NotConnectedError:
+            continue
+        bound_port: int = stop_port.getsockname()[1]
+        if _is_tcp_port_free(bound_port):
+            return Link(f"tcp/{LOOPBACK}:{bound_port}", namespace), stop_port
+        stop_port.close()
     raise NotConnectedError("no free port on the loopback interface", code="network/port-in-use")
 
 
 def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
-    """Raise RefusedError when there is a robot already: two would have one name, or share an endpoint.
+    """Check that no other robot has the name, or the endpoint, of the run that begins.
 
-    Raises NotConnectedError when there is no such router.
+    Args:
+        endpoint: on the loopback interface, as the user gave it; None: any.
+        lab: the router of a lab to connect to; None: the run has a router of its own.
+
+    Raises:
+        RefusedError: another robot is there.
+        NotConnectedError: there is no such router.
     """
     if lab is not None:
         with open_session(lab, CONNECT_S) as session:
@@ -55,15 +73,16 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
                 )
     elif endpoint is not None:
         with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_S) as session:
-            there = ", ".join(robots_on(session)) or "another host"
+            others = ", ".join(robots_on(session)) or "another host"
             raise RefusedError(
-                f"{there} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
+                f"{others} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
                 f"--router {endpoint} with another --namespace",
                 code="robot/already-running",
             )
 
 
-def _is_free(port: int) -> bool:
+def _is_tcp_port_free(port: int) -> bool:
+    """Return whether Zenoh can listen at this port of the loopback interface."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -1,6 +1,6 @@
-"""Findings of `snakesim doctor` about the computer: each says what is there, and how to fix it.
+"""Findings of `snakesim doctor` about the computer: each reports what is there, and how to fix it.
 
-`fail`: no run is possible; `warn`: something that some users need is missing.
+`fail` means that no run is possible, and `warn` that something is missing which some users need.
 """
 
 import ctypes
@@ -30,14 +30,22 @@ from snakesim_operator.base import extras
 
 MIN_PYTHON = (3, 11)
 PROBE_LIMIT_S = 30.0
-CAN_DEVICE = "280"  # ARPHRD_CAN in if_arp.h
-TIME_ERROR = 5  # adjtimex: the clock is not synchronised
+ARPHRD_CAN = "280"  # the type of a CAN interface in /sys/class/net, from if_arp.h
+IFF_UP = 1  # the flag of an interface that is up, from if.h
+ADJTIMEX_TIME_ERROR = 5  # adjtimex returns it if the clock is not synchronized
 TIMEX_BYTES = 256  # more than a struct timex
-LATE_WARN_S = 0.002  # a wake-up this late costs a tick at 500 Hz
-LIMITS = "/etc/security/limits.d/snakesim.conf"
-GB, MB = 1024**3, 1024**2
+WAKE_UPS = 100
+WAKE_UP_PERIOD_S = 0.001
+MAX_WAKE_UP_DELAY_S = 0.002  # a longer one costs a tick at 500 Hz
+MIN_OPEN_FILES = 4096
+LIMITS_FILE = "/etc/security/limits.d/snakesim.conf"
+MB = 1024**2
+GB = 1024**3
+WARN_FREE_BYTES = GB
+MIN_FREE_BYTES = 100 * MB
+MAX_ERROR_LENGTH = 100
 
-OPENGL = """
+RENDER_ONE_IMAGE = """
 import os, mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light/><geom size='.1'/></worldbody></mujoco>")
 with mujoco.Renderer(model, 32, 32) as renderer:
@@ -58,67 +66,80 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     code: str | None = None  # of the error that was found
 
 
-def python() -> Iterator[Finding]:
-    """The interpreter."""
+def check_python() -> Iterator[Finding]:
+    """Check the version of the interpreter."""
     detail = f"{sys.version.split()[0]} at {sys.executable}"
     if sys.version_info >= MIN_PYTHON:
         yield Finding(what="Python", state="ok", detail=detail)
     else:
-        detail, fix = f"{detail}; 3.11 or newer is needed", ["make setup PYTHON=python3.11"]
-        yield Finding(what="Python", state="fail", detail=detail, fix=fix)
+        fix = ["make setup PYTHON=python3.11"]
+        yield Finding(what="Python", state="fail", detail=f"{detail}; 3.11 or newer is needed", fix=fix)
 
 
-def packages() -> Iterator[Finding]:
-    """What SnakeSIM requires, by its own metadata; a line for the core, and one for each extra."""
-    lacking: dict[str, list[str]] = {}
-    there: dict[str, list[str]] = {}
+def check_packages() -> Iterator[Finding]:
+    """Check the packages that SnakeSIM requires by its metadata; one finding for the core, and one for each extra."""
+    installed: dict[str, list[str]] = {}  # by extra; the core's extra is empty
+    missing: dict[str, list[str]] = {}
     for requirement in importlib.metadata.requires("snakesim") or []:
         name = re.split(r"[\[<>=!~; ]", requirement)[0]
-        if name == "snakesim":  # an extra that brings another one
+        if name == "snakesim":  # an extra that includes another extra
             continue
         marker = re.search(r"""extra == ['"]([^'"]+)""", requirement)
-        group = marker[1] if marker else ""
+        extra = marker[1] if marker else ""
         try:
-            there.setdefault(group, []).append(f"{name} {importlib.metadata.version(name)}")
+            installed.setdefault(extra, []).append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
-            lacking.setdefault(group, []).append(name)
-    for group in sorted({*there, *lacking}):
-        what = f"packages [{group}]" if group else "packages"
-        if missing := lacking.get(group):
-            wanted = f"'snakesim[{group}]'" if group else "--force-reinstall snakesim"
-            yield Finding(
-                what=what,
-                state="ok" if group else "fail",  # extras are left out on purpose
-                detail=f"{'left out, needs' if group else 'missing'}: {', '.join(missing)}",
-                fix=["make setup", f"python -m pip install {wanted}"],
-            )
+            missing.setdefault(extra, []).append(name)
+    for extra in sorted({*installed, *missing}):
+        if extra in missing:
+            yield _report_missing_packages(extra, missing[extra])
         else:
-            yield Finding(what=what, state="ok", detail=", ".join(there[group]))
+            yield Finding(what=_name_packages(extra), state="ok", detail=", ".join(installed[extra]))
 
 
-def opengl() -> Iterator[Finding]:
-    """Whether MuJoCo can draw without a screen; only color images, videos and the model `rendered` need that."""
+def _report_missing_packages(extra: str, names: list[str]) -> Finding:
+    """Return the finding for missing packages. An extra may be left out on purpose, so it is no failure."""
+    what = _name_packages(extra)
+    packages = ", ".join(names)
+    if extra:
+        fix = ["make setup", f"python -m pip install 'snakesim[{extra}]'"]
+        return Finding(what=what, state="ok", detail=f"left out, needs: {packages}", fix=fix)
+    fix = ["make setup", "python -m pip install --force-reinstall snakesim"]
+    return Finding(what=what, state="fail", detail=f"missing: {packages}", fix=fix)
+
+
+def _name_packages(extra: str) -> str:
+    return f"packages [{extra}]" if extra else "packages"
+
+
+def check_opengl() -> Iterator[Finding]:
+    """Check that MuJoCo can render without a screen. Color images, videos and the model `rendered` need that."""
     if not extras.is_installed("sim"):
         return
-    detail: list[str] = []
-    for kind in ("egl", "osmesa"):
-        why = _probe(kind)
-        if why is None:
-            more = "" if kind == "egl" else "; set MUJOCO_GL=osmesa for every run"
-            yield Finding(what="OpenGL", state="ok", detail=f"{kind.upper()} draws without a screen{more}")
+    errors: list[str] = []
+    for renderer in ("egl", "osmesa"):
+        error = _find_render_error(renderer)
+        if error is None:
+            detail = f"{renderer.upper()} draws without a screen"
+            if renderer != "egl":
+                detail += f"; set MUJOCO_GL={renderer} for every run"
+            yield Finding(what="OpenGL", state="ok", detail=detail)
             return
-        detail.append(f"{kind.upper()}: {why}")
-    fix = ["sudo apt install libegl1 libgl1-mesa-dri"]
-    yield Finding(what="OpenGL", state="warn", detail=f"no color images and videos: {'; '.join(detail)}", fix=fix)
+        errors.append(f"{renderer.upper()}: {error}")
+    detail = f"no color images and videos: {'; '.join(errors)}"
+    yield Finding(what="OpenGL", state="warn", detail=detail, fix=["sudo apt install libegl1 libgl1-mesa-dri"])
 
 
-def _probe(kind: str) -> str | None:
-    """Why MuJoCo cannot draw with it; None when it can. In a process of its own: a driver may crash."""
+def _find_render_error(renderer: str) -> str | None:
+    """Return why MuJoCo cannot render with an OpenGL library, or None if it can.
+
+    The test runs in a process of its own, because a broken graphics driver may crash it.
+    """
     parent = os.getpid()
     try:
-        ended = subprocess.run(
-            python_command("-c", OPENGL),
-            env=child_environment({"MUJOCO_GL": kind}),
+        completed = subprocess.run(
+            python_command("-c", RENDER_ONE_IMAGE),
+            env=child_environment({"MUJOCO_GL": renderer}),
             capture_output=True,
             text=True,
             timeout=PROBE_LIMIT_S,
@@ -127,44 +148,50 @@ def _probe(kind: str) -> str | None:
         )
     except subprocess.TimeoutExpired:
         return f"no image within {PROBE_LIMIT_S:.0f} s"
-    if ended.returncode == 0:
+    if completed.returncode == 0:
         return None
-    said = [line for line in ended.stderr.splitlines() if "Error" in line]
-    return said[-1][:100] if said else f"ended with {ended.returncode}"
+    error_lines = [line for line in completed.stderr.splitlines() if "Error" in line]
+    if not error_lines:
+        return f"ended with {completed.returncode}"
+    return error_lines[-1][:MAX_ERROR_LENGTH]
 
 
-def can() -> Iterator[Finding]:
-    """SocketCAN: the kernel's part, and the interfaces."""
-    vm = "python3 deploy/vm/with_vcan.py -- .venv/bin/snakesim run triplet --backend can"
+def check_can() -> Iterator[Finding]:
+    """Check that the kernel has SocketCAN, and that its interfaces are up."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
         detail = (
             f"this kernel has none ({error.strerror}); only real joint modules need it, `--backend can` emulates them"
         )
-        yield Finding(what="CAN", state="warn", detail=detail, fix=["sudo modprobe -a can_raw vcan", vm])
+        run_in_vm = "python3 deploy/vm/with_vcan.py -- .venv/bin/snakesim run triplet --backend can"
+        fix = ["sudo modprobe -a can_raw vcan", run_in_vm]
+        yield Finding(what="CAN", state="warn", detail=detail, fix=fix)
         return
-    found = [
-        path.parent.name for path in Path("/sys/class/net").glob("*/type") if path.read_text().strip() == CAN_DEVICE
-    ]
-    if found:
-        up = [name for name in found if _is_up(name)]
-        down = [name for name in found if name not in up]
-        fix = [f"sudo ip link set {name} up" for name in down]
-        yield Finding(what="CAN", state="warn" if down else "ok", detail=f"up: {', '.join(up) or 'none'}", fix=fix)
-    else:
+    interfaces: list[str] = []
+    for type_file in Path("/sys/class/net").glob("*/type"):
+        if type_file.read_text().strip() == ARPHRD_CAN:
+            interfaces.append(type_file.parent.name)
+    if not interfaces:
         yield Finding(what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"])
+        return
+    up = [name for name in interfaces if _is_interface_up(name)]
+    down = [name for name in interfaces if name not in up]
+    detail = f"up: {', '.join(up) or 'none'}"
+    fix = [f"sudo ip link set {name} up" for name in down]
+    yield Finding(what="CAN", state="warn" if down else "ok", detail=detail, fix=fix)
 
 
-def _is_up(name: str) -> bool:
+def _is_interface_up(name: str) -> bool:
     try:
-        return bool(int(Path(f"/sys/class/net/{name}/flags").read_text(), 16) & 1)
+        flags = int(Path(f"/sys/class/net/{name}/flags").read_text(), 16)
     except (OSError, ValueError):
         return False
+    return bool(flags & IFF_UP)
 
 
-def kvm() -> Iterator[Finding]:
-    """Makes the VM for CAN tests fast."""
+def check_kvm() -> Iterator[Finding]:
+    """Check that virtual machines, in which CAN is tested, are fast."""
     device = Path("/dev/kvm")
     if os.access(device, os.R_OK | os.W_OK):
         yield Finding(what="KVM", state="ok", detail=f"{device} can be used")
@@ -176,62 +203,94 @@ def kvm() -> Iterator[Finding]:
         yield Finding(what="KVM", state="warn", detail=detail)
 
 
-def clock() -> Iterator[Finding]:
-    """Wake-ups of an ordinary process, and whether wall time is right: robot time needs the first only."""
-    late: list[float] = []
-    for _ in range(100):
-        due = time.monotonic() + 0.001
-        time.sleep(0.001)
-        late.append(time.monotonic() - due)
-    late.sort()
-    worst_s = late[98]
-    detail = (
-        f"wake-ups {late[50] * 1e6:.0f} us late in the median, {worst_s * 1e6:.0f} us in 99 % (no real-time priority)"
-    )
-    yield Finding(
-        what="wake-ups",
-        state="warn" if worst_s > LATE_WARN_S else "ok",
-        detail=detail,
-        fix=["uptime    # is something else running?"] if worst_s > LATE_WARN_S else [],
-    )
-    if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)) == TIME_ERROR:
-        detail = "not synchronised; only dates of records and of other machines' certificates depend on it"
+def check_clocks() -> Iterator[Finding]:
+    """Check how late a process without priority wakes up, and whether wall time is synchronized.
+
+    Robot time depends on wake-ups only.
+    """
+    yield _check_wake_ups()
+    if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)) == ADJTIMEX_TIME_ERROR:
+        detail = "not synchronized; only dates of records and of other machines' certificates depend on it"
         yield Finding(what="wall clock", state="warn", detail=detail, fix=["sudo timedatectl set-ntp true"])
     else:
-        yield Finding(what="wall clock", state="ok", detail="synchronised")
+        yield Finding(what="wall clock", state="ok", detail="synchronized")
 
 
-def real_time() -> Iterator[Finding]:
-    """What the host and the services ask for, and how well they keep time without."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
+def _check_wake_ups() -> Finding:
+    """Sleep many times, and report how late the process wakes up."""
+    delays_s: list[float] = []
+    for _ in range(WAKE_UPS):
+        due_s = time.monotonic() + WAKE_UP_PERIOD_S
+        time.sleep(WAKE_UP_PERIOD_S)
+        delays_s.append(time.monotonic() - due_s)
+    delays_s.sort()
+    median_s = delays_s[50]
+    p99_s = delays_s[98]
+    detail = (
+        f"wake-ups {median_s * 1e6:.0f} us late in the median, {p99_s * 1e6:.0f} us in 99 % (no real-time priority)"
+    )
+    if p99_s > MAX_WAKE_UP_DELAY_S:
+        fix = ["uptime    # is something else running?"]
+        return Finding(what="wake-ups", state="warn", detail=detail, fix=fix)
+    return Finding(what="wake-ups", state="ok", detail=detail)
+
+
+def check_real_time() -> Iterator[Finding]:
+    """Check that this user may have what host and services need in real time: priority, locked memory, open files."""
+    yield _check_priority()
+    yield _check_memory_lock()
+    yield _check_open_files()
+
+
+def _check_priority() -> Finding:
+    """Try a real-time priority, and restore the priority of this process."""
+    policy_before = os.sched_getscheduler(0)
+    parameters_before = os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(HOST_PRIORITY))
-        os.sched_setscheduler(0, *before)
-        yield Finding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
+        os.sched_setscheduler(0, policy_before, parameters_before)
     except OSError as error:
-        fix = [f'echo "$USER - rtprio {HOST_PRIORITY}" | sudo tee -a {LIMITS}    # then log in again']
-        detail = f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs stumble on a busy machine"
-        yield Finding(what="priority", state="warn", detail=detail, fix=fix)
-    refused = lock_memory()
+        detail = (
+            f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs miss ticks on a busy machine"
+        )
+        fix = [_raise_limit(f"rtprio {HOST_PRIORITY}")]
+        return Finding(what="priority", state="warn", detail=detail, fix=fix)
+    return Finding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
+
+
+def _check_memory_lock() -> Finding:
+    """Try to lock the memory of this process, and unlock it again."""
+    refusal = lock_memory()
     ctypes.CDLL(None).munlockall()
-    if refused is None:
-        yield Finding(what="memory lock", state="ok", detail="granted")
-    else:
-        fix = [f'echo "$USER - memlock unlimited" | sudo tee -a {LIMITS}    # then log in again']
-        yield Finding(what="memory lock", state="warn", detail=refused, fix=fix)
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    few = hard != resource.RLIM_INFINITY and hard < 4096
-    fix = [f'echo "$USER - nofile 8192" | sudo tee -a {LIMITS}    # then log in again'] if few else []
-    yield Finding(what="open files", state="warn" if few else "ok", detail=f"{soft}, at most {hard}", fix=fix)
+    if refusal is None:
+        return Finding(what="memory lock", state="ok", detail="granted")
+    return Finding(what="memory lock", state="warn", detail=refusal, fix=[_raise_limit("memlock unlimited")])
 
 
-def disk() -> Iterator[Finding]:
-    """Where runs are recorded: `runs/` here, or any `--out`."""
-    here = Path.cwd()
-    free = shutil.disk_usage(here).free
-    if not os.access(here, os.W_OK):
-        yield Finding(what="disk", state="warn", detail=f"{here} is read-only; give runs an --out", fix=["cd ~"])
+def _check_open_files() -> Finding:
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    detail = f"{soft_limit}, at most {hard_limit}"
+    if hard_limit == resource.RLIM_INFINITY or hard_limit >= MIN_OPEN_FILES:
+        return Finding(what="open files", state="ok", detail=detail)
+    return Finding(what="open files", state="warn", detail=detail, fix=[_raise_limit("nofile 8192")])
+
+
+def _raise_limit(limit: str) -> str:
+    """Return the command that raises a limit of this user."""
+    return f'echo "$USER - {limit}" | sudo tee -a {LIMITS_FILE}    # then log in again'
+
+
+def check_disk() -> Iterator[Finding]:
+    """Check that runs can be recorded in the present folder, where `runs/` is made."""
+    folder = Path.cwd()
+    free_bytes = shutil.disk_usage(folder).free
+    if not os.access(folder, os.W_OK):
+        yield Finding(what="disk", state="warn", detail=f"{folder} is read-only; give runs an --out", fix=["cd ~"])
         return
-    fix = ["du -sh runs/* | sort -h    # and remove what is not needed"] if free < GB else []
-    state = "ok" if free >= GB else "warn" if free >= 100 * MB else "fail"
-    yield Finding(what="disk", state=state, detail=f"{free / GB:.1f} GB free in {here}", fix=fix)
+    detail = f"{free_bytes / GB:.1f} GB free in {folder}"
+    if free_bytes >= WARN_FREE_BYTES:
+        yield Finding(what="disk", state="ok", detail=detail)
+        return
+    fix = ["du -sh runs/* | sort -h    # and remove what is not needed"]
+    state = "warn" if free_bytes >= MIN_FREE_BYTES else "fail"
+    yield Finding(what="disk", state=state, detail=detail, fix=fix)

@@ -1,4 +1,4 @@
-"""`snakesim doctor`: what this computer has, what it lacks, and the command that fixes each."""
+"""`snakesim doctor`: what this computer has, what is missing, and the command that fixes it."""
 
 from collections.abc import Callable, Iterator
 
@@ -9,39 +9,47 @@ from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.this_computer import computer
 from snakesim_operator.this_computer.computer import Finding
 from snakesim_operator.this_computer.kernel import kernel
-from snakesim_operator.this_computer.network_findings import ports, routers
+from snakesim_operator.this_computer.network_findings import check_ports, check_routers
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    computer.python,
-    computer.packages,
-    computer.opengl,
-    computer.can,
-    computer.kvm,
-    computer.clock,
-    computer.real_time,
+    computer.check_python,
+    computer.check_packages,
+    computer.check_opengl,
+    computer.check_can,
+    computer.check_kvm,
+    computer.check_clocks,
+    computer.check_real_time,
     kernel,
-    computer.disk,
+    computer.check_disk,
 )
 
 
 def doctor(where: RobotSelection, *, as_json: bool) -> int:
-    """Check everything. Returns 1 when something fails without which no run is possible, else 0."""
-    found: list[Finding] = []
-    for check in (*CHECKS, ports, lambda: routers(where)):
+    """Check this computer and its network, and print a finding for each check.
+
+    Args:
+        where: selects the endpoints that are checked.
+        as_json: print all findings as one JSON object.
+
+    Returns:
+        1 if a run is not possible, 0 otherwise.
+    """
+    findings: list[Finding] = []
+    for check in (*CHECKS, check_ports, lambda: check_routers(where)):
         for finding in check():
-            found.append(finding)
+            findings.append(finding)
             if not as_json:
-                _print(finding)
-    failed = [finding.what for finding in found if finding.state == "fail"]
+                _print_finding(finding)
+    failed = [finding.what for finding in findings if finding.state == "fail"]
     if as_json:
-        print_json({"ok": not failed, "findings": msgspec.to_builtins(found)})
+        print_json({"ok": not failed, "findings": msgspec.to_builtins(findings)})
     else:
-        warned = sum(finding.state == "warn" for finding in found)
-        print_line(f"{len(found)} checked; fail: {', '.join(failed) or 'none'}; warnings: {warned}")
+        warnings = sum(finding.state == "warn" for finding in findings)
+        print_line(f"{len(findings)} checked; fail: {', '.join(failed) or 'none'}; warnings: {warnings}")
     return 1 if failed else 0
 
 
-def _print(finding: Finding) -> None:
+def _print_finding(finding: Finding) -> None:
     print_line(f"{finding.state:<5}{finding.what:<21}{finding.detail}")
     for fix in finding.fix:
         print_line(f"     {'':<21}$ {fix}")

@@ -12,41 +12,49 @@ from snakesim_operator.base.targets import CONNECT_S, RobotSelection, robots_on
 from snakesim_operator.this_computer.computer import Finding
 
 
-def ports() -> Iterator[Finding]:
-    """The default endpoint: free, a robot's, or somebody else's."""
+def check_ports() -> Iterator[Finding]:
+    """Check whether the default endpoint is free, or used by a robot or by another program."""
     host, _, port = DEFAULT_ENDPOINT.partition("/")[2].rpartition(":")
-    taken: list[str] = []
+    what = f"port {port}"
+    robots = [robot for robot in local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
+    used_protocols = _find_used_protocols(host, int(port))
+    if robots:
+        yield Finding(what=what, state="ok", detail=f"used by {robots[0].namespace}, process {robots[0].pid}")
+    elif used_protocols:
+        protocols = " and ".join(used_protocols)
+        detail = f"{protocols} used by another program; runs choose other ports, which the commands find here"
+        yield Finding(what=what, state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"])
+    else:
+        yield Finding(what=what, state="ok", detail="free")
+
+
+def _find_used_protocols(host: str, port: int) -> list[str]:
+    """Return for which of TCP and UDP the port cannot be bound."""
+    used: list[str] = []
     for kind, name in ((socket.SOCK_STREAM, "TCP"), (socket.SOCK_DGRAM, "UDP")):
         with socket.socket(socket.AF_INET, kind) as probe:
             if kind == socket.SOCK_STREAM:  # as Zenoh binds: an ended connection does not count
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind((host, int(port)))
+                probe.bind((host, port))
             except OSError:
-                taken.append(name)
-    robots = [robot for robot in local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
-    if robots:
-        detail = f"used by {robots[0].namespace}, process {robots[0].pid}"
-        yield Finding(what=f"port {port}", state="ok", detail=detail)
-    elif taken:
-        detail = f"{' and '.join(taken)} used by another program; runs take other ports, and tools find them here"
-        yield Finding(what=f"port {port}", state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"])
-    else:
-        yield Finding(what=f"port {port}", state="ok", detail="free")
+                used.append(name)
+    return used
 
 
-def routers(where: RobotSelection) -> Iterator[Finding]:
-    """Every endpoint that was given, or has a robot of this computer."""
+def check_routers(where: RobotSelection) -> Iterator[Finding]:
+    """Check that a Zenoh router answers at every endpoint that was given, or that has a robot of this computer."""
     links = where.networks() if where.endpoint or local_robots() else []
     for link in links:
-        began = time.monotonic()
+        begin_s = time.monotonic()
         try:
             with open_session(replace(link, namespace=None), CONNECT_S) as session:
-                took_s = time.monotonic() - began
+                duration_s = time.monotonic() - begin_s
                 robots = ", ".join(robots_on(session)) or "no robot"
         except SnakesimError as error:
             fix = ["snakesim start router    # there; and is a firewall between?"]
             detail = f"{link.endpoint}: {error}"
             yield Finding(what="endpoint", state="fail", detail=detail, fix=fix, code=error.code)
             continue
-        yield Finding(what="endpoint", state="ok", detail=f"{link.endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")
+        detail = f"{link.endpoint} answers in {duration_s * 1e3:.0f} ms: {robots}"
+        yield Finding(what="endpoint", state="ok", detail=detail)

@@ -1,4 +1,4 @@
-"""Contacts of the links with obstacles."""
+"""Measures the contacts of the links with obstacles, as a contact sensor with noise does."""
 
 import math
 
@@ -20,7 +20,7 @@ NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own p
 
 
 class ContactReader:
-    """Contacts with obstacles, in the frames of the links."""
+    """Measures the contacts with obstacles, in the frames of the links."""
 
     def __init__(
         self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
@@ -68,10 +68,13 @@ class ContactReader:
         fx, fy, fz = rotate_into(rotation, touch.force_w)
         normal = rotate_into(rotation, touch.normal_w)
         if self._noise is not None:
-            a, b, c, d, e, f = self._noise(6).tolist()
-            sigma_m, sigma_n = self._sigma_m, self._sigma_n
-            px, py, pz = px + sigma_m * a, py + sigma_m * b, pz + sigma_m * c
-            fx, fy, fz = fx + sigma_n * d, fy + sigma_n * e, fz + sigma_n * f
+            noise_px, noise_py, noise_pz, noise_fx, noise_fy, noise_fz = self._noise(6).tolist()
+            px = px + self._sigma_m * noise_px
+            py = py + self._sigma_m * noise_py
+            pz = pz + self._sigma_m * noise_pz
+            fx = fx + self._sigma_n * noise_fx
+            fy = fy + self._sigma_n * noise_fy
+            fz = fz + self._sigma_n * noise_fz
         tangent_1, tangent_2 = tangents(normal)
         return Contact(
             link=touch.link,

@@ -1,4 +1,4 @@
-"""Motion capture of the base."""
+"""Measures the pose of the base, as motion capture with noise does."""
 
 import math
 
@@ -14,7 +14,7 @@ from snakesim_sim_backend.sensors.scope import Normal
 
 
 class PoseReader:
-    """Pose and velocity of the base."""
+    """Measures pose and velocity of the base."""
 
     def __init__(self, data: mujoco.MjData, sensor: PoseSensor, noise: Normal) -> None:
         self._qpos = data.qpos[:FREE_QPOS]
@@ -30,9 +30,11 @@ class PoseReader:
         # MuJoCo gives a free joint's angular velocity in its own frame.
         angular_velocity_w = rotate((w, x, y, z), (ox, oy, oz))
         if self._noise is not None:
-            ex, ey, ez, a, b, c = (self._sigma * self._noise(6)).tolist()
-            px, py, pz = px + ex, py + ey, pz + ez
-            w, x, y, z = _add_rotation((w, x, y, z), a, b, c)
+            error_x, error_y, error_z, half_roll, half_pitch, half_yaw = (self._sigma * self._noise(6)).tolist()
+            px = px + error_x
+            py = py + error_y
+            pz = pz + error_z
+            w, x, y, z = _add_rotation((w, x, y, z), half_roll, half_pitch, half_yaw)
         return Pose(
             tick=tick,
             timestamp_ns=timestamp_ns,

@@ -37,7 +37,7 @@ DrivesOf = Callable[[Any], EmulatedDrives]
 
 
 class Bench:
-    """A column of the contract's table."""
+    """A backend with its settings: a column of the contract's table."""
 
     def __init__(
         self,
@@ -50,29 +50,37 @@ class Bench:
         drives: DrivesOf | None = None,
         unavailable: str | None = None,
     ) -> None:
-        """backend: an installed one's name, `./file.py:Class`, or the class itself.
+        """Describe the backend without opening it.
 
-        sets: as `--set` of `snakesim run`; mute: `mute(backend, joint)` silences one joint's module, as by a
-        broken wire; drives: gives the emulated drives of an open backend; unavailable: why the bench cannot
-        be used on this machine.
+        Args:
+            name: of the column.
+            backend: name of an installed backend, `./file.py:Class`, or the class itself.
+            scenario: name or path of the scenario.
+            sets: changes of the scenario, as `--set` of `snakesim run`.
+            mute: `mute(backend, joint)` silences one joint module, as a broken wire does; None: not possible.
+            drives: returns the emulated drives of an open backend; None: not possible.
+            unavailable: why the bench cannot be used on this machine; None: it can.
         """
         self.name = name
         self.unavailable = unavailable
         self.mute = mute
         self.drives = drives
         self._backend = backend
-        self._scenario, self._sets = scenario, sets
+        self._scenario = scenario
+        self._sets = sets
         self._rig: Rig | None = None
-        self.was_opened = False  # at any time
+        self.was_opened = False  # since the bench was made
         self._hosted: Hosted | None = None
-        self._kept: dict[str, Any] = {}
+        self._recordings: dict[str, Any] = {}
 
     # --- what it is ----------------------------------------------------------------------------------------
 
     @cached_property
     def backend_type(self) -> type[Backend]:
         """The backend's class. Raises ConfigError when there is no such backend."""
-        return find_backend(self._backend) if isinstance(self._backend, str) else self._backend
+        if isinstance(self._backend, str):
+            return find_backend(self._backend)
+        return self._backend
 
     @cached_property
     def config(self) -> RunConfig:
@@ -82,26 +90,25 @@ class Bench:
         config = with_backend_modes(load(self._scenario, overrides).config, self.backend_type)
         # The tests' own controller is the only service.
         clock_modes = self.backend_type.check(config, backend_settings(config, self.backend_type))
-        clock_mode = (
-            "lockstep" if "lockstep" in clock_modes else "realtime"
-        )  # the first: quick, and the same on every machine
+        # Lockstep is preferred: it is quick, and the same on every machine.
+        clock_mode = "lockstep" if "lockstep" in clock_modes else "realtime"
         return msgspec.structs.replace(config, clock_mode=clock_mode, services={HOLDER: ServiceSchedule()})
 
     @property
     def clock_mode(self) -> ClockMode:
-        """At which clock mode the tests run it."""
+        """The clock mode in which the tests run the backend."""
         return self.config.clock_mode
 
     # --- opening and closing -------------------------------------------------------------------------------
 
     def open(self) -> Backend:
-        """A new backend; an open one is closed before."""
+        """Open the backend, and return it. The one that is open is closed first."""
         self.close()
         self.was_opened = True
         return self.backend_type(self.config, backend_settings(self.config, self.backend_type))
 
-    def fresh_rig(self) -> Rig:
-        """A rig on a fresh backend."""
+    def open_rig(self) -> Rig:
+        """Open the backend, and return a rig with it."""
         backend = self.open()
         try:
             self._rig = Rig(backend, self.clock_mode, self.config.period_ns)
@@ -110,31 +117,35 @@ class Bench:
             raise
         return self._rig
 
-    def rig(self) -> Rig:
-        """The rig that tests share, since opening may be slow; a new one if that is spoiled."""
-        return self._rig if self._rig is not None and not self._rig.spoiled else self.fresh_rig()
+    def shared_rig(self) -> Rig:
+        """Return the rig that tests share, because opening may be slow; a new one if it is not usable any more."""
+        if self._rig is None or self._rig.spoiled:
+            return self.open_rig()
+        return self._rig
 
-    def hosted(self) -> Hosted:
-        """The backend behind a real host, shared like the rig."""
+    def shared_host(self) -> Hosted:
+        """Return the backend behind a real host, which tests share."""
         if self._hosted is None:
             self._hosted = Hosted(self.open(), self.config)
         return self._hosted
 
-    def spoil(self) -> None:
-        """Reopen for the next test: after this one the backend's state is unknown."""
+    def reopen_for_next_test(self) -> None:
+        """Close the backend, so that the next test opens it again: its state is unknown."""
         self.close()
 
     def close(self) -> None:
         """Close the open backend."""
-        rig, hosted = self._rig, self._hosted
-        self._rig = self._hosted = None
+        rig = self._rig
+        hosted = self._hosted
+        self._rig = None
+        self._hosted = None
         if hosted is not None:
             hosted.close()
         if rig is not None and not rig.closed:
             rig.close()
 
-    def keep(self, name: str, make: Callable[[], Any]) -> Any:
-        """A recording that several tests read, made by the first of them."""
-        if name not in self._kept:
-            self._kept[name] = make()
-        return self._kept[name]
+    def record_once(self, name: str, make: Callable[[], Any]) -> Any:
+        """Return a recording that several tests read; the first of them makes it."""
+        if name not in self._recordings:
+            self._recordings[name] = make()
+        return self._recordings[name]

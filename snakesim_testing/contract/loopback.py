@@ -1,4 +1,4 @@
-"""A backend behind the real host, a real client that commands it, and an observer; over Zenoh on loopback."""
+"""A backend behind the real host, with a real client that commands it and an observer, over Zenoh on loopback."""
 
 import contextlib
 import socket
@@ -40,7 +40,7 @@ def stay(_ticks: int) -> JointTargets:
 
 
 def wait_until(happened: Callable[[], Any], what: str) -> None:
-    """Wait until a condition holds; fails with its name if it does not in time."""
+    """Wait until a condition holds. Fails with a description of the condition after LIMIT_S."""
     deadline = time.monotonic() + LIMIT_S
     while not happened():
         assert time.monotonic() < deadline, f"not within {LIMIT_S} s: {what}"
@@ -48,20 +48,21 @@ def wait_until(happened: Callable[[], Any], what: str) -> None:
 
 
 class RecordingBackend(Backend):
-    """A backend that forwards and records all calls; a fault can be planted in it."""
+    """Forwards all calls to a backend, records the joint states, and can report a planted fault."""
 
     def __init__(self, inner: Backend) -> None:
         self._inner = inner
-        self.seen: list[JointState] = []
-        self.planted: Callable[[int], Fault | None] | None = None  # tick -> a fault to report besides the backend's own
+        self.joint_states: list[JointState] = []
+        # For each tick, a fault to report besides those of the backend.
+        self.planted_fault: Callable[[int], Fault | None] | None = None
 
     def describe(self) -> Description:
         return self._inner.describe()
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """The backend's, recorded."""
+        """Sample the backend, and record the joint states."""
         samples = self._inner.sample(tick, timestamp_ns)
-        self.seen.append(samples.joints)
+        self.joint_states.append(samples.joints)
         return samples
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
@@ -74,15 +75,19 @@ class RecordingBackend(Backend):
         self._inner.close()
 
     def faults(self) -> list[Fault]:
-        """The backend's, and the planted one."""
-        found = self._inner.faults()
-        planted = self.planted(self.seen[-1].tick) if self.planted is not None and self.seen else None
-        return found if planted is None else [*found, planted]
+        """Return the faults of the backend, and the planted one."""
+        faults = self._inner.faults()
+        planted = None
+        if self.planted_fault is not None and self.joint_states:
+            planted = self.planted_fault(self.joint_states[-1].tick)
+        if planted is None:
+            return faults
+        return [*faults, planted]
 
 
 @dataclass
 class Controller:
-    """A control service with a plan that counts from arming."""
+    """A control service that commands joints by a plan, which counts ticks from the arming."""
 
     plan: Plan = stay
     last_sent_tick: int = -1
@@ -91,14 +96,19 @@ class Controller:
     stopped: threading.Event = field(default_factory=threading.Event)
 
     def run(self, link: Link) -> None:
-        """Until stopped."""
+        """Connect to the host and command it until stopped.
+
+        Args:
+            link: to the host.
+        """
         with open_session(link) as session:
             client = Client(session, HOLDER)
             robot = client.description()
             joints = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
             client.announce()
-            arm_session = armed_at = -1
+            arm_session = -1
+            armed_at = -1  # tick
             held: RequestedSetpoints | None = None
             for clock in client.ticks(silence_s=0.05):
                 if self.stopped.is_set():
@@ -112,25 +122,31 @@ class Controller:
                 if clock.lifecycle != "armed" or held is None:
                     held = commander.hold_position(measured)
                 elif clock.arm_session != arm_session:
-                    arm_session, armed_at = clock.arm_session, clock.tick
-                asked = self._asked(clock, held, clock.tick - armed_at)
-                if asked is not None:
-                    commander.send(clock, measured, asked)
-                    self.last_sent_tick, self.epoch, self.arm_session = clock.tick, clock.lease_epoch, clock.arm_session
+                    arm_session = clock.arm_session
+                    armed_at = clock.tick
+                setpoints = self._plan_setpoints(clock, held, clock.tick - armed_at)
+                if setpoints is not None:
+                    commander.send(clock, measured, setpoints)
+                    self.last_sent_tick = clock.tick
+                    self.epoch = clock.lease_epoch
+                    self.arm_session = clock.arm_session
                     client.report_done(clock.tick)
 
-    def _asked(self, clock: Clock, held: RequestedSetpoints, ticks: int) -> RequestedSetpoints | None:
-        asked = self.plan(ticks) if clock.lifecycle == "armed" else {}
-        if asked is None:
+    def _plan_setpoints(self, clock: Clock, held: RequestedSetpoints, ticks: int) -> RequestedSetpoints | None:
+        """Return the setpoints of a tick: the held ones, changed by the plan. None: the plan sends nothing."""
+        targets = self.plan(ticks) if clock.lifecycle == "armed" else {}
+        if targets is None:
             return None
-        mode, target = list(held.mode), list(held.target)
-        for joint, (wanted_mode, wanted) in asked.items():
-            mode[joint], target[joint] = wanted_mode, wanted
+        mode = list(held.mode)
+        target = list(held.target)
+        for joint, (joint_mode, joint_target) in targets.items():
+            mode[joint] = joint_mode
+            target[joint] = joint_target
         return RequestedSetpoints(mode, target, held.torque_limit_nm)
 
 
 class Hosted:
-    """Host, controller and observer, each with a session and a thread of its own, until `close`."""
+    """Runs host and controller in threads until `close`, each with its own session, and observes them."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
         with socket.socket() as probe:
@@ -142,30 +158,30 @@ class Hosted:
         self.config = config
         self.armed_at = 0  # tick
         self._threads: list[threading.Thread] = []
-        self._open = contextlib.ExitStack()
-        self._open.callback(self.backend.close)
-        self._open.callback(sys.setswitchinterval, sys.getswitchinterval())
+        self._opened = contextlib.ExitStack()
+        self._opened.callback(self.backend.close)
+        self._opened.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
         try:
-            own = self._open.enter_context(open_session(replace(link, listen=True)))
-            self.host = Host(config, GuardedBackend(self.backend), own)
+            host_session = self._opened.enter_context(open_session(replace(link, listen=True)))
+            self.host = Host(config, GuardedBackend(self.backend), host_session)
             self.robot = self.host.description
-            self.session: Session = self._open.enter_context(open_session(link))
+            self.session: Session = self._opened.enter_context(open_session(link))
             self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
             wait_until(self._commands.has_subscriber, "the host receives our commands")  # earlier ones are lost
             self._start("host", self.host.run, self.host.stop)
             self._start("controller", lambda: self.controller.run(link), self.controller.stopped.set)
         except BaseException:
-            self._open.close()
+            self._opened.close()
             raise
 
     @property
     def tick(self) -> int:
-        """Of the newest sample."""
-        return self.backend.seen[-1].tick if self.backend.seen else -1
+        """The tick of the newest sample."""
+        return self.backend.joint_states[-1].tick if self.backend.joint_states else -1
 
     def lifecycle(self, action: Any) -> Answer:
-        """Arm (naming robot, backend and configuration), disarm or reset."""
+        """Send a lifecycle request, which names the robot, the backend and the configuration."""
         robot = self.robot
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
@@ -185,7 +201,7 @@ class Hosted:
         assert answer.ok, f"the robot cannot be armed: {answer.reason}"
         self.armed_at = self.tick
 
-    def reaches(self, state: LifecycleState) -> None:
+    def wait_for_lifecycle(self, state: LifecycleState) -> None:
         """Wait for a lifecycle state."""
         wait_until(
             lambda: self.host.authority.state == state or not self._threads_live(),
@@ -193,17 +209,23 @@ class Hosted:
         )
         assert self.host.authority.state == state, self.host.authority.reason
 
-    def passes(self, periods: int) -> list[JointState]:
+    def wait_for_ticks(self, periods: int) -> list[JointState]:
         """Wait for this many more ticks, and return their joint states."""
-        since = len(self.backend.seen)
-        wait_until(lambda: len(self.backend.seen) >= since + periods or not self._threads_live(), f"{periods} ticks")
-        assert len(self.backend.seen) >= since + periods, f"the host ended: {self.host.authority.reason}"
-        return self.backend.seen[since:]
+        since = len(self.backend.joint_states)
+        wait_until(
+            lambda: len(self.backend.joint_states) >= since + periods or not self._threads_live(), f"{periods} ticks"
+        )
+        assert len(self.backend.joint_states) >= since + periods, f"the host ended: {self.host.authority.reason}"
+        return self.backend.joint_states[since:]
 
-    def forge(self, **wrong: Any) -> None:
-        """Publish a command that would turn the first joint, valid except for the fields given here."""
+    def send_forged_command(self, **wrong: Any) -> None:
+        """Publish a command that would turn the first joint.
+
+        Args:
+            wrong: invalid values by field; all other fields are valid.
+        """
         count = len(self.robot.joints)
-        good: dict[str, Any] = {
+        valid_fields: dict[str, Any] = {
             "tick": self.tick,
             "sequence": 2**40,
             "lease_epoch": self.controller.epoch,
@@ -213,11 +235,11 @@ class Hosted:
             "mode": [Mode.POSITION] * count,
             "target": [0.5] * count,
         }
-        self._commands.put(JointCommand(**(good | wrong)))
+        self._commands.put(JointCommand(**(valid_fields | wrong)))
 
     def close(self) -> None:
         """Stop everything and close the backend."""
-        self._open.close()
+        self._opened.close()
 
     def _start(self, name: str, run: Callable[[], None], stop: Callable[[], None]) -> None:
         thread = threading.Thread(target=run, name=name, daemon=True)
@@ -228,7 +250,7 @@ class Hosted:
             thread.join(LIMIT_S)
 
         thread.start()
-        self._open.callback(end)
+        self._opened.callback(end)
 
     def _threads_live(self) -> bool:
         return all(thread.is_alive() for thread in self._threads)

@@ -28,73 +28,77 @@ class Pushing:
     all: Record
 
 
-def sway(rig: Rig) -> Record:
-    """All joints sway a little around home, each with a phase of its own."""
+def record_sway(rig: Rig) -> Record:
+    """Let all joints sway a little around the start pose, neighbors in opposite directions, and return the record."""
     rig.arm()
-    began = rig.tick
-    for tick in range(rig.periods(1.0)):
+    first_tick = rig.tick
+    for tick in range(rig.count_periods(1.0)):
         angle = 0.3 * t.STEP_RAD * math.sin(2 * math.pi * tick * rig.period_ns * 1e-9)
-        asked: JointTargets = {i: (Mode.POSITION, rig.home_rad[i] + angle * (-1) ** i) for i in range(rig.count)}
-        rig.drive(asked)
-    rig.must_be_armed()
-    return rig.since(began)
+        targets: JointTargets = {i: (Mode.POSITION, rig.home_rad[i] + angle * (-1) ** i) for i in range(rig.count)}
+        rig.drive(targets)
+    rig.assert_armed()
+    return rig.record_since(first_tick)
 
 
-def push(rig: Rig) -> Pushing:
-    """Push two joints against their stops, in opposite directions: by torque, and by speed with a low limit."""
+def record_push(rig: Rig) -> Pushing:
+    """Push two joints against their stops, in opposite directions.
+
+    They push first in torque mode, then in velocity mode with a low torque limit. A joint without velocity mode gets a
+    position beyond its stop instead.
+    """
     rig.arm()
-    began = rig.tick
+    first_tick = rig.tick
     upper, lower = rig.robot.joints[0], rig.robot.joints[1]
 
     def both(mode: Mode, up: float, down: float) -> JointTargets:
         return {0: (mode, up), 1: (mode, down)}
 
-    near = both(Mode.POSITION, t.NEAR_STOP * upper.angle_max_rad, t.NEAR_STOP * lower.angle_min_rad)
-    rig.drive(near, rig.periods(t.SETTLE_S))
+    near_stops = both(Mode.POSITION, t.NEAR_STOP * upper.angle_max_rad, t.NEAR_STOP * lower.angle_min_rad)
+    rig.drive(near_stops, rig.count_periods(t.SETTLE_S))
     asked_nm = t.PUSH_SHARE * upper.torque_limit_nm
     torque_mode = None
-    if rig.has(0, Mode.TORQUE) and rig.has(1, Mode.TORQUE):
-        rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), rig.periods(t.PUSH_S))
+    if rig.supports_mode(0, Mode.TORQUE) and rig.supports_mode(1, Mode.TORQUE):
+        rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), rig.count_periods(t.PUSH_S))
         torque_mode = rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), t.TRANSPORT_PERIODS)
     limit_nm = t.LIMIT_SHARE * upper.torque_limit_nm
     speed = min(
         t.DEMAND_SHARE * upper.torque_limit_nm / upper.velocity_gain_nm_s_per_rad, 0.5 * upper.speed_limit_rad_s
     )
     limits = [limit_nm] * rig.count
-    fast = both(Mode.VELOCITY, speed, -speed)
-    if not (rig.has(0, Mode.VELOCITY) and rig.has(1, Mode.VELOCITY)):
-        fast = both(Mode.POSITION, upper.angle_max_rad + t.BEYOND_RAD, lower.angle_min_rad - t.BEYOND_RAD)
-    rig.press(fast, rig.periods(t.PUSH_S), torque_limit_nm=limits)
-    limited = rig.press(fast, t.TRANSPORT_PERIODS, torque_limit_nm=limits)
-    rig.must_be_armed()
-    return Pushing(torque_mode, asked_nm, limited, limit_nm, rig.since(began))
+    beyond_stops = both(Mode.VELOCITY, speed, -speed)
+    if not (rig.supports_mode(0, Mode.VELOCITY) and rig.supports_mode(1, Mode.VELOCITY)):
+        beyond_stops = both(Mode.POSITION, upper.angle_max_rad + t.BEYOND_RAD, lower.angle_min_rad - t.BEYOND_RAD)
+    rig.press(beyond_stops, rig.count_periods(t.PUSH_S), torque_limit_nm=limits)
+    limited = rig.press(beyond_stops, t.TRANSPORT_PERIODS, torque_limit_nm=limits)
+    rig.assert_armed()
+    return Pushing(torque_mode, asked_nm, limited, limit_nm, rig.record_since(first_tick))
 
 
-def switch(rig: Rig) -> dict[tuple[Mode, Mode], Floats]:
-    """Torques of joint 0 around every change of mode, (ticks,), from the tick before the change on."""
+def record_switching(rig: Rig) -> dict[tuple[Mode, Mode], Floats]:
+    """Return the torques of joint 0 at every change of mode, (ticks,), from the tick before the change on."""
     rig.arm()
     slow = 0.3 * t.CRUISE_RAD_S
     gentle_nm = 0.02 * rig.full_torque_nm[0]
     home = rig.home_rad[0]
 
-    def back() -> float:
-        """The sign that leads towards home."""
-        return -math.copysign(1.0, rig.now.angle_rad[0] - home)
+    def sign_towards_home() -> float:
+        """Return the sign of the direction towards the start pose."""
+        return -math.copysign(1.0, rig.newest_joints.angle_rad[0] - home)
 
     target: dict[Mode, Callable[[], float]] = {
         Mode.PASSIVE: lambda: 0.0,
-        Mode.POSITION: lambda: rig.now.angle_rad[0],
-        Mode.VELOCITY: lambda: back() * slow,
-        Mode.TORQUE: lambda: back() * gentle_nm,
+        Mode.POSITION: lambda: rig.newest_joints.angle_rad[0],
+        Mode.VELOCITY: lambda: sign_towards_home() * slow,
+        Mode.TORQUE: lambda: sign_towards_home() * gentle_nm,
     }
-    rig.drive({0: (CIRCUIT[0], home)}, rig.periods(HELD_S))
+    rig.drive({0: (CIRCUIT[0], home)}, rig.count_periods(HELD_S))
     torques: dict[tuple[Mode, Mode], Floats] = {}
     for before, after in PAIRS:
-        if not (rig.has(0, before) and rig.has(0, after)):
-            rig.drive({0: (Mode.POSITION, rig.now.angle_rad[0])}, rig.periods(HELD_S))
+        if not (rig.supports_mode(0, before) and rig.supports_mode(0, after)):
+            rig.drive({0: (Mode.POSITION, rig.newest_joints.angle_rad[0])}, rig.count_periods(HELD_S))
             continue
-        began = rig.now.torque_nm[0]
-        record = rig.drive({0: (after, target[after]())}, rig.periods(HELD_S))
-        torques[before, after] = np.array([began, *record.torque_nm[:, 0]])
-    rig.must_be_armed()
+        torque_before_nm = rig.newest_joints.torque_nm[0]
+        record = rig.drive({0: (after, target[after]())}, rig.count_periods(HELD_S))
+        torques[before, after] = np.array([torque_before_nm, *record.torque_nm[:, 0]])
+    rig.assert_armed()
     return torques

@@ -15,12 +15,12 @@ from snakesim_testing.contract.rig import Rig, unlimited
 from snakesim_testing.contract.test_lifecycle import GO
 
 
-def what_is_still_seen(rig: Rig) -> list[JointState]:
+def keep_using(rig: Rig) -> list[JointState]:
     """Go on as if nothing had happened. A closed backend may raise BackendError, and nothing else."""
     seen: list[JointState] = []
     for tick in range(rig.tick + 1, rig.tick + 1 + t.CLOSING_PERIODS):
         with contextlib.suppress(BackendError):
-            rig.backend.enact(unlimited(rig.points(GO)), "armed")
+            rig.backend.enact(unlimited(rig.make_setpoints(GO)), "armed")
         with contextlib.suppress(BackendError):
             rig.backend.advance()
         with contextlib.suppress(BackendError):
@@ -33,9 +33,9 @@ def what_is_still_seen(rig: Rig) -> list[JointState]:
 def test_a_closed_backend_drives_nothing(bench: Bench, rig: Rig) -> None:
     """Closed while a joint moves, and handed setpoints afterwards: nothing is driven any more."""
     rig.cruise()
-    before = rig.now.angle_rad[0]
+    before = rig.newest_joints.angle_rad[0]
     rig.close()
-    went = max((abs(joints.angle_rad[0] - before) for joints in what_is_still_seen(rig)), default=0.0)
+    went = max((abs(joints.angle_rad[0] - before) for joints in keep_using(rig)), default=0.0)
     coasting = 0.5 * t.CRUISE_RAD_S * t.CLOSING_PERIODS * rig.period_ns * 1e-9
     assert went < coasting, f"it went on by {went:.3f} rad"
 
@@ -51,23 +51,25 @@ def test_a_backend_opens_again_after_it_was_closed(bench: Bench) -> None:
     """In the same process, as after the first opening: disarmed, at rest, and it moves when it is armed."""
     if not bench.was_opened:
         bench.open().close()
-    again = bench.fresh_rig()
-    assert np.abs(again.now.velocity_rad_s).max() < t.STILL_RAD_S
+    again = bench.open_rig()
+    assert np.abs(again.newest_joints.velocity_rad_s).max() < t.STILL_RAD_S
     again.cruise()
 
 
 def test_in_lockstep_the_same_seed_and_commands_give_the_same_samples(bench: Bench) -> None:
-    """Bit-identical in lockstep."""
+    """Two runs in lockstep have bit-identical samples."""
     if bench.clock_mode != "lockstep":
         pytest.skip("this backend supports real time only, which is not exactly repeatable")
 
     def once() -> list[Samples]:
-        rig = bench.fresh_rig()
+        rig = bench.open_rig()
         rig.cruise()
-        rig.drive({0: (Mode.TORQUE, -0.1), 1: (Mode.POSITION, rig.home_rad[1] + t.STEP_RAD)}, rig.periods(t.CRUISE_S))
+        rig.drive(
+            {0: (Mode.TORQUE, -0.1), 1: (Mode.POSITION, rig.home_rad[1] + t.STEP_RAD)}, rig.count_periods(t.CRUISE_S)
+        )
         rig.estop()
         rig.idle(t.ARMING_PERIODS)
-        return rig.since(1).samples
+        return rig.record_since(1).samples
 
     first, second = once(), once()
     for a, b in zip(first, second, strict=True):

@@ -17,7 +17,8 @@ from snakesim_testing.contract.rig import Record, Rig
 
 def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:
     """Joints (count, order, names, axes, limits, gains), links, period, lease and safety come from the run's files."""
-    robot, wanted = rig.robot, describe_run_robot(bench.config)
+    robot = rig.robot
+    wanted = describe_run_robot(bench.config)
     assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
     for joint, expected in zip(robot.joints, wanted.joints, strict=True):
         drive = {"serial": joint.serial, "firmware": joint.firmware}  # which the drive says, not the file
@@ -61,14 +62,14 @@ def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Recor
     for sensor in rig.robot.sensors:
         if sensor.key == keys.JOINTS:
             continue
-        came = how_often(sensor.key, healthy)
+        came = count_readings(sensor.key, healthy)
         wanted = seconds * sensor.rate_hz
         slack = 1 + t.RATE_SHARE * wanted
         assert came >= 1 or wanted < 2, f"{sensor.key} is listed but never published"
         assert abs(came - wanted) <= slack, f"{sensor.key}: {came} in {seconds} s, stated are {sensor.rate_hz} Hz"
 
 
-def how_often(key: str, record: Record) -> int:
+def count_readings(key: str, record: Record) -> int:
     """Number of readings. IMUs may answer in turns, so there it is that of the most frequent link."""
     messages = [sample.others[key] for sample in record.samples if key in sample.others]
     links = Counter(link for message in messages if isinstance(message, Imu) for link in message.link)

@@ -11,11 +11,11 @@ from snakesim_testing.contract.bench import EmulatedDrives
 from snakesim_testing.contract.rig import Rig
 
 
-def go_on(_rig: Rig) -> None:
+def do_nothing(_rig: Rig) -> None:
     """Do nothing: the host finds by itself that it was away."""
 
 
-@pytest.mark.parametrize("then", [go_on, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
+@pytest.mark.parametrize("then", [do_nothing, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
 def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an_arming(
     rig: Rig, drives: EmulatedDrives, then: Callable[[Rig], None]
 ) -> None:
@@ -31,21 +31,21 @@ def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an
     rig.freeze_host(t.FROZEN_S, drives.freeze_driver)
     assert not any(drives.enabled()), f"{t.FROZEN_S} s without the driver, and still enabled are {drives.enabled()}"
     then(rig)
-    must_stay_off(rig, drives, rig.periods(t.SETTLE_S))
-    record = rig.since(began)
+    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
+    record = rig.record_since(began)
     named = {fault.joint for fault in record.faults if fault.cause}
     silent = [joint.name for joint in rig.robot.joints if joint.name not in named]
     assert not silent, f"their stop was never reported: {silent}; reported were {record.faults}"
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
-    must_stay_off(rig, drives, t.ARMING_PERIODS)
+    assert_drives_stay_off(rig, drives, t.ARMING_PERIODS)
     reset_tick = rig.tick
     rig.cruise()
     assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
-    assert not rig.since(reset_tick).faults, rig.since(reset_tick).faults
+    assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
 
 
-def must_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:
+def assert_drives_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:
     """Fail if a drive is enabled at any time."""
     for _ in range(periods):
         rig.idle()
@@ -59,8 +59,12 @@ def test_drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watch
     rig.cruise()
     rig.fault()
     rig.idle()
-    if rig.has(0, Mode.VELOCITY):  # otherwise the joint is led to rest by its position, which takes less than a period
+    if rig.supports_mode(
+        0, Mode.VELOCITY
+    ):  # otherwise the joint is led to rest by its position, which takes less than a period
         assert drives.enabled()[0], "the joint moves, and its drive does not brake"
-    rig.idle(rig.periods(t.BRAKES_S) + t.TRANSPORT_PERIODS)
-    must_stay_off(rig, drives, rig.periods(t.SETTLE_S))
-    assert np.abs(rig.now.velocity_rad_s).max() < t.STILL_RAD_S, f"still moving: {rig.now.velocity_rad_s} rad/s"
+    rig.idle(rig.count_periods(t.BRAKES_S) + t.TRANSPORT_PERIODS)
+    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
+    assert np.abs(rig.newest_joints.velocity_rad_s).max() < t.STILL_RAD_S, (
+        f"still moving: {rig.newest_joints.velocity_rad_s} rad/s"
+    )

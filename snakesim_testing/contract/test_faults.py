@@ -9,7 +9,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.rig import Record, Rig
-from snakesim_testing.contract.test_lifecycle import must_rest
+from snakesim_testing.contract.test_lifecycle import assert_at_rest
 
 MUTED = 1
 LOST = 1
@@ -23,13 +23,13 @@ def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
 
 def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> None:
     """While it is in `isolated`, a joint has no torque, whatever is commanded; a reset ends that."""
-    with rig.may_lose_a_joint():
+    with rig.with_isolation_allowed():
         began = rig.tick
         rig.cruise()
-        rig.lose(LOST)
+        rig.isolate_joint(LOST)
         asked = {0: (Mode.VELOCITY, t.CRUISE_RAD_S), LOST: (Mode.POSITION, rig.home_rad[LOST] + t.STEP_RAD)}
-        record = rig.drive(asked, rig.periods(t.CRUISE_S))
-        rig.must_be_armed()
+        record = rig.drive(asked, rig.count_periods(t.CRUISE_S))
+        rig.assert_armed()
         assert abs(record.torque_nm[-1, LOST]) < t.TORQUE_NM, f"{record.torque_nm[-1, LOST]:.3f} N·m"
         moved = np.ptp(record.angle_rad[t.TRANSPORT_PERIODS :, LOST])
         assert moved < t.REACHED_RAD, f"it was moved by {moved:.3f} rad"
@@ -39,10 +39,10 @@ def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> N
         rig.reset()
         rig.idle(t.ARMING_PERIODS)
         rig.arm()
-        record = rig.drive({LOST: asked[LOST]}, rig.periods(t.SETTLE_S))
+        record = rig.drive({LOST: asked[LOST]}, rig.count_periods(t.SETTLE_S))
         away = record.angle_rad[-1, LOST] - asked[LOST][1]
         assert abs(away) < t.REACHED_RAD, f"after the reset it stops {away:.3f} rad from its target"
-        assert not rig.since(began).faults, rig.since(began).faults
+        assert not rig.record_since(began).faults, rig.record_since(began).faults
 
 
 def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) -> None:
@@ -65,7 +65,7 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
         others = [i for i in range(rig.count) if i != MUTED]
         assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), "the others are fresh"
     assert rig.authority.state == "fault", "the robot goes on with a joint of unknown state"
-    must_rest_but_the_muted(rig)
+    assert_others_at_rest(rig)
     before = len(rig.faults)
     assert all(fault.what and fault.cause for fault in rig.faults)
     rig.idle(t.TRANSPORT_PERIODS)
@@ -73,11 +73,11 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
     rig.close()
 
 
-def must_rest_but_the_muted(rig: Rig) -> None:
+def assert_others_at_rest(rig: Rig) -> None:
     """The position of the silent joint is unknown; the others rest."""
-    record = rig.idle(rig.periods(t.SETTLE_S))
+    record = rig.idle(rig.count_periods(t.SETTLE_S))
     for sample in record.samples:
         sample.joints.velocity_rad_s[MUTED] = 0.0
         sample.joints.angle_rad[MUTED] = 0.0
-    must_rest(record, rig)
+    assert_at_rest(record, rig)
     assert np.isfinite(record.angle_rad).all()

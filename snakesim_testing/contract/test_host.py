@@ -15,12 +15,21 @@ from snakesim_testing.contract.loopback import Hosted, stay, wait_until
 from snakesim_testing.contract.rig import JointTargets
 
 
-def moves_then(silent: bool, hosted: Hosted) -> int:
-    """Arm and move a joint for a while; returns for how many ticks."""
-    wait_until(lambda: hosted.backend.seen, "a first sample")
-    angle = hosted.backend.seen[-1].angle_rad[0]
+def arm_and_move(silent: bool, hosted: Hosted) -> int:
+    """Arm, and move joint 0.
+
+    Args:
+        silent: whether the controller sends nothing after the motion.
+        hosted: the robot.
+
+    Returns:
+        The duration of the motion in ticks, from the arming on.
+    """
+    wait_until(lambda: hosted.backend.joint_states, "a first sample")
+    angle = hosted.backend.joint_states[-1].angle_rad[0]
     speed = -math.copysign(t.CRUISE_RAD_S, angle)  # away from the nearer stop
-    by_speed, period_s = hosted.robot.joints[0].supports_mode(Mode.VELOCITY), hosted.config.period_ns * 1e-9
+    has_velocity_mode = hosted.robot.joints[0].supports_mode(Mode.VELOCITY)
+    period_s = hosted.config.period_ns * 1e-9
     ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
 
     def plan(since_arming: int) -> JointTargets | None:
@@ -28,26 +37,28 @@ def moves_then(silent: bool, hosted: Hosted) -> int:
             return {}
         if silent and since_arming >= ticks:
             return None
-        along = angle + speed * period_s * (since_arming - t.ARMING_PERIODS)
-        return {0: (Mode.VELOCITY, speed) if by_speed else (Mode.POSITION, along)}
+        if has_velocity_mode:
+            return {0: (Mode.VELOCITY, speed)}
+        position = angle + speed * period_s * (since_arming - t.ARMING_PERIODS)
+        return {0: (Mode.POSITION, position)}
 
     hosted.arm(plan)
     return ticks
 
 
-def must_have_moved_before(fault: Fault, hosted: Hosted) -> None:
+def assert_moved_before(fault: Fault, hosted: Hosted) -> None:
     """Fail if joint 0 was still until the fault: then its stopping would prove nothing."""
     since = fault.tick - 2 * t.ARMING_PERIODS
-    speeds = [abs(state.velocity_rad_s[0]) for state in hosted.backend.seen if since < state.tick <= fault.tick]
+    speeds = [abs(state.velocity_rad_s[0]) for state in hosted.backend.joint_states if since < state.tick <= fault.tick]
     assert max(speeds) > t.STILL_RAD_S, "the joint did not move, so stopping cannot be tested"
 
 
-def must_come_to_rest_after(fault: Fault, hosted: Hosted) -> None:
+def assert_rest_after(fault: Fault, hosted: Hosted) -> None:
     """Fail if a joint still moves SETTLE_S after the fault, in ticks of the robot."""
     settled = fault.tick + math.ceil(t.SETTLE_S * 1e9 / hosted.config.period_ns) + 1
     while hosted.tick < settled:
-        hosted.passes(1)
-    states = [state for state in hosted.backend.seen if fault.tick < state.tick <= settled]
+        hosted.wait_for_ticks(1)
+    states = [state for state in hosted.backend.joint_states if fault.tick < state.tick <= settled]
     assert np.abs(states[-1].velocity_rad_s).max() < t.STILL_RAD_S, f"still moving: {states[-1].velocity_rad_s} rad/s"
     tail = np.array([state.angle_rad for state in states[-len(states) // 3 :]])
     assert np.ptp(tail, axis=0).max() < t.STILL_RAD, f"still moving: {np.ptp(tail, axis=0)} rad"
@@ -56,12 +67,12 @@ def must_come_to_rest_after(fault: Fault, hosted: Hosted) -> None:
 def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -> None:
     """Of another lease, for another robot, too long, NaN, too old, from the future: each by its own word."""
     hosted.arm(stay)
-    hosted.passes(t.ARMING_PERIODS)
+    hosted.wait_for_ticks(t.ARMING_PERIODS)
     count = len(hosted.robot.joints)
     lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
     wait_until(lambda: hosted.tick > 2 * lease, "ticks enough to be late by")
     refused = Counter(hosted.host.authority.rejected_counts)
-    home = hosted.backend.seen[-1].angle_rad
+    home = hosted.backend.joint_states[-1].angle_rad
     wrong: dict[str, dict[str, Any]] = {
         "wrong_epoch": {"lease_epoch": hosted.controller.epoch + 7},
         "wrong_layout": {"layout": "f" * 16},
@@ -75,11 +86,11 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -
     def all_refused() -> bool:
         missing = [values for word, values in wrong.items() if rejected[word] <= refused[word]]
         for values in missing:  # again, because a burst of samples may lose some
-            hosted.forge(**values)
+            hosted.send_forged_command(**values)
         return not missing
 
     wait_until(all_refused, f"all refused, so far: {rejected}")
-    after = hosted.passes(t.ARMING_PERIODS)
+    after = hosted.wait_for_ticks(t.ARMING_PERIODS)
     assert hosted.host.authority.state == "armed", hosted.host.authority.reason
     away = np.array([state.angle_rad for state in after]) - home
     assert np.abs(away).max() < t.STILL_RAD, f"it moved by {np.abs(away).max():.3f} rad"
@@ -87,14 +98,16 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: Hosted) -
 
 def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: Hosted) -> None:
     """Whatever the controller still sends; and only a reset ends it."""
-    ticks = moves_then(silent=False, hosted=hosted)
+    ticks = arm_and_move(silent=False, hosted=hosted)
     at = hosted.armed_at + ticks
-    hosted.backend.planted = lambda tick: Fault(tick=tick, what="planted", cause="by the test") if tick >= at else None
-    hosted.reaches("fault")
-    hosted.backend.planted = None
+    hosted.backend.planted_fault = lambda tick: (
+        Fault(tick=tick, what="planted", cause="by the test") if tick >= at else None
+    )
+    hosted.wait_for_lifecycle("fault")
+    hosted.backend.planted_fault = None
     assert {fault.what for fault in hosted.host.authority.faults} == {"planted"}
-    must_have_moved_before(hosted.host.authority.faults[0], hosted)
-    must_come_to_rest_after(hosted.host.authority.faults[0], hosted)
+    assert_moved_before(hosted.host.authority.faults[0], hosted)
+    assert_rest_after(hosted.host.authority.faults[0], hosted)
     assert not hosted.lifecycle("arm").ok, "a fault has to be reset first"
     answer = hosted.lifecycle("reset")
     assert answer.ok and answer.lifecycle == "disarmed", answer
@@ -103,19 +116,19 @@ def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: Hosted) -> 
 def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench: Bench, hosted: Hosted) -> None:
     """The lease is the dead-man switch: it runs out, that is a fault, and the joints come to rest."""
     try:
-        loses_its_lease(hosted)
-        must_come_to_rest_after(hosted.host.authority.faults[0], hosted)
+        let_lease_expire(hosted)
+        assert_rest_after(hosted.host.authority.faults[0], hosted)
     finally:
-        bench.spoil()  # a lockstep host does not wait again for a service that has stalled
+        bench.reopen_for_next_test()  # a lockstep host does not wait again for a service that has stalled
 
 
-def loses_its_lease(hosted: Hosted) -> None:
-    """Fall silent, and expect the fault that ends the lease."""
-    moves_then(silent=True, hosted=hosted)
-    hosted.reaches("fault")
+def let_lease_expire(hosted: Hosted) -> None:
+    """Let the controller fall silent, and check that the lease expires in time."""
+    arm_and_move(silent=True, hosted=hosted)
+    hosted.wait_for_lifecycle("fault")
     expired = next(fault for fault in hosted.host.authority.faults if fault.what == "lease_expired")
     lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
-    must_have_moved_before(expired, hosted)
+    assert_moved_before(expired, hosted)
     late = expired.tick - hosted.controller.last_sent_tick - lease
     assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
 
@@ -123,13 +136,13 @@ def loses_its_lease(hosted: Hosted) -> None:
 def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted) -> None:
     """In a pause no tick passes and no lease expires; whatever cannot stand still says so."""
     hosted.arm(stay)
-    hosted.passes(t.ARMING_PERIODS)
+    hosted.wait_for_ticks(t.ARMING_PERIODS)
     answer = hosted.session.request(
         keys.SIMULATOR, SimulatorRequest(action="pause", requester="contract"), timeout_s=10.0
     )
     if not hosted.robot.simulated_time:
         assert answer.refusal == "not_simulated", answer
-        hosted.passes(t.ARMING_PERIODS)
+        hosted.wait_for_ticks(t.ARMING_PERIODS)
         return
     assert answer.ok, answer
     wait_until(lambda: hosted.host.status().paused_by == "contract", "the pause")
@@ -137,5 +150,5 @@ def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted)
     time.sleep(2 * hosted.robot.lease_ns * 1e-9)
     assert hosted.tick == tick, "time goes on in a pause"
     assert hosted.session.request(keys.SIMULATOR, SimulatorRequest(action="resume"), timeout_s=10.0).ok
-    hosted.passes(t.ARMING_PERIODS)
+    hosted.wait_for_ticks(t.ARMING_PERIODS)
     assert hosted.host.authority.state == "armed", hosted.host.authority.reason

@@ -13,7 +13,7 @@ def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> N
     """Each joint in turn moves STEP_RAD from the start pose, in rad, in the right direction, and stays there."""
     rig.arm()
     for joint in range(rig.count):
-        angles = rig.drive({joint: (Mode.POSITION, rig.home_rad[joint] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
+        angles = rig.drive({joint: (Mode.POSITION, rig.home_rad[joint] + t.STEP_RAD)}, rig.count_periods(t.SETTLE_S))
         moved = angles.angle_rad[-1] - rig.home_rad
         assert abs(moved[joint] - t.STEP_RAD) < t.REACHED_RAD, f"joint {joint} asked for {t.STEP_RAD} rad: {moved} rad"
         others = np.delete(moved, joint)
@@ -22,11 +22,11 @@ def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> N
 
 def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: Rig) -> None:
     """In both directions, in rad/s; friction may reduce a motor's speed."""
-    rig.needs(Mode.VELOCITY)
+    rig.skip_without(Mode.VELOCITY)
     rig.arm()
     for speed in (t.CRUISE_RAD_S, -t.CRUISE_RAD_S):
-        record = rig.drive({0: (Mode.VELOCITY, speed)}, rig.periods(t.CRUISE_S))
-        last = record.velocity_rad_s[-rig.periods(t.CRUISE_S / 3) :, 0].mean()
+        record = rig.drive({0: (Mode.VELOCITY, speed)}, rig.count_periods(t.CRUISE_S))
+        last = record.velocity_rad_s[-rig.count_periods(t.CRUISE_S / 3) :, 0].mean()
         assert abs(last - speed) < t.SPEED_SHARE * abs(speed), f"asked for {speed} rad/s: {last:.3f} rad/s"
 
 
@@ -34,8 +34,9 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> 
     """Integrated over a motion, velocity gives the angle: same unit, same sign, same joint."""
     rig.arm()
     joint = rig.count - 1
-    record = rig.drive({joint: (Mode.VELOCITY, -t.CRUISE_RAD_S)}, rig.periods(t.CRUISE_S))
-    velocity, angle = record.velocity_rad_s, record.angle_rad
+    record = rig.drive({joint: (Mode.VELOCITY, -t.CRUISE_RAD_S)}, rig.count_periods(t.CRUISE_S))
+    velocity = record.velocity_rad_s
+    angle = record.angle_rad
     integral = 0.5 * (velocity[1:] + velocity[:-1]).sum(axis=0) * rig.period_ns * 1e-9
     turned = angle[-1] - angle[0]
     assert turned[joint] < -t.STILL_RAD, "the joint did not move, so nothing can be compared"
@@ -44,19 +45,20 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> 
 
 def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: Pushing) -> None:
     """Against a stop the reported torque is the one asked for, in N·m, with its sign."""
-    rig.needs(Mode.TORQUE, torque=True)
+    rig.skip_without(Mode.TORQUE, torque=True)
     assert pushing.torque_mode is not None
-    felt, asked = pushing.torque_mode.torque_nm[-1], pushing.asked_nm
+    measured_nm = pushing.torque_mode.torque_nm[-1]
+    asked = pushing.asked_nm
     slack = t.TORQUE_SHARE * asked + t.TORQUE_NM
-    assert abs(felt[0] - asked) < slack, f"asked for {asked:.2f} N·m: {felt[0]:.3f} N·m"
-    assert abs(felt[1] + asked) < slack, f"asked for {-asked:.2f} N·m: {felt[1]:.3f} N·m"
+    assert abs(measured_nm[0] - asked) < slack, f"asked for {asked:.2f} N·m: {measured_nm[0]:.3f} N·m"
+    assert abs(measured_nm[1] + asked) < slack, f"asked for {-asked:.2f} N·m: {measured_nm[1]:.3f} N·m"
 
 
 def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> None:
     """Armed and passive: released away from the start pose, a joint stays where it is, without torque."""
     rig.arm()
-    rig.drive({0: (Mode.POSITION, rig.home_rad[0] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
-    record = rig.drive({0: (Mode.PASSIVE, 0.0)}, rig.periods(t.SETTLE_S))
+    rig.drive({0: (Mode.POSITION, rig.home_rad[0] + t.STEP_RAD)}, rig.count_periods(t.SETTLE_S))
+    record = rig.drive({0: (Mode.PASSIVE, 0.0)}, rig.count_periods(t.SETTLE_S))
     assert abs(record.torque_nm[-1, 0]) < t.TORQUE_NM, f"{record.torque_nm[-1, 0]:.3f} N·m"
     settled = record.angle_rad[t.TRANSPORT_PERIODS :, 0]
     assert np.ptp(settled) < t.REACHED_RAD, f"it moved by {np.ptp(settled):.3f} rad"
@@ -65,9 +67,10 @@ def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> 
 def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
     """Position, velocity, passive and position again, side by side: each does its own."""
     rig.arm()
-    step, speed = rig.home_rad[0] - t.STEP_RAD, t.CRUISE_RAD_S
+    step = rig.home_rad[0] - t.STEP_RAD
+    speed = t.CRUISE_RAD_S
     asked = {0: (Mode.POSITION, step), 1: (Mode.VELOCITY, speed), rig.count - 1: (Mode.PASSIVE, 0.0)}
-    record = rig.drive(asked, rig.periods(t.CRUISE_S))
+    record = rig.drive(asked, rig.count_periods(t.CRUISE_S))
     assert abs(record.angle_rad[-1, 0] - step) < 2 * t.REACHED_RAD  # still on its way
     assert abs(record.velocity_rad_s[-1, 1] - speed) < t.SPEED_SHARE * speed
     still = record.angle_rad[-1] - rig.home_rad
@@ -76,38 +79,38 @@ def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
 
 def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
     """Without commands for less than a lease the joint keeps its setpoint."""
-    rig.needs(Mode.VELOCITY)
+    rig.skip_without(Mode.VELOCITY)
     rig.cruise()
     rig.idle(t.LAPSE_PERIODS)
-    must_cruise(rig)
+    assert_cruising(rig)
 
 
 def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
     """`advance` alone keeps the last setpoints active."""
-    rig.needs(Mode.VELOCITY)
+    rig.skip_without(Mode.VELOCITY)
     rig.cruise()
     for _ in range(t.HELD_PERIODS):
-        rig.let_pass()
-    must_cruise(rig)
+        rig.advance_period()
+    assert_cruising(rig)
 
 
 def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> None:
     """Described without a mode, a joint is never given a setpoint in it: the command is refused as a whole."""
-    lacking = [mode for mode in Mode if not rig.has(0, mode)]
+    lacking = [mode for mode in Mode if not rig.supports_mode(0, mode)]
     if not lacking:
         pytest.skip(f"{rig.robot.joints[0].name} is described with every mode")
     rig.arm()
     for mode in lacking:
         refused = rig.authority.rejected_counts["wrong_mode"]
-        wrong = rig.points({})
+        wrong = rig.make_setpoints({})
         wrong.mode[0], wrong.target[0] = mode, t.CRUISE_RAD_S
-        record = rig.offer(wrong)
+        record = rig.send_command(wrong)
         assert rig.authority.rejected_counts["wrong_mode"] == refused + 1, f"{mode.name.lower()} mode was accepted"
         assert np.abs(record.angle_rad - rig.home_rad).max() < t.REACHED_RAD, "it moved"
         assert all(mode not in points.mode for points in record.setpoints)
 
 
-def must_cruise(rig: Rig) -> None:
+def assert_cruising(rig: Rig) -> None:
     """Fail when joint 0 has slowed down."""
-    speed = rig.now.velocity_rad_s[0]
-    assert speed > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, f"{speed:.3f} rad/s, told to keep {t.CRUISE_RAD_S} rad/s"
+    speed = rig.newest_joints.velocity_rad_s[0]
+    assert speed > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, f"{speed:.3f} rad/s, commanded were {t.CRUISE_RAD_S} rad/s"

@@ -93,8 +93,8 @@ def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record)
 
 def test_what_is_not_known_yet_is_not_reported_as_valid(rig: Rig) -> None:
     """The very first sample: a joint has the same angle as afterwards, or it is not valid."""
-    for i, valid in enumerate(rig.first.joints.valid):
-        away = rig.first.joints.angle_rad[i] - rig.home_rad[i]
+    for i, valid in enumerate(rig.first_sample.joints.valid):
+        away = rig.first_sample.joints.angle_rad[i] - rig.home_rad[i]
         assert not valid or abs(away) < t.STILL_RAD, f"joint {i} was {away:+.3f} rad off and called valid"
 
 

@@ -17,9 +17,9 @@ def test_a_mode_switch_makes_no_jump(
 ) -> None:
     """Every ordered pair of modes, with small targets: no tick changes the torque by a quarter of the maximum."""
     for mode in (before, after):
-        if not rig.has(0, mode):
+        if not rig.supports_mode(0, mode):
             pytest.skip(f"{rig.robot.joints[0].name} is described without {mode.name.lower()} mode")
-    rig.needs(torque=True)
+    rig.skip_without(torque=True)
     most = t.BUMP_SHARE * rig.full_torque_nm[0]
     steps = np.abs(np.diff(switching[before, after]))
     assert steps.max() < most, f"torque changed by {steps.max():.2f} N·m in a tick; at most {most:.2f} N·m"

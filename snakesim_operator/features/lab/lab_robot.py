@@ -6,13 +6,14 @@ from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
 
-MAX_NAME = 24  # so that a certificate's common name, which holds three of them, has at most the 64 characters of X.509
+# A common name of a certificate holds three names, and X.509 allows it 64 characters; hence the limit.
+MAX_NAME_LENGTH = 24
 
-Name = Annotated[str, Meta(pattern=f"^[a-z][a-z0-9_]{{0,{MAX_NAME - 1}}}$")]
+Name = Annotated[str, Meta(pattern=f"^[a-z][a-z0-9_]{{0,{MAX_NAME_LENGTH - 1}}}$")]
 # An interface of the kernel, or INTERFACE:CHANNEL of python-can.
 CanBus = Annotated[str, Meta(pattern=r"^(v?can[0-9]{1,3}|[a-z][a-z0-9_]*:[A-Za-z0-9_./@+-]+)$", max_length=127)]
 DeviceFile = Annotated[str, Meta(pattern=r"^/dev/[A-Za-z0-9_./+-]+$", max_length=200)]
-# In a unit it stands between double quotes.
+# A unit of systemd has the setting in double quotes, so some characters are not allowed.
 Setting = Annotated[str, Meta(pattern=r"^[^=\s\"\\$%]+=[^\r\n%\"\\$]+$")]
 BitRate = Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})]
 DataBitRate = Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})]

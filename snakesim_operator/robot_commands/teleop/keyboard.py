@@ -1,7 +1,7 @@
-"""Single keys from the terminal, which is always given back as it was.
+"""Reads single keys from the terminal, and restores the terminal's settings at the end.
 
-A terminal gives keys without a time. Behind a network that stalls, or in a program that was stopped, they wait, and
-come all at once when it goes on. Such keys are marked as late, by what no keyboard does: `KeyTiming`.
+Keys from a terminal have no timestamp. While a network stalls, or the program is stopped, keys wait; when it continues,
+all of them arrive at once. `KeyTiming` recognizes such late keys, because no keyboard sends keys like that.
 """
 
 import math
@@ -15,88 +15,116 @@ from typing import Self
 
 from snakesim_hal.base.errors import ConfigError
 
-KEYS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # after ESC [ or ESC O
-MAX_BYTES = 1024  # a paste, or a key that repeats; all of it is read, and the newest end of it counts
-MAX_AT_ONCE = 8  # keys in one look; teleop looks 20 times a second, and a keyboard repeats up to 50 times
-WINDOW_S, MAX_KEYS_HZ = 0.5, 60.0  # more keys a second than any keyboard repeats
-MAX_UNREAD_S = 0.5  # between two looks: keys may have waited for as long
-WANTED = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
+ESCAPE_PREFIXES = (b"\x1b[", b"\x1bO")  # the first two bytes of an arrow key
+ARROW_KEYS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # by the third byte
+MAX_BYTES = 1024  # in one reading: a pasted text, or a key that repeats
+MAX_AT_ONCE = 8  # keys in one reading; teleop reads 20 times a second, and a keyboard repeats up to 50 times a second
+RATE_WINDOW_S = 0.5
+MAX_KEYS_HZ = 60.0  # more keys a second than any keyboard repeats
+MAX_UNREAD_S = 0.5  # between two readings; keys may have waited for that long
+NO_TERMINAL = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
+INPUT_FLAGS, LOCAL_FLAGS, CONTROL_CHARACTERS = 0, 3, 6  # indices of what termios.tcgetattr returns
 
 
 class KeyTiming:
-    """Whether keys may have waited before they were read. Pure.
+    """Decides whether keys may have waited before they were read. Has no side effects.
 
-    They have if more came together than a keyboard repeats, or if nobody has read for a while: then they may be as old
-    as that. A single key that a network has delayed cannot be told from one that was pressed just now.
+    Keys are late if more of them arrive together than a keyboard repeats, or if the program has not read for a while.
+    A single key that a network has delayed looks like one that was pressed just now, so it is not recognized.
     """
 
     def __init__(self) -> None:
-        self._read_s: float | None = None  # when keys were looked for last; None: never
-        self._came_s: deque[float] = deque()  # when the keys of the last WINDOW_S came
+        self._last_reading_s: float | None = None  # None: no reading yet
+        self._arrivals_s: deque[float] = deque()  # of the keys of the last RATE_WINDOW_S
 
     def are_late(self, count: int, now_s: float) -> bool:
-        """Return whether keys that are read now may be old. count: how many; call it for each look, also for none."""
-        unread_s = math.inf if self._read_s is None else now_s - self._read_s
-        self._read_s = now_s
-        while self._came_s and now_s - self._came_s[0] > WINDOW_S:
-            self._came_s.popleft()
-        self._came_s.extend([now_s] * count)
-        too_many = count > MAX_AT_ONCE or len(self._came_s) > MAX_KEYS_HZ * WINDOW_S
-        return count > 0 and (too_many or unread_s > MAX_UNREAD_S)
+        """Return whether the keys of this reading may be old. Call it for each reading, also for one without keys.
+
+        Args:
+            count: number of keys in this reading.
+            now_s: time of this reading, of the monotonic clock.
+        """
+        unread_s = math.inf
+        if self._last_reading_s is not None:
+            unread_s = now_s - self._last_reading_s
+        self._last_reading_s = now_s
+        while self._arrivals_s and now_s - self._arrivals_s[0] > RATE_WINDOW_S:
+            self._arrivals_s.popleft()
+        self._arrivals_s.extend([now_s] * count)
+        if count == 0:
+            return False
+        too_many = count > MAX_AT_ONCE or len(self._arrivals_s) > MAX_KEYS_HZ * RATE_WINDOW_S
+        return too_many or unread_s > MAX_UNREAD_S
 
 
 class Keyboard:
-    """stdin, a key at a time, without echo. Ctrl-C works; Ctrl-Z does not, because it would leave the robot moving."""
+    """Reads stdin key by key, without echo. Ctrl-C works; Ctrl-Z does not, because it would leave the robot moving."""
 
-    def __init__(self, wanted: str = WANTED) -> None:
-        """Raises ConfigError, with what is wanted, when stdin is no terminal."""
+    def __init__(self, no_terminal: str = NO_TERMINAL) -> None:
+        """Remember the terminal's settings.
+
+        Args:
+            no_terminal: text of the error for a stdin that is no terminal.
+
+        Raises:
+            ConfigError: stdin is no terminal.
+        """
         self._handle = sys.stdin.fileno()
         if not os.isatty(self._handle):
-            raise ConfigError(wanted, code="command/invalid-option")
-        self._before = termios.tcgetattr(self._handle)
+            raise ConfigError(no_terminal, code="command/invalid-option")
+        self._initial_settings = termios.tcgetattr(self._handle)
         self.gone = False  # the terminal was closed
-        self.late = False  # whether the keys of the last look may be old
+        self.late = False  # the keys of the last reading may be old
         self._timing = KeyTiming()
 
     def __enter__(self) -> Self:
-        mode = termios.tcgetattr(self._handle)
-        mode[0] &= ~termios.IXON  # Ctrl-S would stop output, and with it this program, the emergency stop too
-        mode[3] &= ~(termios.ICANON | termios.ECHO)
-        mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
-        mode[6][termios.VSUSP] = b"\0"
-        termios.tcsetattr(self._handle, termios.TCSADRAIN, mode)
+        settings = termios.tcgetattr(self._handle)
+        settings[INPUT_FLAGS] &= ~termios.IXON  # Ctrl-S would pause output, and with it this program and its stop keys
+        settings[LOCAL_FLAGS] &= ~(termios.ICANON | termios.ECHO)
+        characters = settings[CONTROL_CHARACTERS]
+        characters[termios.VMIN] = 1
+        characters[termios.VTIME] = 0
+        characters[termios.VSUSP] = b"\0"  # disables Ctrl-Z
+        termios.tcsetattr(self._handle, termios.TCSADRAIN, settings)
         return self
 
     def __exit__(self, *_: object) -> None:
         try:
-            termios.tcsetattr(self._handle, termios.TCSADRAIN, self._before)
-        except termios.error:  # it was closed
+            termios.tcsetattr(self._handle, termios.TCSADRAIN, self._initial_settings)
+        except termios.error:  # the terminal was closed
             self.gone = True
 
     def keys(self, wait_s: float) -> list[str]:
-        """Keys pressed, at the latest after a time: `up`, `down`, `left`, `right`, or the character."""
-        ready, _, _ = select.select([self._handle], [], [], wait_s)
-        found = self._read() if ready else []
-        self.late = self._timing.are_late(len(found), time.monotonic())
-        return found
+        """Wait for keys, and return them as `up`, `down`, `left`, `right`, or the character.
 
-    def _read(self) -> list[str]:
+        Args:
+            wait_s: how long to wait for the first key; without one, the list is empty.
+        """
+        readable, _, _ = select.select([self._handle], [], [], wait_s)
+        pressed = self._read_keys() if readable else []
+        self.late = self._timing.are_late(len(pressed), time.monotonic())
+        return pressed
+
+    def _read_keys(self) -> list[str]:
         try:
             data = os.read(self._handle, MAX_BYTES)
         except OSError:
             data = b""
         self.gone = not data
-        return _split(data)
+        return _split_keys(data)
 
 
-def _split(data: bytes) -> list[str]:
-    found: list[str] = []
+def _split_keys(data: bytes) -> list[str]:
+    """Return the keys in the terminal's bytes; other escape sequences of three bytes are left out."""
+    pressed: list[str] = []
     while data:
-        if data[:2] in (b"\x1b[", b"\x1bO") and len(data) > 2:
-            if data[2:3] in KEYS:
-                found.append(KEYS[data[2:3]])
+        is_escape_sequence = data[:2] in ESCAPE_PREFIXES and len(data) > 2
+        if is_escape_sequence:
+            code = data[2:3]
+            if code in ARROW_KEYS:
+                pressed.append(ARROW_KEYS[code])
             data = data[3:]
-            continue
-        found.append(chr(data[0]))
-        data = data[1:]
-    return found
+        else:
+            pressed.append(chr(data[0]))
+            data = data[1:]
+    return pressed

@@ -11,7 +11,7 @@ import pytest
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.cli import main
 from snakesim_operator.this_computer.kernel import kernel
-from snakesim_operator.this_computer.network_findings import ports, routers
+from snakesim_operator.this_computer.network_findings import check_ports, check_routers
 from snakesim_testing.harness.endpoint import free_endpoint
 
 
@@ -29,12 +29,12 @@ def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.C
 
 def test_an_endpoint_that_is_not_zenoh_is_a_failure_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
-        (finding,) = routers(RobotSelection(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
+        (finding,) = check_routers(RobotSelection(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
     assert finding.state == "fail" and finding.fix
 
 
 def test_the_default_port_is_free_or_has_a_user() -> None:
-    (finding,) = ports()
+    (finding,) = check_ports()
     assert finding.what == "port 7447" and finding.state in ("ok", "warn")
 
 

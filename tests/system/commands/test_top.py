@@ -11,7 +11,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.base.targets import RobotSelection
-from snakesim_operator.monitoring.top import table_of, top
+from snakesim_operator.monitoring.top import TrafficSnapshot, top
 from snakesim_operator.monitoring.traffic import KEPT, MAX_KEYS, Traffic
 from snakesim_testing.hal.small_robots import clock, command, description, state
 from snakesim_testing.harness.endpoint import free_endpoint
@@ -49,8 +49,8 @@ def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -
     lines = traffic.lines(MS)
     assert len(lines) == MAX_KEYS and traffic.keys_left_out == 11
     assert lines[0].failure == "malformed" and lines[1].writer is None
-    text = "\n".join(table_of(lines, [], {}, traffic.keys_left_out, {}))
-    assert "STRANGER" in text and "11 messages on still more keys" in text
+    text = "\n".join(TrafficSnapshot(lines, [], {}, {}, traffic.keys_left_out).format_table())
+    assert "UNKNOWN" in text and "11 messages on still more keys" in text
 
 
 def test_a_table_for_scripts_from_a_real_network() -> None:

@@ -40,7 +40,7 @@ def test_calls_are_spread_over_processes_to_which_nothing_can_connect(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     abandoned = tmp_path / f"{FOLDER_PREFIX}killed"
     abandoned.mkdir()
-    monkeypatch.setattr(worker_pool, "UNLOCKED_S", 0.0)
+    monkeypatch.setattr(worker_pool, "MAX_UNLOCKED_S", 0.0)
     before = listening_sockets()
     with WorkerPool(2) as pool:
         assert pool.map(math.sqrt, [(4.0,), (9.0,), (16.0,)]) == [2.0, 3.0, 4.0]

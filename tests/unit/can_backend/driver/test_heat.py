@@ -57,7 +57,7 @@ def until_told(rig: Rig, celsius: float) -> None:
     """Until the robot's power samples tell the temperature."""
     for _ in range(100):
         rig.idle()
-        power = rig.since(rig.tick - 1).samples[-1].others.get(keys.POWER)
+        power = rig.record_since(rig.tick - 1).samples[-1].others.get(keys.POWER)
         if isinstance(power, Power) and power.motor_c[0] == pytest.approx(celsius, abs=0.5):
             return
     raise AssertionError(f"{celsius} °C were not told")

@@ -52,7 +52,7 @@ class Lame(Rig):
             self.drive(dict.fromkeys(OTHERS, (Mode.VELOCITY, there)))
 
     def turning(self) -> list[bool]:
-        return [abs(self.now.velocity_rad_s[i]) > 0.2 for i in OTHERS]
+        return [abs(self.newest_joints.velocity_rad_s[i]) > 0.2 for i in OTHERS]
 
 
 @contextmanager
@@ -80,7 +80,7 @@ def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within:
             return
         assert robot.authority.isolated_joints == [f"joint_{FAILS + 1}"], robot.authority.reason
         robot.wave(30)
-        robot.must_be_armed()
+        robot.assert_armed()
         assert all(robot.turning()) and {fault.joint for fault in robot.faults} == {f"joint_{FAILS + 1}"}
         assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
 
@@ -93,7 +93,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         assert robot.authority.isolated_joints == [f"joint_{FAILS + 1}"], robot.authority.reason
         robot.inject(f"{kind}:joint_{FAILS + 1}", begins=False)
         robot.wave(40)
-        robot.must_be_armed()
+        robot.assert_armed()
         assert robot.states()[FAILS] != ModuleState.ARMED, "its motor is on"
         reported = len(robot.faults)
         robot.ask("disarm")
@@ -102,7 +102,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.idle(20)
         robot.arm()
         robot.wave(30)
-        robot.must_be_armed()
+        robot.assert_armed()
         assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
         assert len(robot.faults) == reported, robot.faults[reported:]
 
@@ -115,7 +115,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
         robot.idle(10)
         robot.arm()
         robot.wave(30)
-        robot.must_be_armed()
+        robot.assert_armed()
         assert all(robot.turning()) and robot.states()[FAILS] == ModuleState.DISARMED
         assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
 
@@ -124,7 +124,7 @@ def test_one_joint_too_many_stops_all() -> None:
     with lame_robot() as robot:
         robot.inject(f"mute:joint_{FAILS + 1}")
         robot.wave(30)
-        robot.must_be_armed()
+        robot.assert_armed()
         robot.inject("mute:joint_1")
         robot.wave(DEADLINE)
         assert robot.authority.state == "fault"
@@ -162,7 +162,7 @@ def test_who_clears_before_a_period_has_passed_clears_all_the_same(
         assert robot.authority.state == "disarmed" and robot.states() == [ModuleState.DISARMED] * JOINTS
         robot.arm()
         robot.wave(30)
-        robot.must_be_armed()
+        robot.assert_armed()
         assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
 
 
@@ -181,9 +181,9 @@ def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch
         robot.wave(60)
         robot.inject(f"mute:joint_{FAILS + 1}")
         robot.wave(10)
-        robot.must_be_armed()
+        robot.assert_armed()
         if then == "fault":
-            robot.lose(0)
+            robot.isolate_joint(0)
         else:
             robot.ask("disarm")
         robot.ask("reset")
@@ -200,8 +200,8 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
     with lame_robot() as robot:
         robot.arm()
         robot.drive({FAILS: (Mode.VELOCITY, 0.5)}, 30)
-        robot.lose(FAILS)
+        robot.isolate_joint(FAILS)
         robot.wave(3)
-        robot.must_be_armed()
+        robot.assert_armed()
         assert robot.states()[FAILS] == ModuleState.DISARMED
         assert chain_of(robot.can).slots[FAILS].module.demand == PASSIVE

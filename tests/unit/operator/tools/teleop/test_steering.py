@@ -5,7 +5,7 @@ import math
 import pytest
 
 from snakesim_operator.cli import main
-from snakesim_operator.robot_commands.teleop.keyboard import _split  # pyright: ignore[reportPrivateUsage]
+from snakesim_operator.robot_commands.teleop.keyboard import _split_keys  # pyright: ignore[reportPrivateUsage]
 from snakesim_operator.robot_commands.teleop.steering import LEAD_RAD, VALID_NS, Steering
 
 
@@ -33,8 +33,8 @@ def test_the_direction_begins_at_the_bodys_and_stays_near_it() -> None:
 
 
 def test_keys_arrive_whole_or_in_bunches() -> None:
-    assert _split(b"\x1b[A\x1bOD q") == ["up", "left", " ", "q"]
-    assert _split(b"\x1b[Z\x1b\xff") == ["\x1b", "\xff"], "unknown keys do nothing"
+    assert _split_keys(b"\x1b[A\x1bOD q") == ["up", "left", " ", "q"]
+    assert _split_keys(b"\x1b[Z\x1b\xff") == ["\x1b", "\xff"], "unknown keys do nothing"
 
 
 def test_without_a_terminal_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
