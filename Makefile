@@ -36,7 +36,7 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	$(bin)/snakesim run peg_row --controller obstacle_aided --console --clock-mode realtime --duration 10 --out runs/demo $(ARGS)
 	@printf '%s\n' 'Next:' '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
 	  '  $(bin)/snakesim run triplet --console --clock-mode realtime      the paper'\''s case study: one joint at a time pushes' \
-	  '  docs/tutorial.md, 3: write a controller                       push it your way'
+	  '  docs/tutorials/complete-tour.md, 3: write a controller                       push it your way'
 
 test: test-unit test-contract test-system test-can ## Run the tests that every change must pass (4 minutes on two cores)
 
@@ -72,7 +72,7 @@ compiled: .venv/.compiled
 
 pytest = $(bin)/python -m pytest
 
-faults: $(stamp) ## Measure the fault table and write docs/faults.md and its CSV (ARGS="--rows NAME --trials 3")
+faults: $(stamp) ## Measure the fault table and write docs/benchmarks/faults.md and its CSV (ARGS="--rows NAME --trials 3")
 	$(bin)/python -m verification.faults --write $(ARGS)
 
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
@@ -108,7 +108,7 @@ bench: $(stamp) ## Measure the ratios in benchmarks/
 bench-peers: $(stamp) ## Measure the loop beside raw Zenoh, dora-rs and rospy (installs them: build/peers, Debian)
 	$(bin)/python -m benchmarks.peers $(ARGS)
 
-links: $(stamp) ## Measure bad links between a robot and its controller, and write docs/lab-links.md (root; ARGS="--trials 4")
+links: $(stamp) ## Measure bad links between a robot and its controller, and write docs/benchmarks/lab-links.md (root; ARGS="--trials 4")
 	$(bin)/python -m verification.links --write $(ARGS)
 
 bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link beside raw Zenoh (root)

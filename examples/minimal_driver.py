@@ -1,4 +1,6 @@
-"""A complete driver type: copy it, and replace what uses `body` by the protocol of your drives. See docs/backends.md.
+"""A complete driver type to copy: replace what uses `body` by the protocol of your drives.
+
+See docs/hardware/write-a-driver.md.
 
 Here `body` is the body of a simulated robot, and so the drives obey at once. Try it:
 

@@ -7,7 +7,7 @@
 
 `run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running.
 `Controller` is the base class of controllers; `Observation`, `ControllerCommand`, `Telemetry`, `Parameters` and
-`positions` go with it. `docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
+`positions` go with it. `docs/how-to/python.md` is the reference. Nothing of SnakeSIM imports this package.
 
 Names are loaded when they are first used, and importing this package changes nothing in the process. A run gives the
 digest of `snakesim run`, because it is computed in a child process where this process would round otherwise. Only a run

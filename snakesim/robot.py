@@ -265,7 +265,7 @@ class Robot:
         """Take the lease and arm the robot. It holds its pose until the first command.
 
         Args:
-            unchecked: Also arm a robot whose joints were not checked as they are now; see docs/commissioning.md.
+            unchecked: Also arm a robot whose joints were not checked as they are now; see docs/hardware/calibration.md.
 
         Raises:
             RefusedError: The robot is not ready within ARM_TIMEOUT_S, or refuses, or disarms at once.

@@ -244,7 +244,8 @@ def require_controller(plugin: Any, name: str) -> type[Controller[Any]]:
         class_name = plugin.__name__ if isinstance(plugin, type) else "Name"
         raise ConfigError(
             f"{where} does not derive from Controller, the base class of all controllers. Write "
-            f"`class {class_name}(snakesim.Controller):`, after `import snakesim`; docs/controllers.md has an example"
+            f"`class {class_name}(snakesim.Controller):`, after `import snakesim`; "
+            "docs/reference/controllers.md has an example"
         )
     if inspect.isabstract(plugin):
         raise ConfigError(

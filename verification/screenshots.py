@@ -1,7 +1,8 @@
 """Pictures of the console for the documentation, of a recorded run or of one that it starts.
 
-python -m verification.screenshots runs/clutter docs/console.png --at 5 --dark
-python -m verification.screenshots 'peg_row --stay' docs/console-live.png --click 'Take control' --click Parameters
+python -m verification.screenshots runs/clutter docs/pictures/console.png --at 5 --dark
+python -m verification.screenshots 'peg_row --stay' docs/pictures/console-live.png \\
+    --click 'Take control' --click Parameters
 """
 
 import argparse

@@ -42,7 +42,7 @@ EXPLAINED = (
     "A run that stops is named; a lease lasts 50 ms. On such a link a packet of 1500 bytes takes 2 ms, and nothing",
     "passes the one that is under way: so p99 is longer, also with raw Zenoh. Smaller pieces of an image do not help,",
     "TCP joins them to whole packets again. Previews instead of images keep the aim: see",
-    "[bandwidth](../docs/bandwidth.md).",
+    "[bandwidth](../docs/benchmarks/bandwidth.md).",
     "",
     "What ours takes longer is mostly Python that runs once in 10 ms, so from a cold cache, half of it in the process",
     "of control. That ours sends five messages a tick costs little: all that have a reader are in one packet.",

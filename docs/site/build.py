@@ -69,7 +69,7 @@ def shown_files() -> Iterator[Path]:
     """Every tracked or new file of the folders that pages link to."""
     command = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "--", *SHOWN)
     for name in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
-        if (ROOT / name).is_file() and not name.startswith("docs/site/"):
+        if (ROOT / name).is_file() and not name.startswith(("docs/site/", "docs/style/")):
             yield Path(name)
 
 

@@ -1,4 +1,4 @@
-"""Writes docs/commands.md: every command with its arguments and examples. Run `python -m docs.site.commands_page`."""
+"""Writes docs/reference/commands.md, which lists every command: `python -m docs.site.commands_page`."""
 
 import argparse
 from collections.abc import Iterator
@@ -6,13 +6,13 @@ from pathlib import Path
 
 from snakesim_operator.cli import find_subparsers, make_parser
 
-PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
 HEAD = """\
 # Commands
 
 Made by `make schemas` from the parsers of `snakesim`; `snakesim COMMAND --help` prints the same. Commands for daily
 work are verbs, such as `snakesim run`. All others are a noun and a verb, such as `snakesim robot arm`.
-[The command](command.md) explains them by task.
+[The command](../how-to/command-line.md) explains them by task.
 
 The table lists the first word of each command; follow its link for arguments and examples.
 

@@ -1,4 +1,4 @@
-"""The page docs/configuration.md, every key of every file; `python -m docs.site.configuration_page` writes it."""
+"""Writes docs/reference/configuration.md, every key of every file: `python -m docs.site.configuration_page`."""
 
 from collections.abc import Iterator
 from inspect import cleandoc
@@ -20,12 +20,12 @@ from snakesim_operator.features.evaluate.suite import Suite
 from snakesim_operator.features.lab.lab_file import LabFile
 from snakesim_operator.this_computer.scenario_keys import section_type
 
-PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
 INTRODUCTION = """# Configuration
 
 Every key of the files that you write, from the code by `make schemas`. `snakesim config SCENARIO --explain KEY` prints
 the same for one key, with its value in a scenario and the file or flag that gives it. As JSON Schemas:
-[`schemas/files/`](../schemas/README.md).
+[`schemas/files/`](../../schemas/README.md).
 
 * A key that is *required* has no default. The default *none* cannot be written: leave the key out, or remove it with
   `--unset`.
@@ -45,8 +45,11 @@ FILES: dict[str, tuple[type[msgspec.Struct], str]] = {
     "Robot file": (RobotFile, EXTENDS.format(kind="robot")),
     "Scene file": (SceneFile, EXTENDS.format(kind="scene")),
     "Scenario file": (RunConfig, SCENARIO),
-    "Suite file": (Suite, "A suite is described in [evaluation](evaluation.md#a-suite-of-your-own)."),
-    "Lab file": (LabFile, "A lab is described in [a lab](lab.md)."),
+    "Suite file": (
+        Suite,
+        "A suite is described in [evaluation](../how-to/evaluate-controllers.md#a-suite-of-your-own).",
+    ),
+    "Lab file": (LabFile, "A lab is described in [a lab](../how-to/lab.md)."),
 }
 PLUGINS = {
     CONTROLLERS: ("Controllers", "controllers", "The parameters of a controller, in a scenario file."),

@@ -1,4 +1,4 @@
-"""The page docs/errors.md, from the registry of codes; `python -m docs.site.error_pages` writes it."""
+"""The page docs/reference/errors.md, from the registry of codes; `python -m docs.site.error_pages` writes it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from snakesim_hal.base.error_codes import ERROR_CODES, ErrorCode
 from snakesim_hal.base.fault_codes import FAULT_CODES, REFUSAL_CODES
 
-PAGE = Path(__file__).parents[2] / "docs" / "errors.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "errors.md"
 HEAD = """# Errors and faults
 
 Every error ends its first line with a code, such as `[config/unknown-key]`. Search this page for the code. Codes are

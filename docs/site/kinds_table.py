@@ -1,4 +1,4 @@
-"""The table of faults on request in docs/injector.md, from the registry.
+"""The table of faults on request in docs/how-to/inject-faults.md, from the registry.
 
 `python -m docs.site.kinds_table` writes it.
 """
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from snakesim_hal.model.fault_kinds import DOERS, KINDS, Amount
 
-PAGE = Path(__file__).parents[2] / "docs" / "injector.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "inject-faults.md"
 BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"
 TARGETS = {
     "process": "`host`, `guidance`, `navigation`, `control`; `router` with `--with-router`, which cannot hang",

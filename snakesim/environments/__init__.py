@@ -7,7 +7,8 @@
 
 Importing this package registers the names; it needs the extra `gym`, and nothing else of SnakeSIM imports it.
 `environment` has the environment, `vector` many of them, `stepped` and `assisted` the robot in it,
-`rewards` what is paid; what is seen is in `snakesim_gnc.control.observations`. `docs/environments.md` is the reference.
+`rewards` what is paid; what is seen is in `snakesim_gnc.control.observations`. `docs/how-to/environments.md` is the
+reference.
 """
 
 from snakesim_operator.base import extras

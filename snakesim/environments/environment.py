@@ -31,7 +31,7 @@ MAX_FIELD_ATTEMPTS = 20  # a reset gives up after so many random fields without 
 
 
 class SnakeEnv(gymnasium.Env[Any, Any]):
-    """A Gymnasium environment with one robot in one scenario; see `docs/environments.md`.
+    """A Gymnasium environment with one robot in one scenario; see `docs/how-to/environments.md`.
 
     A pickle holds the arguments and no robot: an environment that is loaded from one needs a `reset`, as Gymnasium's
     own MuJoCo environments do.

@@ -433,7 +433,7 @@ def check_interface(channel: str) -> None:
     if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
         raise ConfigError(
             f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "
-            f"run in a VM that has CAN: see docs/hil.md",
+            f"run in a VM that has CAN: see docs/hardware/joint-modules.md",
             code="bus/not-available",
         )
     bring_up = "deploy/can/up.sh"

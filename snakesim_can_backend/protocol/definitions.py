@@ -1,7 +1,7 @@
 """The bus protocol of the joint modules, version 1: ids, states, actions and parameters.
 
 Layouts and scales are only in `schemas/can/snakesim.dbc`; tests compare the numbers here with its value
-tables. The specification is `docs/can-protocol.md`.
+tables. The specification is `docs/reference/can-protocol.md`.
 """
 
 from binascii import crc_hqx

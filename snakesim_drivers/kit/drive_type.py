@@ -138,7 +138,9 @@ class BusesBackend(DriveBackend):
 
 
 class DriverTypeBackend(BusesBackend):
-    """A driver type, and the backend on its drives, real or emulated. Derive from it; see docs/backends.md.
+    """A driver type, and the backend on its drives, real or emulated.
+
+    Derive from it; see docs/hardware/write-a-driver.md.
 
     A driver type sets `name`, `Settings`, a subclass of `DriveSettings`, and perhaps `supported_modes`, and implements
     the four abstract class methods. The host's thread calls all of them, before the backend is opened or while it is.

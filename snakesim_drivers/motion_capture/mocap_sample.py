@@ -1,4 +1,4 @@
-"""The datagram with the base's pose from a motion-capture system; specified in docs/hil.md."""
+"""The datagram with the base's pose from a motion-capture system; specified in docs/hardware/joint-modules.md."""
 
 import msgspec
 

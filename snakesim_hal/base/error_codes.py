@@ -1,7 +1,8 @@
 """Every error code, with its meaning, its usual cause and its remedy.
 
-The codes are stable words: users search for them, scripts compare them, and tests assert them. `docs/errors.md` is
-made of this file by `make schemas`. Nothing else imports it, so it costs no time at the start of a program.
+The codes are stable words: users search for them, scripts compare them, and tests assert them.
+`docs/reference/errors.md` is made of this file by `make schemas`. Nothing else imports it, so it costs no time at the
+start of a program.
 
 A command prints the code in brackets at the end of the first line of an error. The words on the wire, for faults and
 refusals, are explained in `fault_codes`.
@@ -114,7 +115,7 @@ ERROR_CODES = {
     "python/invalid-argument": ErrorCode(
         "A function of the Python API got an argument that is not allowed.",
         "A wrong type, a wrong number of values, or an object where a class is needed.",
-        "Pass what the message names; see docs/python.md and docs/environments.md.",
+        "Pass what the message names; see docs/how-to/python.md and docs/how-to/environments.md.",
     ),
     # --- plug-ins and extras
     "extra/not-installed": ErrorCode(
@@ -157,7 +158,7 @@ ERROR_CODES = {
     "injection/unknown-fault": ErrorCode(
         "A fault to inject is written wrongly, or does not exist.",
         "The kind is misspelled, the target cannot have this fault, or its amount is outside the range.",
-        "Write it as the message shows; docs/injector.md lists all kinds.",
+        "Write it as the message shows; docs/how-to/inject-faults.md lists all kinds.",
     ),
     "injection/unknown-target": ErrorCode(
         "The target of a fault does not exist in this run.",
@@ -172,7 +173,7 @@ ERROR_CODES = {
     "injection/not-allowed": ErrorCode(
         "This robot does not allow injected faults.",
         "Something real moves, or the run was started without permission.",
-        "Allow them explicitly, as the message says; see docs/injector.md.",
+        "Allow them explicitly, as the message says; see docs/how-to/inject-faults.md.",
     ),
     # --- buses and drives
     "bus/not-available": ErrorCode(
@@ -320,7 +321,7 @@ ERROR_CODES = {
     "network/insecure-endpoint": ErrorCode(
         "The endpoint would let anyone on the network command the robot.",
         "It is not on loopback, and clients are not authenticated.",
-        "Listen on loopback, use certificates (docs/lab.md), or accept the risk with --insecure.",
+        "Listen on loopback, use certificates (docs/how-to/lab.md), or accept the risk with --insecure.",
     ),
     "network/loopback-down": ErrorCode(
         "The loopback interface is down.",
@@ -330,7 +331,7 @@ ERROR_CODES = {
     "network/session-file": ErrorCode(
         "A session or router file is not usable.",
         "A setting is missing, or makes the session something else than a client.",
-        "Set the key that the message names; docs/lab.md shows how to generate correct files.",
+        "Set the key that the message names; docs/how-to/lab.md shows how to generate correct files.",
     ),
     "network/unknown-key": ErrorCode(
         "There is no such key on the network.",
@@ -340,12 +341,12 @@ ERROR_CODES = {
     "certificate/rejected": ErrorCode(
         "The router does not accept this certificate, or a certificate is missing.",
         "It is of another authority, has expired, or no router runs at that address.",
-        "Install the files of the right authority (docs/lab.md), and set RUST_LOG=zenoh=warn to see why.",
+        "Install the files of the right authority (docs/how-to/lab.md), and set RUST_LOG=zenoh=warn to see why.",
     ),
     "certificate/expired": ErrorCode(
         "The certificate authority has expired.",
         "It is older than its period of validity.",
-        "Make a new authority, and install the new files on every machine; see docs/lab.md.",
+        "Make a new authority, and install the new files on every machine; see docs/how-to/lab.md.",
     ),
     "certificate/invalid-authority": ErrorCode(
         "The folder of the certificate authority cannot be trusted or read.",
@@ -422,7 +423,7 @@ ERROR_CODES = {
     "policy/invalid": ErrorCode(
         "A policy does not fit this robot or this version.",
         "The ONNX file has other inputs, outputs or metadata than expected.",
-        "Export it again, or correct its metadata; see docs/train.md.",
+        "Export it again, or correct its metadata; see docs/tutorials/train-a-policy.md.",
     ),
     "service/failed": ErrorCode(
         "A service raised an exception, or published an invalid message.",
@@ -453,7 +454,7 @@ ERROR_CODES = {
     "recording/not-readable": ErrorCode(
         "A recording is damaged, or is a file of another kind.",
         "The file was cut off or changed, or its name is wrong.",
-        "Name another file, or recover what is readable; see docs/recordings.md.",
+        "Name another file, or recover what is readable; see docs/how-to/recordings.md.",
     ),
     "recording/missing-data": ErrorCode(
         "A recording does not hold what this command needs.",
@@ -489,7 +490,7 @@ ERROR_CODES = {
     "lab/invalid-file": ErrorCode(
         "A lab file contradicts itself.",
         "A robot, machine, router or bus is missing or is used twice.",
-        "Correct the entry that the message names; see docs/lab.md.",
+        "Correct the entry that the message names; see docs/how-to/lab.md.",
     ),
     "urdf/invalid": ErrorCode(
         "A URDF file or a mesh cannot be imported.",

@@ -1,7 +1,7 @@
 """The words on the wire for faults and refusals, explained as `error_codes` explains errors.
 
 `FAULT_CODES` has each `Fault.what`. `REFUSAL_CODES` has each `Answer.refusal`, and the reasons by which
-`Status.commands_rejected` counts. `docs/errors.md` is made of them.
+`Status.commands_rejected` counts. `docs/reference/errors.md` is made of them.
 """
 
 from snakesim_hal.base.error_codes import ErrorCode
@@ -147,7 +147,9 @@ REFUSAL_CODES = {
     "wrong_host": ErrorCode("The request names another host.", "The host restarted.", "Read the description again."),
     "not_simulated": ErrorCode("Time cannot be changed here.", "The robot is real.", "Use a simulated robot."),
     "wrong_pace": ErrorCode("The clock mode has no speed.", "It is not realtime.", "Use --clock-mode realtime."),
-    "not_allowed": ErrorCode("This run does not allow it.", "Faults were not allowed.", "See docs/injector.md."),
+    "not_allowed": ErrorCode(
+        "This run does not allow it.", "Faults were not allowed.", "See docs/how-to/inject-faults.md."
+    ),
     "not_permitted": ErrorCode("The operating system refuses it.", "A missing capability.", "Run as root."),
     "unknown_fault": ErrorCode("There is no such fault.", "A misspelled kind.", "List the kinds of faults."),
     "cannot": ErrorCode("This fault cannot be injected here.", "The backend does not support it.", "Use another one."),

@@ -226,7 +226,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     """Seed of all random numbers of the run."""
 
     faults: list[str] = []
-    """Faults to inject, at times since the first arming, such as "kill:control@2"; see docs/injector.md."""
+    """Faults to inject, at times since the first arming, such as "kill:control@2"; see docs/how-to/inject-faults.md."""
 
     allow_fault_injection: bool = False
     """True: faults may be injected also on a robot whose motors really move."""

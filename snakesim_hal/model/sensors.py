@@ -1,4 +1,4 @@
-"""The sensors in a robot file. docs/sensors.md describes what they publish, and how they are simulated.
+"""The sensors in a robot file. docs/how-to/sensors.md describes what they publish, and how they are simulated.
 
 All noise is given as a standard deviation. A delay is the time from the measurement to the arrival at the host.
 """
@@ -205,7 +205,7 @@ class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
 
 
 class CustomSensor(Mounted, frozen=True, kw_only=True):
-    """A custom sensor: the class in `model` defines its message, see docs/sensors.md."""
+    """A custom sensor: the class in `model` defines its message, see docs/how-to/sensors.md."""
 
     model: Model
     """Class that defines the sensor and its message: the name of an installed sensor, or ./file.py:Class."""

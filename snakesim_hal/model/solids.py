@@ -9,7 +9,7 @@ from snakesim_hal.model.outlines import Friction, Heading, Point
 from snakesim_hal.wire.messages import Obstacle
 
 GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless configured otherwise
-PEG_FRICTION = 0.2  # plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/scenes.md
+PEG_FRICTION = 0.2  # plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/how-to/scenes.md
 BASE_FRICTION = 0.4  # an obstacle on the ground on which it slides
 MAX_LEAN_RAD = 0.6
 

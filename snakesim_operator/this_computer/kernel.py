@@ -31,7 +31,7 @@ def _preemption(root: Path) -> Iterator[Finding]:
     if _read(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         yield Finding(what="kernel", state="ok", detail="PREEMPT_RT")
         return
-    detail = "not PREEMPT_RT: a tick may begin milliseconds late; `snakesim topic rate` shows it (docs/real-time.md)"
+    detail = "not PREEMPT_RT: ticks may be milliseconds late; `snakesim topic rate` shows it (docs/how-to/real-time.md)"
     yield Finding(what="kernel", state="warn", detail=detail, fix=["sudo apt install linux-image-rt-amd64"])
 
 
@@ -53,7 +53,7 @@ def _isolated(root: Path) -> Iterator[Finding]:
     if isolated:
         detail = f"{isolated} kept free of other programs; a host uses them when started with `taskset -c {isolated}`"
     else:
-        detail = f"none of {os.cpu_count()}; from 500 Hz on one for the host alone is worth it (docs/real-time.md)"
+        detail = f"none of {os.cpu_count()}; isolate one for the host from 500 Hz on (docs/how-to/real-time.md)"
     yield Finding(what="isolated processors", state="ok", detail=detail)
 
 

@@ -10,7 +10,7 @@ INTRODUCTION = """\
 Made by `make schemas` from `snakesim_hal/wire/roles.py`, as are the access rules that `snakesim lab render` writes
 for a lab's routers. A certificate gives a process one role for one robot; keys are below that robot's namespace. What
 no cell grants is denied: other keys, other robots, `delete`, a query where a stream is, a wildcard that covers a key
-where no wildcard is granted. [docs/lab.md](../docs/lab.md) shows how a lab is set up.
+where no wildcard is granted. [docs/how-to/lab.md](../docs/how-to/lab.md) shows how a lab is set up.
 """
 NOTES = """\
 A `gnc` publishes, declares and answers at `*` only under the names of its own services, as the lab file lists them, and

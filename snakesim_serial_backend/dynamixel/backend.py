@@ -136,7 +136,8 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
                 f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
-                f"amperes: take stall torque over stall current from the e-Manual, and measure it (docs/dynamixel.md)",
+                "amperes: take stall torque over stall current from the e-Manual, and measure it "
+                "(docs/hardware/dynamixel.md)",
                 code="drive/unsupported-setting",
             )
 

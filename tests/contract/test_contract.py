@@ -1,4 +1,4 @@
-"""The contract of a backend, unchanged, on every bench of ours: see conftest.py, and docs/backends.md."""
+"""The contract of a backend, on every bench: see conftest.py and docs/hardware/write-a-driver.md."""
 
 from snakesim_testing.contract.test_closing import *  # noqa: F403
 from snakesim_testing.contract.test_description import *  # noqa: F403

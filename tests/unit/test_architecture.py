@@ -1,11 +1,11 @@
-"""The walks of docs/architecture.md lead through functions that exist, and its tour from line to line."""
+"""The walks of docs/concepts/architecture.md lead through functions that exist, and its tour from line to line."""
 
 import ast
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "architecture.md").read_text()
+PAGE = (ROOT / "docs" / "concepts" / "architecture.md").read_text()
 WALKS = PAGE.partition("## Walks through the code\n")[2].partition("\n## ")[0]
 ROWS = re.findall(r"^\|(?: (\d) \|)? `(\w+)` in `([\w/.]+)` \| (.+) \|$", WALKS, re.MULTILINE)
 HOPS = [(name, path, line.strip("`")) for number, name, path, line in ROWS if number]
@@ -25,7 +25,7 @@ def test_every_function_of_the_walks_is_where_they_say() -> None:
 
 def test_walk_from_readme_leads_to_the_line_that_limits_a_torque() -> None:
     readme = (ROOT / "README.md").read_text()
-    assert "](docs/architecture.md#walks-through-the-code)" in readme
+    assert "](docs/concepts/architecture.md#walks-through-the-code)" in readme
     assert f"]({HOPS[0][1]})" in readme
     assert len(HOPS) < 5 and HOPS[-1][1] == "snakesim_hal/safety/limiter.py"
     for (name, path, line), following in zip(HOPS, [*HOPS[1:], None], strict=True):

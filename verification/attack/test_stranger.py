@@ -38,11 +38,11 @@ def test_nothing_of_ours_is_imported(path: Path) -> None:
 
 
 def test_every_test_that_the_safety_page_names_is_there() -> None:
-    page = (HERE.parents[1] / "docs" / "safety.md").read_text(encoding="utf-8")
+    page = (HERE.parents[1] / "docs" / "concepts" / "safety.md").read_text(encoding="utf-8")
     file, found = "", 0
     for named, test in re.findall(r"`(test_\w+\.py)?::(test_\w+)`", page):
         file = named or file
         path = next(folder / file for folder in (HERE, LAB) if (folder / file).exists())
-        assert f"def {test}(" in path.read_text(encoding="utf-8"), f"docs/safety.md names {file}::{test}"
+        assert f"def {test}(" in path.read_text(encoding="utf-8"), f"docs/concepts/safety.md names {file}::{test}"
         found += 1
     assert found >= 20, found

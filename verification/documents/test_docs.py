@@ -1,6 +1,6 @@
 """What tutorials, the guide to evaluations and the README ask a reader to type is typed here, as printed.
 
-Of docs/hil.md only what needs no CAN; `make test-can` runs the rest of it with commands of its own.
+Of docs/hardware/joint-modules.md only what needs no CAN; `make test-can` runs the rest of it with commands of its own.
 """
 
 import os
@@ -24,11 +24,14 @@ def typed_in(page: str) -> list[Section]:
     return [section for section in sections(REPOSITORY / page) if section.has_commands]
 
 
-TUTORIAL, EVALUATION = typed_in("docs/tutorial.md"), typed_in("docs/evaluation.md")
-HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
-CONTROLLERS, ROBOTS, SCENES = (typed_in(f"docs/{page}.md") for page in ("controllers", "robots", "scenes"))
-PAGES = ("first-controller", "train", "your-robot", "your-sensor", "lab-tutorial")
-LESSONS = [section for page in PAGES for section in typed_in(f"docs/{page}.md")]
+TUTORIAL, EVALUATION = typed_in("docs/tutorials/complete-tour.md"), typed_in("docs/how-to/evaluate-controllers.md")
+JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
+HIL = [section for section in sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
+CONTROLLERS, ROBOTS, SCENES = (
+    typed_in(f"docs/{page}.md") for page in ("reference/controllers", "how-to/robots", "how-to/scenes")
+)
+PAGES = ("first-controller", "train-a-policy", "your-robot", "your-sensor", "lab-on-your-desk")
+LESSONS = [section for page in PAGES for section in typed_in(f"docs/tutorials/{page}.md")]
 README = typed_in("README.md")
 LIMIT_S = 500.0
 

@@ -1,4 +1,4 @@
-"""Everything that docs/lab.md asks its reader to type is typed here, on four machines, as printed.
+"""Everything that docs/how-to/lab.md asks its reader to type is typed here, on four machines, as printed.
 
 Only the machine's `/etc/snakesim` is another folder here, the address of the hub is that of its namespace, and the
 clock mode is lockstep, because several robots in real time share a test machine.
@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.timeout(600),
     pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root"),
 ]
-BLOCKS = [block for section in sections(REPOSITORY / "docs" / "lab.md") for block in section.blocks]
+BLOCKS = [block for section in sections(REPOSITORY / "docs" / "how-to" / "lab.md") for block in section.blocks]
 LIMIT_S = 120.0
 
 

@@ -15,7 +15,7 @@ SITE = REPOSITORY / "build" / "docs"
 def test_the_menu_has_every_page() -> None:
     menu = (REPOSITORY / "docs" / "site" / "mkdocs.yml").read_text()
     pages = [
-        page.relative_to(REPOSITORY) for folder in ("docs", "schemas") for page in (REPOSITORY / folder).glob("*.md")
+        page.relative_to(REPOSITORY) for folder in ("docs", "schemas") for page in (REPOSITORY / folder).rglob("*.md")
     ]
     assert not [page for page in pages if f"{page}\n" not in menu]
 

@@ -127,9 +127,9 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--backends", nargs="+", choices=get_args(Backend), metavar="NAME", help="only on these")
     parser.add_argument("--trials", type=int, default=TRIALS, help=f"of each row and backend ({TRIALS})")
     parser.add_argument(
-        "--write", action="store_true", help="write docs/faults.md and docs/fault-table.csv from all results"
+        "--write", action="store_true", help="write docs/benchmarks/faults.md and docs/fault-table.csv from all results"
     )
-    parser.add_argument("--json", type=Path, default=Store().path, help="raw results (docs/faults.json)")
+    parser.add_argument("--json", type=Path, default=Store().path, help="raw results (docs/benchmarks/faults.json)")
     return parser.parse_args(argv)
 
 

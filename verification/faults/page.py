@@ -10,7 +10,7 @@ from verification.faults.results import ROOT, Store
 from verification.faults.row import TRIALS, Result, Row, judge
 from verification.faults.table import HEADINGS, LEASE_MS, PERIOD_MS, Heading
 
-PAGE = ROOT / "docs" / "faults.md"
+PAGE = ROOT / "docs" / "benchmarks" / "faults.md"
 TABLE_NAME = "fault-table.csv"  # beside the page
 COLUMNS = (
     "row",
@@ -134,7 +134,7 @@ def _is_met(pair: tuple[Row, str], results: Results) -> bool:
 def _format_table(results: Results) -> str:
     """Return the table of all measurements as CSV."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer: csv.DictWriter[str] = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
     for heading in HEADINGS:
         for row in heading.rows:

@@ -9,7 +9,7 @@ import msgspec
 from verification.faults.row import Result
 
 ROOT = Path(__file__).resolve().parents[2]
-RAW = ROOT / "docs" / "faults.json"
+RAW = ROOT / "docs" / "benchmarks" / "faults.json"
 
 
 class Store:

@@ -2,5 +2,5 @@
 
 `relay`     a link that loses and delays, packet by packet
 `lab`       the programs of a robot on three machines
-`__main__`  `python -m verification.links --write` writes docs/lab-links.md
+`__main__`  `python -m verification.links --write` writes docs/benchmarks/lab-links.md
 """

@@ -19,7 +19,7 @@ from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_operator.results.run_log import RunRecord
 from verification.links.lab import Lab, lab
 
-PAGE = Path(__file__).parents[2] / "docs" / "lab-links.md"
+PAGE = Path(__file__).parents[2] / "docs" / "benchmarks" / "lab-links.md"
 ARMED_S = 10.0
 ARM_LIMIT_S = 20.0
 WRITTEN_S = 1.0  # until rows are on disk

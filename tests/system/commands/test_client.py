@@ -1,4 +1,4 @@
-"""Programs of others on a robot that runs: the clients of docs/client.md, and `snakesim.Robot` of docs/python.md."""
+"""Clients of a running robot: those of docs/how-to/client.md, and `snakesim.Robot` of docs/how-to/python.md."""
 
 import ast
 import sys
@@ -111,7 +111,7 @@ def settled(run: Running) -> None:
 
 
 def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running, tmp_path: Path) -> None:
-    nod = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "nod.py" in s.files).files["nod.py"]
+    nod = next(s for s in sections(REPOSITORY / "docs" / "how-to" / "python.md") if "nod.py" in s.files).files["nod.py"]
     ended = script(nod, waiting, tmp_path)
     assert ended.code == 0, ended.err
     assert "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.out or "turned by +0.1" in ended.out

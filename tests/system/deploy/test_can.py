@@ -46,7 +46,7 @@ def test_bus_off_stays_off_wherever_an_interface_is_configured() -> None:
     """In script, systemd files, rendered units and every command of the documentation."""
     assert setting("40-can0.network", "CAN", "RestartSec") == "0"
     commands: dict[str, str] = {}
-    for page in (*(ROOT / "docs").glob("*.md"), *(ROOT / "deploy").rglob("*.md")):
+    for page in (*(ROOT / "docs").rglob("*.md"), *(ROOT / "deploy").rglob("*.md")):
         commands[page.name] = "".join(re.findall(r"^```\w*\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL))
     for file in (UP, ROOT / "snakesim_operator" / "features" / "lab" / "templates" / "can.j2"):
         commands[file.name] = file.read_text()

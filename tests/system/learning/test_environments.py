@@ -370,5 +370,5 @@ def test_without_the_extra_the_import_says_how_to_get_it() -> None:
 @pytest.mark.slow
 def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    found = next(of for of in sections(REPOSITORY / "docs" / "environments.md") if "search.py" in of.files)
+    found = next(of for of in sections(REPOSITORY / "docs" / "how-to" / "environments.md") if "search.py" in of.files)
     exec(compile(found.files["search.py"], "search.py", "exec"), {"__name__": "__main__"})

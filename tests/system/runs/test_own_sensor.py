@@ -1,4 +1,4 @@
-"""A sensor with a message of its own, in one file outside of the packages: examples/whisker.py, of docs/sensors.md."""
+"""A sensor with a message of its own, in one file outside of the packages: examples/whisker.py, of docs/how-to/sensors.md."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ def robot(tmp_path: Path) -> str:
     return f"robot=./examples/{ROBOT.name}"
 
 
-@pytest.mark.slow  # docs/your-sensor.md is typed in verification/documents
+@pytest.mark.slow  # docs/tutorials/your-sensor.md is typed in verification/documents
 def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robot: str) -> None:
     run = ("peg_row", "--set", robot, "--duration", "600", "--stay", "--clock-mode", "realtime")
     with running(tmp_path / "run", *run) as started:
@@ -106,7 +106,7 @@ SAID = {
 
 
 def suite(folder: Path, robot: str, clause: str) -> Ended:
-    """The contract suite, as docs/backends.md has it, on the simulator with the whiskers."""
+    """The contract suite, as docs/hardware/write-a-driver.md has it, on the simulator with the whiskers."""
     typed = [sys.executable, "-m", "pytest", "-q", *PYTEST, "--snakesim-set", robot, "-k", clause]
     return call(typed, folder, environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
 

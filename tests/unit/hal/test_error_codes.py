@@ -1,4 +1,4 @@
-"""Every code that is used is explained, every explained code is used, and docs/errors.md is current."""
+"""Every code that is used is explained, every explained code is used, and docs/reference/errors.md is current."""
 
 import ast
 import re

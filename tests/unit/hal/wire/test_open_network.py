@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.roles import TABLE, KeyRights
 
-PAGE = (Path(__file__).parents[4] / "docs" / "safety.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[4] / "docs" / "concepts" / "safety.md").read_text(encoding="utf-8")
 SECTION = PAGE.partition("## What an unauthenticated client can do")[2].partition("\n## ")[0]
 REQUESTED = {keys.FAULT_ALL, keys.INTENT} | {line.key for line in TABLE if line.kind == "query"}
 

@@ -254,7 +254,7 @@ def test_a_mesh_may_be_text_or_binary_and_one_that_is_not_there_is_told(tmp_path
 
 
 def test_a_document_that_shows_a_robot_shows_one_that_runs(tmp_path: Path) -> None:
-    document = (Path(__file__).parents[4] / "docs" / "robots.md").read_text(encoding="utf-8")
+    document = (Path(__file__).parents[4] / "docs" / "how-to" / "robots.md").read_text(encoding="utf-8")
     robot = tmp_path / "eel.toml"
     robot.write_text(document.partition("```toml eel.toml\n")[2].partition("```")[0])
     result = simulate(config("peg_row", robot, "duration_s=3"))
