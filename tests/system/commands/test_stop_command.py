@@ -15,6 +15,7 @@ from snakesim_testing.hal.small_robots import run_config
 from snakesim_testing.runs.command import snakesim
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
     with running(run_config()) as run:
         at, said = run.link.endpoint, list[str]()
