@@ -187,6 +187,7 @@ def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(driven: Running
         assert robot.wait() and robot.status.lifecycle == "estop"
 
 
+@pytest.mark.slow
 def test_where_there_is_no_robot_it_says_so() -> None:
     with raises_error(snakesim.NotConnectedError, code="network/no-robot"):
         snakesim.Robot.connect("tcp/127.0.0.1:9")

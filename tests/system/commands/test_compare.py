@@ -25,6 +25,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow  # the digests: tests/system/runs/test_golden.py
 def test_a_repeated_run_is_the_same(runs: Path) -> None:
     ended = snakesim("study", "compare", "a", "again", "--within", "0", cwd=runs)
     assert ended.code == 0, ended.out + ended.err

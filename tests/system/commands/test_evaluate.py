@@ -272,6 +272,7 @@ def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: t
     assert [row[3] for row in rows] == ["1/1", "0/1"] * 2
 
 
+@pytest.mark.slow
 def test_a_sweep_runs_every_value(home: Path) -> None:
     span = "controllers.path_following.look_ahead_m=0.02:0.06:3"
     given = ["--vary", span, "--set", "duration_s=0.5", "--seeds", "2", "--set", "controller=path_following"]

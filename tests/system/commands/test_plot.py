@@ -24,6 +24,7 @@ def words(path: Path) -> list[str]:
     return ["".join(text.itertext()) for text in ElementTree.parse(path).getroot().iter(f"{SVG}text")]
 
 
+@pytest.mark.slow
 def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     given = ["angle_rad.joint_7,target.joint_7", "torque_nm", "contact_count"]
     out = run / "chosen.svg"

@@ -199,6 +199,7 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
             assert ros.asked("stop", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)).success
 
 
+@pytest.mark.slow
 def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
     """Arm, command single joints, fall silent, stop, reset, disarm: all of it as a node of rmw_zenoh would."""
     alone = (

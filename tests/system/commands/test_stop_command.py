@@ -17,6 +17,7 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.command import snakesim
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
     with running(run_config()) as run:
         at, said = run.link.endpoint, list[str]()

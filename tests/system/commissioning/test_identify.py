@@ -45,6 +45,7 @@ def test_hidden_parameters_are_found_and_written_down(tmp_path: Path) -> None:
     assert "Torque of joint_3, measured" in (tmp_path / "run" / "identified.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_hang_is_not_identified(tmp_path: Path) -> None:
     given = ("backends.sim.suspended=false", "robot.chain.modules=3", "robot.motor.friction_nm=0.1")
     sets = [word for text in given for word in ("--set", text)]

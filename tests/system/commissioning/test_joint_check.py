@@ -28,6 +28,7 @@ def check(out: Path, *sets: str) -> tuple[int, list[str]]:
     return ended.code, ended.out.splitlines()
 
 
+@pytest.mark.slow  # verification/test_commissioning_trials.py hides one defect of each kind
 def test_every_defect_is_named_and_no_sound_joint_is(tmp_path: Path) -> None:
     code, lines = check(tmp_path / "run", *DEFECTS)
     assert code == 1

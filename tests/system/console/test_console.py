@@ -47,6 +47,7 @@ def fastest_rad_s(joints: JointState) -> float:
     return max(abs(speed) for speed in joints.velocity_rad_s)
 
 
+@pytest.mark.quiet
 def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         began_s = time.monotonic()

@@ -41,6 +41,7 @@ def cells(tab: Tab) -> dict[str, list[str]]:
     return {row[0].removeprefix("■ "): row[1:5] for row in rows}
 
 
+@pytest.mark.slow
 def test_signals_are_searched_put_beside_each_other_pointed_at_and_saved(tmp_path: Path) -> None:
     simulate(load("triplet", [parse_set("duration_s=2")]).config, tmp_path / "run")
     record = RunRecord.load(tmp_path / "run")

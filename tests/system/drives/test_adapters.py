@@ -116,6 +116,7 @@ def test_channels_of_udp_multicast_are_buses_of_their_own(machine: Machine) -> N
     assert "received: [0, 1, 0]" in machine.run(sys.executable, "-c", TWO_GROUPS)
 
 
+@pytest.mark.slow
 def test_its_own_modules_move_in_lockstep_as_on_any_bus(machine: Machine, tmp_path: Path) -> None:
     said = run(machine, tmp_path, "--clock-mode", "lockstep", "--duration", "2", "--set", 'backend.emulators="process"')
     assert "(exit code 0)" in said, said

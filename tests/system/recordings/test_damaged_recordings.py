@@ -111,6 +111,7 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
         assert json.loads(ended.out)["missing"]["a"] and not json.loads(ended.out)["missing"]["b"]
 
 
+@pytest.mark.slow
 def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole: bytes, tmp_path: Path) -> None:
     for name in ("whole.mcap", "a.mcap"):
         written(tmp_path / name, whole)

@@ -94,6 +94,7 @@ def _demonstrate(run: Running, home: Path) -> None:
         assert at.process.wait(10) == 0
 
 
+@pytest.mark.slow
 def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
     labels = [json.loads(line) for line in (demos / "demos" / "episodes.jsonl").read_text().splitlines()]
     assert [(one["file"], one["success"]) for one in labels] == [

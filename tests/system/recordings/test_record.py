@@ -64,6 +64,7 @@ def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Pat
     assert "last second" in (tmp_path / "run" / REPORT).read_text()
 
 
+@pytest.mark.slow
 def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
@@ -98,6 +99,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
     nothing_left(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
         assert command.tell(run, "robot", "disarm").code == 0
@@ -149,9 +151,10 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
     [
         pytest.param("size=1M", "cat /dev/zero > ballast 2> /dev/null", IN_ONE, FULL, marks=pytest.mark.slow),
         ("size=48k", "", IN_ONE, FULL),  # room for the configuration and little else
-        ("size=250k", "", [], FULL),  # less than the black box alone takes: rows are lost whoever fills it first
+        # less than the black box alone takes: rows are lost whoever fills it first
+        pytest.param("size=250k", "", [], FULL, marks=pytest.mark.slow),
         pytest.param("size=1M,nr_inodes=4", "", IN_ONE, FULL, marks=pytest.mark.slow),
-        ("size=1M", LOCKED, [], READ_ONLY),
+        pytest.param("size=1M", LOCKED, [], READ_ONLY, marks=pytest.mark.slow),
         ("size=1M", f"mkdir run; echo '{{}}' > run/config.json; {LOCKED}", IN_ONE, READ_ONLY),
     ],
 )
@@ -165,6 +168,7 @@ def test_a_full_or_read_only_disk_neither_ends_nor_changes_a_run(
         assert "of 500 ticks are missing in the black box" in ended.out
 
 
+@pytest.mark.slow
 def test_a_fault_outranks_a_full_disk(tmp_path: Path) -> None:
     ended, left = in_a_file_system(tmp_path, "size=100k", "", *SHORT, "--in-process", "--fault", "mute:joint_3@1")
     orderly(ended, left, code=1, warning="No space left on device")

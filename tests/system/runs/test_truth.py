@@ -1,5 +1,6 @@
 """What a run says of itself is what happened: who stands still does not locomote, and a run that ended has an end."""
 
+import pytest
 from pathlib import Path
 
 import msgspec
@@ -34,6 +35,7 @@ def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_p
     assert "Did not locomote: standing still: less than 20 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
 
 
+@pytest.mark.slow
 def test_a_snake_that_moves_locomotes_from_when_it_is_seen_to_move(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
     assert ended.code == 0 and summary.path_distance_m is not None and summary.path_distance_m > 0.5

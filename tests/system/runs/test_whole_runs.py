@@ -21,6 +21,7 @@ def test_the_control_experiment_stays_where_it_is(tmp_path: Path) -> None:
     assert summary.net_displacement_m is not None and summary.net_displacement_m < 0.02
 
 
+@pytest.mark.slow
 def test_a_run_repeats_from_the_configuration_that_it_left(tmp_path: Path) -> None:
     _, first = run_to_summary(tmp_path / "first", "triplet", "--duration", "2", "--set", "scene.ground.friction=0.08")
     _, again = run_to_summary(tmp_path / "again", str(tmp_path / "first" / "config.json"))
