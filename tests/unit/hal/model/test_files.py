@@ -35,7 +35,7 @@ class Whole(FileStruct, frozen=True):
 
 GOOD = {"part": {"size_m": 1.0}}
 
-WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
+WRONG: dict[str, dict[str, Any]] = {
     "missing": {"part": {}},
     "missing section": {},
     "type": {"part": {"size_m": "big"}},
@@ -115,7 +115,7 @@ class Thing(FileStruct, frozen=True):
     grip: Grip = Grip.FIRM
 
 
-UNION: dict[str, tuple[dict[str, Any], list[str]]] = {
+UNION: dict[str, dict[str, Any]] = {
     "unknown kind": {"shape": {"kind": "spiral"}},
     "unknown kind in a list": {"shapes": [{"kind": "round", "radius_m": 1}, {"kind": "x"}]},
     "kind of another type": {"shape": {"kind": 3}},
