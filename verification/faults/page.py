@@ -12,7 +12,7 @@ from verification.faults.table import HEADINGS, LEASE_MS, PERIOD_MS, Heading
 
 PAGE = ROOT / "docs" / "benchmarks" / "faults.md"
 TABLE_NAME = "fault-table.csv"  # beside the page
-COLUMNS = (
+COLUMNS: tuple[str, ...] = (
     "row",
     "fault",
     "backend",
