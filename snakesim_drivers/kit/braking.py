@@ -1,7 +1,7 @@
 """How long drives brake after a fault: until their joint is at rest, at most for their watchdog's time. Pure.
 
 Joint modules do so by themselves (state STOPPING of the bus protocol). Drives of every other type would brake for as
-long as a driver commands it, so the driver ends it by the same rule: docs/concepts/safety.md, "After a stop".
+long as a driver commands it, so the driver ends it by the same rule: docs/concepts/stop-modes.md.
 """
 
 from collections.abc import Sequence

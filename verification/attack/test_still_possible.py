@@ -1,6 +1,6 @@
 """What remains without a router's access control: who reaches the endpoint may do this. Each ends within the limits.
 
-docs/concepts/safety.md lists it line by line; more of it stands in test_forged.py, test_commands.py and
+docs/concepts/open-network.md lists it line by line; more of it stands in test_forged.py, test_commands.py and
 test_second_run.py.
 """
 

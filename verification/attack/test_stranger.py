@@ -37,12 +37,13 @@ def test_nothing_of_ours_is_imported(path: Path) -> None:
     assert path.name == Path(__file__).name or ("import_module" not in code and "__import__" not in code)
 
 
-def test_every_test_that_the_safety_page_names_is_there() -> None:
-    page = (HERE.parents[1] / "docs" / "concepts" / "safety.md").read_text(encoding="utf-8")
-    file, found = "", 0
-    for named, test in re.findall(r"`(test_\w+\.py)?::(test_\w+)`", page):
+@pytest.mark.parametrize(("page", "min_tests"), [("open-network.md", 20), ("lab-attackers.md", 10)])
+def test_every_test_that_a_page_on_attacks_names_exists(page: str, min_tests: int) -> None:
+    text = (HERE.parents[1] / "docs" / "concepts" / page).read_text(encoding="utf-8")
+    file, count = "", 0
+    for named, test in re.findall(r"`(test_\w+\.py)?::(test_\w+)`", text):
         file = named or file
         path = next(folder / file for folder in (HERE, LAB) if (folder / file).exists())
-        assert f"def {test}(" in path.read_text(encoding="utf-8"), f"docs/concepts/safety.md names {file}::{test}"
-        found += 1
-    assert found >= 20, found
+        assert f"def {test}(" in path.read_text(encoding="utf-8"), f"docs/concepts/{page} names {file}::{test}"
+        count += 1
+    assert count >= min_tests, count

@@ -1,4 +1,4 @@
-"""The page on safety says what each key by which a client can move, stop or change a robot is worth to a stranger."""
+"""The page on open networks has a row for each key by which a client can move, stop or change a robot."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.roles import TABLE, KeyRights
 
-PAGE = (Path(__file__).parents[4] / "docs" / "concepts" / "safety.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[4] / "docs" / "concepts" / "open-network.md").read_text(encoding="utf-8")
 SECTION = PAGE.partition("## What an unauthenticated client can do")[2].partition("\n## ")[0]
 REQUESTED = {keys.FAULT_ALL, keys.INTENT} | {line.key for line in TABLE if line.kind == "query"}
 
