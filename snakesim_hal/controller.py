@@ -245,12 +245,14 @@ def require_controller(plugin: Any, name: str) -> type[Controller[Any]]:
         raise ConfigError(
             f"{where} does not derive from Controller, the base class of all controllers. Write "
             f"`class {class_name}(snakesim.Controller):`, after `import snakesim`; "
-            "docs/reference/controllers.md has an example"
+            "docs/reference/controllers.md has an example",
+            code="plugin/not-loadable",
         )
     if inspect.isabstract(plugin):
         raise ConfigError(
             f"{where} has no method `update`. Add `def update(self, observation):`, which returns a "
-            f"snakesim.ControllerCommand"
+            f"snakesim.ControllerCommand",
+            code="plugin/not-loadable",
         )
     return plugin
 

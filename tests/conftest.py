@@ -7,7 +7,7 @@ import pytest
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
 from snakesim_testing.hypothesis_profiles import load_profile
 
-pytest_plugins = ["snakesim_testing.contract.plugin"]
+pytest_plugins = ["snakesim_testing.contract.plugin", "snakesim_testing.messages"]
 load_profile()
 
 

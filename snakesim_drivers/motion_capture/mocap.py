@@ -230,7 +230,9 @@ def _open_socket(address: str, setting: str) -> socket.socket:
         receiver.bind((host or "127.0.0.1", int(port)))
     except (OSError, OverflowError, ValueError) as error:
         receiver.close()
-        raise ConfigError(f"`{setting}` = {address!r}: {error}; choose another port") from error
+        raise ConfigError(
+            f"`{setting}` = {address!r}: {error}; choose another port", code="network/invalid-address"
+        ) from error
     receiver.setblocking(False)
     return receiver
 

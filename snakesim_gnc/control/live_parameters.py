@@ -12,6 +12,7 @@ import msgspec
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.controller import Controller, decode_parameters, load_controller
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
@@ -144,6 +145,6 @@ def _to_json(parameters: Any) -> str:
 def _make_schema(parameters_type: type[msgspec.Struct]) -> str:
     """Return the JSON Schema of parameters. For a type that has none it is empty, which allows anything."""
     try:
-        return msgspec.json.encode(msgspec.json.schema(parameters_type)).decode()
+        return msgspec.json.encode(make_schema(parameters_type)).decode()
     except (TypeError, ValueError):
         return "{}"

@@ -19,7 +19,7 @@ gaps, and the shape itself pushes, by its look-ahead l: tau_i = kp_i (theta_i(s 
 work with the force l sum_i kp_i theta_i'^2. The look-ahead follows a PI law of e, too.
 
 A negative speed moves the body backward along its own path. A body that does not advance moves by a wave until it lies
-where it can push (`contact_search.py`). See `docs/concepts/poal.md`.
+where it can push (`contact_search.py`). See `docs/concepts/propulsion-control.md`.
 """
 
 from dataclasses import dataclass

@@ -47,7 +47,7 @@ from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
-NODES_PER_S = 250_000  # of robot time: two fifths of what a core expands, see docs/concepts/poal.md
+NODES_PER_S = 250_000  # of robot time: two fifths of what a core expands, see docs/concepts/path-planning.md
 
 # When to plan again.
 ENDS_SOON_M = 0.6  # of path ahead of the head

@@ -7,7 +7,7 @@ the obstacle. The contacts push a body of length L forward along its curve gamma
 
 o_c is the place of contact c, t the unit tangent of the curve. The margin F* is the largest such F. The search for it
 goes through all sets of three contacts, because three equations have a basic solution with three unknowns. More
-contacts could share the load, so the result is a lower bound. See `docs/concepts/poal.md`.
+contacts could share the load, so the result is a lower bound. See `docs/concepts/path-planning.md`.
 """
 
 from functools import cache

@@ -18,18 +18,20 @@ class HostFaults(Injector):
 
     def __init__(self, config: RunConfig, backend: Backend, session: Session) -> None:
         """Wrap the host's backend. Declares the host's key for fault requests."""
-        self.backend = FaultyBackend(backend)
+        faulty_backend = FaultyBackend(backend)
+        self.backend = faulty_backend
         self._period_ns = config.period_ns
         self._tick = 0
-        super().__init__(HAL, config, session, carry_out=self._inject)
+
+        def carry_out(injection: Injection, begins: bool) -> None:  # no method: it would keep a run in memory as a cycle
+            faulty_backend.inject(injection, begins=begins)
+
+        super().__init__(HAL, config, session, carry_out=carry_out)
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """Keep the tick for the record, then do what every part does."""
         self._tick = timestamp_ns // self._period_ns
         return super().update(timestamp_ns, arm_session, lifecycle)
-
-    def _inject(self, injection: Injection, begins: bool) -> None:
-        self.backend.inject(injection, begins=begins)
 
     def _note(self, text: str, now_s: float) -> None:
         if len(self.notes) < MAX_NOTES:

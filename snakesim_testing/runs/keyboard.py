@@ -30,7 +30,7 @@ class Terminal:
         self.before = termios.tcgetattr(self._theirs)
         self._said = b""
         self.process = subprocess.Popen(
-            [*SNAKESIM, "teleop", "--endpoint", run.endpoint, "--fastest", "0.2"],
+            [*SNAKESIM, "teleop", "--endpoint", run.endpoint, "--max-speed", "0.2"],
             stdin=self._theirs,
             stdout=self._theirs,
             stderr=self._theirs,

@@ -117,7 +117,7 @@ def events(trials: int) -> list[str]:
     cut, mend = (lambda made: made.link.make(cut=True)), (lambda made: made.link.make())
     return [
         event("link cut for 0.5 s", trials, cut, mend, 0.5),
-        event("link cut for 5 s; the machine rejoins", max(trials // 4, 1), cut, mend, 5.0),
+        event("link cut for 5 s, and the machine joins again", max(trials // 4, 1), cut, mend, 5.0),
         event("router killed, and a new one started", trials, Lab.kill_router, Lab.start_router, 0.2),
     ]
 
@@ -131,34 +131,40 @@ def has_netem() -> bool:
 HEAD = """\
 # Bad links between a robot and its controller
 
-Written by `python -m verification.links --write --trials {trials}` (root) on {day};
-{cpus} cores, Linux {kernel}, load {load}.
+How long does a robot keep moving if the network link to its controller loses or delays packets? How fast does it
+stop and resume if the link or the router fails? In short: the robot stops if a command arrives later than one lease
+period. A lower rate helps against delay, but not against loss.
 
-Three machines as network namespaces: the host of `triplet` at 100 Hz in real time with the simulator, a router,
-and guidance, navigation and control. The link between router and controller is bad. This kernel {netem}:
-the link is a pair of TAP interfaces with a process between them (`verification/links/relay.py`) that drops and delays
-Ethernet frames, **each way**, so that a round trip takes twice the delay. TCP runs unchanged above. Frames keep
-their order. The host is armed and watched over a socket pair, so nothing that happens to the network hides what
-the host does.
-All machines share the cores of one; host, controller, router and link run with real-time priority.
+Three machines run as network namespaces. The first runs the host of `triplet` at 100 Hz in real time with the
+simulator, the second a router, and the third guidance, navigation and control. The link between router and
+controller is bad. This kernel {netem}: the link is a pair of TAP interfaces with a process between them
+(`verification/links/relay.py`). It drops and delays Ethernet frames, **each way**, so a round trip takes twice the
+delay. TCP runs unchanged above, and frames keep their order.
+
+The operator arms and watches the host over a socket pair, so the network does not affect what is measured about the
+host. All machines share the cores of one computer. Host, controller, router and link run with real-time priority.
+
+`python -m verification.links --write --trials {trials}` (root) wrote this page on {day}, on {cpus} cores with Linux
+{kernel} at a load of {load}.
 
 ## A link that is bad all the time
 
-How many of the trials lasted {armed:g} s, how long the robot stayed armed, and what ended it. A lease lasts 50
-ms at 100 Hz, and 100 ms at 50 Hz: a controller whose command comes later than that stops the robot, whatever
-the cause. One lost packet takes TCP at least the time of the next ones to notice, and often a timer of 200 ms.
-A delay of 20 +- 10 ms on one interface, as `netem` makes it, is about the round trip of the row 10 +- 5 ms.
+The table shows how many trials lasted {armed:g} s, how long the robot stayed armed, and which fault ended it. A
+lease lasts 50 ms at 100 Hz and 100 ms at 50 Hz. TCP notices one lost packet when the next packets arrive at the
+earliest, and often after a timer of 200 ms. A delay of 20 +- 10 ms on one interface, as `netem` makes it,
+corresponds to the round trip of the condition 10 +- 5 ms.
 
-| link | lasted | armed, median s | shortest s | ended by | m/s while driven | state to command, p50 / p99 ms |
+| Link | Lasted | Armed, median s | Armed, shortest s | Ended by | Driven speed, m/s | State to command, p50 / p99 ms |
 |---|---|---|---|---|---|---|
 """
 EVENTS = """
-## A link or a router that breaks, and comes back
+## A link or a router that fails and returns
 
-Until the host has stopped the robot, and from the repair until it is armed again (`reset`, then `arm`, by an operator
-who does not wait); median / worst.
+*Stopped after* is the time until the host has stopped the robot. *Armed again after* is the time from the repair
+until the robot is armed again, by an operator who sends `reset` and then `arm` without waiting. Both are median /
+worst.
 
-| what | trials | stopped after, ms | armed again after, s |
+| Event | Trials | Stopped after, ms | Armed again after, s |
 |---|---|---|---|
 """
 
@@ -175,7 +181,7 @@ def main() -> None:
         cpus=os.cpu_count(),
         kernel=platform.release(),
         armed=ARMED_S,
-        netem="has `netem`, but for the same link on every kernel" if has_netem() else "has no `netem`",
+        netem="has `netem`, which is not used" if has_netem() else "has no `netem`",
         load=f"{os.getloadavg()[1]:.1f}",
     )
     lines: list[str] = []

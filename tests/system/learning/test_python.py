@@ -103,7 +103,7 @@ WRONG = [
     (("triplet",), {"backend": "simm"}, "plugin/not-found"),
     (("triplet",), {"controller": lambda time_s: 0}, "python/invalid-argument"),
     (("triplet",), {"controller": 5}, "python/invalid-argument"),
-    (("triplet",), {"controller": int}, "python/invalid-argument"),
+    (("triplet",), {"controller": int}, "plugin/not-loadable"),
     (("triplet",), {"controller": wave, "processes": True}, "python/invalid-argument"),
     (("triplet",), {"set": {"clock_mode": "realtime"}}, "backend/wrong-clock-mode"),
 ]

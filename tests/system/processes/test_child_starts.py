@@ -42,11 +42,13 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "benchmarks/paths/ways.py": "openssl",
     "benchmarks/peers/__main__.py": "rospy, dora and apt, each with an interpreter of its own",
     "deploy/bootstrap.py": "before anything is installed; its environment has the variable",
+    "deploy/release.py": "uv, twine and the command of another environment",
     "deploy/vm/kernel.py": "zstd",
     "deploy/vm/machine.py": "qemu",
     "deploy/vm/packages.py": "apt",
     "deploy/vm/with_vcan.py": "the command that the user types",
     "docs/site/build.py": "git",
+    "docs/style/check_prose.py": "git and proselint",
     "snakesim_can_backend/bus/bus_faults.py": "ip",
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
