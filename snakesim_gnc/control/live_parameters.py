@@ -12,8 +12,8 @@ import msgspec
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
-from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.controller import Controller, decode_parameters, load_controller
+from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.mailbox import Mailbox

@@ -23,7 +23,7 @@ class HostFaults(Injector):
         self._period_ns = config.period_ns
         self._tick = 0
 
-        def carry_out(injection: Injection, begins: bool) -> None:  # no method: it would keep a run in memory as a cycle
+        def carry_out(injection: Injection, begins: bool) -> None:  # a method would form a reference cycle
             faulty_backend.inject(injection, begins=begins)
 
         super().__init__(HAL, config, session, carry_out=carry_out)

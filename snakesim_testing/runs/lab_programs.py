@@ -31,7 +31,7 @@ class Lab:
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         """One of them."""
-        log = self._stack.enter_context((self.folder / f"{arguments[0]}-{Path(arguments[1]).stem}.log").open("a"))
+        log = self._stack.enter_context((self.folder / f"{arguments[1]}-{Path(arguments[2]).stem}.log").open("a"))
         process = subprocess.Popen(
             [*SNAKESIM, *arguments],
             cwd=self.folder,
@@ -46,11 +46,13 @@ class Lab:
 
     def host(self, out: str, *arguments: str) -> subprocess.Popen[str]:
         """A HAL host."""
-        return self.start("host", *SCENARIO, "--once", *arguments, "--session", str(self.session), "--out", out)
+        return self.start(
+            "start", "host", *SCENARIO, "--end-after-duration", *arguments, "--session", str(self.session), "--out", out
+        )
 
     def service(self, name: str, *arguments: str) -> subprocess.Popen[str]:
         """A service."""
-        return self.start("service", name, *SCENARIO, *arguments, "--session", str(self.session))
+        return self.start("start", "service", name, *SCENARIO, *arguments, "--session", str(self.session))
 
     def tell(self, *arguments: str) -> Ended:
         """An operator's command, on another machine."""
@@ -58,4 +60,4 @@ class Lab:
 
     def until_armed(self) -> None:
         """As a person does it: until the answer is yes."""
-        wait_until(lambda: self.tell("arm", "planar13", "sim").code == 0, "armed", 60.0)
+        wait_until(lambda: self.tell("robot", "arm", "planar13", "sim").code == 0, "armed", 60.0)

@@ -62,7 +62,7 @@ def test_a2_a_second_answer_is_an_impostor(
     elif before == "disarmed":
         operator.stand_by()
     operator.until(lambda: operator.lifecycle() == before, before)
-    arguments = [tool, "planar13", "sim"] if tool == "arm" else [tool]
+    arguments = {"arm": ["robot", "arm", "planar13", "sim"], "estop": ["estop"]}.get(tool, ["robot", tool])
     with impostor(routed, "hal/estop" if tool == "estop" else "hal/lifecycle", lies):
         ended = routed.run.tell(*arguments)
     if tool == "estop" and ended.code == 0:  # confirmed past the network, by the stop port of a run of this user

@@ -109,7 +109,7 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, cha
     )
 
     # Whoever looks afterwards sees it.
-    scanned = snakesim("can", "scan", channel, "--seconds", "3", cwd=robot.folder)
+    scanned = snakesim("drive", "scan", "can", channel, "--duration", "3", cwd=robot.folder)
     lines = scanned.out.splitlines()
     assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
     rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]

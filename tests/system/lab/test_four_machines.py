@@ -85,9 +85,9 @@ def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_p
         checked = lab.at("hub", "lab", "check", "lab.toml", "--out", ".")
         assert "all is as it should be" in checked, checked
         lab.machines["laptop"].module("snakesim_testing.lab.intruder", viewer[1], log=tmp_path / "intruder.log")
-        refused = lab.at("laptop", "arm", "planar13", backend, *viewer, check=False)
+        refused = lab.at("laptop", "robot", "arm", "planar13", backend, *viewer, check=False)
         assert "exit code 1" in refused, refused
-        until(lab, "planar13: armed", "arm", "planar13", backend, *operator)
+        until(lab, "planar13: armed", "robot", "arm", "planar13", backend, *operator)
         record = finished(lab)
         more = ("--in-process",) if backend == "sim" else ()
         lab.at("robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *more)  # by this machine alone

@@ -305,7 +305,13 @@ def test_what_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, 
     begun = snakesim("run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", *own, cwd=tmp_path)
     assert begun.code == 0 and (tmp_path / "ran").exists(), begun
     (tmp_path / "ran").unlink()
-    for words in ("recording info run", "recording report run", "recording export run --format csv", "study compare run run"):
+    commands = (
+        "recording info run",
+        "recording report run",
+        "recording export run --format csv",
+        "study compare run run",
+    )
+    for words in commands:
         assert snakesim(*words.split(), cwd=tmp_path).code == 0
     more = () if kind == "controller" else ("--controller", "hold")  # which says nothing of a service
     refused = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
