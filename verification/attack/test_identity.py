@@ -98,7 +98,7 @@ def test_a2_a_frozen_host_is_not_stopped_by_whoever_answers_for_it(
     routed: Robot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
 ) -> None:
     with impostor(routed, key, lies), frozen_host(routed):
-        ended = routed.run.tell(tool)
+        ended = routed.run.tell(*(["estop"] if tool == "estop" else ["robot", tool]))
     assert ended.code == 1 and word not in ended.said, f"exit code {ended.code}: {ended.said}"
 
 
