@@ -10,7 +10,7 @@ from snakesim_hal.model.fault_kinds import DOERS, KINDS, Amount
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "inject-faults.md"
 BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"
 TARGETS = {
-    "process": "`host`, `guidance`, `navigation`, `control`; `router` with `--with-router`, which cannot hang",
+    "process": "`host`, `guidance`, `navigation`, `control`, and `router` with `--with-router`, which cannot hang",
     "key": "`sensor/joints`, `actuator/joints`, ...",
     "joint": "`joint_1`, ...",
     "bus": "`bus_1`, ...",
@@ -27,7 +27,7 @@ def with_table() -> str:
 
 def table() -> str:
     """A row a kind."""
-    rows = ["| happens to | kind | what | amount | carried out by |", "|---|---|---|---|---|"]
+    rows = ["| target | kind | effect | amount | carried out by |", "|---|---|---|---|---|"]
     for sort, kinds in KINDS.items():
         target = f"{sort}: {TARGETS[sort]}" if sort in ("process", "key", "joint", "bus") else TARGETS[sort]
         for name, kind in kinds.items():

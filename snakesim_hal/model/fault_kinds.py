@@ -21,9 +21,9 @@ Doer = Literal["supervisor", "process", "writer", "module", "samples", "driver",
 DOERS: Mapping[Doer, str] = {
     "supervisor": "the supervisor, `snakesim run`",
     "process": "the process itself",
-    "writer": "whoever writes the key",
+    "writer": "the publisher of the key",
     "module": "the module",
-    "samples": "the host, on what the sensors gave",
+    "samples": "the host, in the samples",
     "driver": "the driver",
     "host": "the host",
     "simulator": "the simulator",
@@ -69,30 +69,32 @@ SHARE = Amount("share of the messages", "1", 1.0, 0.0, 1.0)
 
 KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
     "process": {
-        "kill": Kind("SIGKILL: gone without a word", ("supervisor",), once=True),
-        "stop": Kind("SIGTERM: ends in order", ("supervisor",), once=True),
-        "freeze": Kind("SIGSTOP until the end: there, and silent", ("supervisor",)),
+        "kill": Kind("SIGKILL: terminated immediately", ("supervisor",), once=True),
+        "stop": Kind("SIGTERM: ends in an orderly way", ("supervisor",), once=True),
+        "freeze": Kind("SIGSTOP until the end: the process exists and sends nothing", ("supervisor",)),
         "hang": Kind(
-            "its interpreter is busy until the end: alive on the network, and does nothing",
+            "its interpreter is busy until the end: connected, but does nothing",
             ("process",),
         ),
     },
     "key": {
-        "drop": Kind("messages get lost", ("writer",), SHARE),
-        "delay": Kind("messages come late", ("writer",), Amount("delay", "s", 0.05, 0.0, 10.0)),
-        "duplicate": Kind("messages come twice", ("writer",), SHARE),
-        "reorder": Kind("a message comes after the one that follows it", ("writer",), SHARE),
+        "drop": Kind("messages are lost", ("writer",), SHARE),
+        "delay": Kind("messages arrive late", ("writer",), Amount("delay", "s", 0.05, 0.0, 10.0)),
+        "duplicate": Kind("messages arrive twice", ("writer",), SHARE),
+        "reorder": Kind("a message arrives after the one that follows it", ("writer",), SHARE),
         "corrupt": Kind("bytes of messages are changed", ("writer",), SHARE),
-        "flood": Kind("the newest message is sent over and over", ("writer",), Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
+        "flood": Kind("the newest message is sent repeatedly", ("writer",), Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
     },
     "joint": {
-        "mute": Kind("says nothing", ("module", "samples"), in_module="sends nothing; still hears, and follows"),
+        "mute": Kind(
+            "sends nothing", ("module", "samples"), in_module="sends nothing, but still follows its setpoints"
+        ),
         "freeze": Kind(
-            "repeats what it said last; its age grows",
+            "repeats its last sample, whose age grows",
             ("module", "samples"),
             in_module="its main loop hangs: repeats its last joint state, no heartbeat; passive after its watchdog",
         ),
-        "wrong": Kind("its angle is off", ("samples",), Amount("offset", "rad", 0.5, -6.3, 6.3)),
+        "wrong": Kind("its angle is wrong", ("samples",), Amount("offset", "rad", 0.5, -6.3, 6.3)),
         "nan": Kind("its angle is NaN", ("samples",)),
         "reboot": Kind("its module restarts", ("module",), once=True),
         "counter": Kind("joint states with a wrong count", ("module",)),
@@ -105,15 +107,15 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
         "overheat": Kind(
             "its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given", ("module",)
         ),
-        "leak": Kind("finds water inside", ("module",)),
-        "babble": Kind("sends its heartbeat over and over, as often as the bus lets it", ("module",)),
+        "leak": Kind("detects water inside", ("module",)),
+        "babble": Kind("sends its heartbeat as often as the bus allows", ("module",)),
         "undervoltage": Kind("its supply falls to 12 V", ("module",)),
     },
     "bus": {
         "cut": Kind("the interface goes down; it comes up again at the end", ("driver",)),
         "bus_off": Kind("the controller leaves the bus; it restarts at the end", ("driver",)),
         "error_passive": Kind("the controller has counted more than 127 errors", ("driver",), once=True),
-        "overflow": Kind("received frames get lost", ("driver",), once=True),
+        "overflow": Kind("received frames are lost", ("driver",), once=True),
         "full": Kind("the transmit queue is full", ("driver",)),
         "slow": Kind("each reading of it takes longer", ("driver",), Amount("by", "s", 0.02, 0.0, 1.0)),
     },

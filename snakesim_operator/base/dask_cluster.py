@@ -69,6 +69,6 @@ def _check_certificates(address: str) -> None:
     if address.startswith("tls:") and context is None:
         raise ConfigError(
             f"--cluster {address}: Dask has no certificate for TLS; name the files in its configuration, "
-            "distributed.comm.tls, as docs/how-to/evaluate-controllers.md shows",
+            "distributed.comm.tls, as docs/how-to/evaluate-on-a-cluster.md shows",
             code="certificate/rejected",
         )

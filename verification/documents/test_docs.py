@@ -24,7 +24,12 @@ def typed_in(page: str) -> list[Section]:
     return [section for section in sections(REPOSITORY / page) if section.has_commands]
 
 
-TUTORIAL, EVALUATION = typed_in("docs/tutorials/complete-tour.md"), typed_in("docs/how-to/evaluate-controllers.md")
+TUTORIAL = typed_in("docs/tutorials/complete-tour.md")
+EVALUATION = [
+    section
+    for page in ("evaluate-controllers", "write-a-suite", "optimize-parameters")
+    for section in typed_in(f"docs/how-to/{page}.md")
+]
 JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
 HIL = [section for section in sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
 CONTROLLERS, ROBOTS, SCENES = (

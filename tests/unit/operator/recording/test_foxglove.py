@@ -200,7 +200,7 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
     with (run / RECORDING).open("rb") as file:
         for _, channel, _, one in make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages():
             if channel.topic.startswith("/"):
-                newest[channel.topic.replace(ROBOT, "/planar13")] = one  # as docs/how-to/recordings.md tells
+                newest[channel.topic.replace(ROBOT, "/planar13")] = one  # as docs/how-to/foxglove.md shows
     panels, text = layout["configById"], json.dumps(layout["layout"])
     assert all(f'"{name}"' in text for name in panels) and text.count("!") == len(panels)
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
