@@ -1,4 +1,4 @@
-"""Run one controller, unchanged, on the simulator and on emulated drives of every type. See docs/hardware/odrive.md."""
+"""Run one controller, unchanged, on the simulator and on emulated drives of every type. See docs/hardware/README.md."""
 
 import statistics
 import sys

@@ -1,4 +1,4 @@
-"""The datagram with the base's pose from a motion-capture system; specified in docs/hardware/joint-modules.md."""
+"""The datagram with the base's pose from a motion-capture system; specified in docs/hardware/motion-capture.md."""
 
 import msgspec
 

@@ -1,4 +1,4 @@
-"""The backend that docs/hardware/write-a-driver.md shows, and one that behaves like a robot on a bus."""
+"""The backend that docs/hardware/write-a-backend.md shows, and one that behaves like a robot on a bus."""
 
 import dataclasses
 import re
@@ -15,7 +15,7 @@ from snakesim_drivers.kit.drive_backend import LATCHED_STATES
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
-DOCS = Path(__file__).parents[2] / "docs" / "hardware" / "write-a-driver.md"
+DOCS = Path(__file__).parents[2] / "docs" / "hardware" / "write-a-backend.md"
 
 
 def text_of_the_example() -> str:

@@ -1,7 +1,7 @@
 """The pytest plugin: options, fixtures and the table at the end. It does nothing until a contract test runs.
 
 Its options are --snakesim-backend, -scenario, -set, -mute, -drives and -table. A repository with several benches
-implements `pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/hardware/write-a-driver.md.
+implements `pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/hardware/contract-suite.md.
 """
 
 from collections.abc import Generator, Iterator
@@ -71,7 +71,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--snakesim-drives",
         metavar="./FILE.py:CLASS",
-        help="CLASS(backend) has a backend's emulated drives: see EmulatedDrives in docs/hardware/write-a-driver.md",
+        help="CLASS(backend) has a backend's emulated drives: see EmulatedDrives in docs/hardware/contract-suite.md",
     )
     group.addoption("--snakesim-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
 

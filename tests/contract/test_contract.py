@@ -1,4 +1,4 @@
-"""The contract of a backend, on every bench: see conftest.py and docs/hardware/write-a-driver.md."""
+"""The contract of a backend, on every bench: see conftest.py and docs/hardware/contract-suite.md."""
 
 from snakesim_testing.contract.test_closing import *  # noqa: F403
 from snakesim_testing.contract.test_description import *  # noqa: F403

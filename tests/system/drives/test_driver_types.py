@@ -1,4 +1,4 @@
-"""docs/driver types.py: one controller, unchanged, on the simulator and on emulated drives of every driver type."""
+"""examples/driver_types.py: one controller, unchanged, on the simulator and on emulated drives of every driver type."""
 
 import re
 import subprocess

@@ -106,7 +106,7 @@ SAID = {
 
 
 def suite(folder: Path, robot: str, clause: str) -> Ended:
-    """The contract suite, as docs/hardware/write-a-driver.md has it, on the simulator with the whiskers."""
+    """The contract suite, as docs/hardware/contract-suite.md has it, on the simulator with the whiskers."""
     typed = [sys.executable, "-m", "pytest", "-q", *PYTEST, "--snakesim-set", robot, "-k", clause]
     return call(typed, folder, environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
 
