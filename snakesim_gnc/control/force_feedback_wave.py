@@ -10,7 +10,7 @@ For joint i, with phase phi, and with n = 0, 1, 2, ... counted from the head ove
 F_c are the contact forces on the links behind and ahead of the joint. feedback_i changes by at most
 MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal.
 
-Source: the shipped policy `lab` (`snakesim policy train`, `docs/how-to/environments.md`), with its numbers, and with
+Source: the shipped policy `lab` (`snakesim policy train`, `docs/development/shipped-policies.md`), with its numbers, and with
 measured or estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied in every
 tick as fast as the drives are, the body would need a quarter more energy; the limit of its rate avoids this.
 
