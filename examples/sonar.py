@@ -1,4 +1,4 @@
-"""A sensor model of one's own: a sonar that hears the nearest surface in a cone. See sensors.md.
+"""A sensor model of one's own: a sonar that hears the nearest surface in a cone. See docs/how-to/custom-sensors.md.
 
 [[sensors.range]]
 name = "sonar"

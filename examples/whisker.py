@@ -1,4 +1,4 @@
-"""A sensor with a message of its own: a whisker, which says how far it is bent. See sensors.md; copy it, and change it.
+"""A custom sensor with its own message: a whisker that measures how far it is bent. See docs/how-to/custom-sensors.md.
 
 In the robot file, or as planar13_whiskers.toml beside this file has it:
 

@@ -1,4 +1,4 @@
-"""One controller on emulated drives, with sensors and without, side by side: see sensors.md.
+"""One controller on emulated drives, with sensors and without, side by side: see docs/how-to/run-without-sensors.md.
 
 Distances are those of the emulated motion capture, which records what guidance is not told.
 """

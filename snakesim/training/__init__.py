@@ -1,4 +1,4 @@
-"""The search for a policy: `snakesim policy train`, in the extra `train`. See `docs/how-to/environments.md`.
+"""The search for a policy: `snakesim policy train`, in the extra `train`. See `docs/how-to/train-policies.md`.
 
 `form` has the policy and its numbers, `episodes` runs it in environments, `search` looks for better ones, `exported`
 writes it as an ONNX file that the controller `policy` takes, `curve` what came of each generation. `kept_search` has

@@ -10,9 +10,9 @@ For joint i, with phase phi, and with n = 0, 1, 2, ... counted from the head ove
 F_c are the contact forces on the links behind and ahead of the joint. feedback_i changes by at most
 MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal.
 
-Source: the shipped policy `lab` (`snakesim policy train`, `docs/how-to/environments.md`), with its numbers, and with
-measured or estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied in every
-tick as fast as the drives are, the body would need a quarter more energy; the limit of its rate avoids this.
+Source: the shipped policy `lab` (`snakesim policy train`, `docs/development/shipped-policies.md`), with its numbers,
+and with measured or estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied
+in every tick as fast as the drives are, the body would need a quarter more energy; the limit of its rate avoids this.
 
 The policy was trained on one robot. For another robot, angles and lags scale with the distance between its joints, so
 that it has the same curve, and torques scale with the torque limits of its joints.

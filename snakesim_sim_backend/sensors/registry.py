@@ -1,7 +1,7 @@
 """Finds the reader of each sensor. A new type of sensor is a file with a reader, and a line here or an entry point.
 
 Sensors that look around may have several models, of which the robot file chooses one: `model = "rays"`, the name of an
-entry point in the group `snakesim.sensors`, or `./sonar.py:Sonar`. See docs/how-to/sensors.md.
+entry point in the group `snakesim.sensors`, or `./sonar.py:Sonar`. See docs/how-to/custom-sensors.md.
 """
 
 from collections.abc import Callable

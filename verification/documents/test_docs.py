@@ -32,8 +32,8 @@ EVALUATION = [
 ]
 JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
 HIL = [section for section in sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
-CONTROLLERS, ROBOTS, SCENES = (
-    typed_in(f"docs/{page}.md") for page in ("reference/controllers", "how-to/robots", "how-to/scenes")
+CONTROLLERS, ROBOTS, SCENES, URDF = (
+    typed_in(f"docs/{page}.md") for page in ("reference/controllers", "how-to/robots", "how-to/scenes", "how-to/urdf")
 )
 PAGES = ("first-controller", "train-a-policy", "your-robot", "your-sensor", "lab-on-your-desk")
 LESSONS = [section for page in PAGES for section in typed_in(f"docs/tutorials/{page}.md")]
@@ -80,7 +80,9 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *LESSONS], ids=named)
+@pytest.mark.parametrize(
+    "section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *URDF, *LESSONS], ids=named
+)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)

@@ -191,7 +191,7 @@ def test_a_model_that_does_not_fit_is_refused_with_file_field_and_what_is_expect
 def test_the_snippet_of_the_documentation_makes_a_model_that_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    blocks = [code for one in sections(REPOSITORY / "docs" / "how-to" / "environments.md") for _, code in one.blocks]
+    blocks = [code for one in sections(REPOSITORY / "docs" / "how-to" / "policies.md") for _, code in one.blocks]
     (tmp_path / "named.py").write_text(next(code for code in blocks if "set_model_props" in code))
     monkeypatch.chdir(tmp_path)
     linear(Path("trained.onnx"), 3 * JOINTS)

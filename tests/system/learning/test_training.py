@@ -109,7 +109,7 @@ def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, b
 @pytest.mark.parametrize(("name", "out"), [("clutter", "trained"), ("free", "free"), ("lab", "lab")])
 def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(name: str, out: str) -> None:
     told = {one.key: one.value for one in onnx.load(POLICIES / f"{name}.onnx").metadata_props}
-    page = (REPOSITORY / "docs" / "how-to" / "environments.md").read_text().replace("\\\n", " ")
+    page = (REPOSITORY / "docs" / "development" / "shipped-policies.md").read_text().replace("\\\n", " ")
     (given,) = [
         line for line in page.splitlines() if line.startswith("snakesim policy train") and line.endswith(f"--out {out}")
     ]

@@ -1,4 +1,4 @@
-"""A sensor with a message of its own, in one file outside of the packages: examples/whisker.py, of docs/how-to/sensors.md."""
+"""A custom sensor with its own message, in one file outside of the packages: examples/whisker.py."""
 
 import csv
 import json

@@ -20,7 +20,7 @@ from snakesim_testing.runs import in_process_command as in_process
 
 pytestmark = pytest.mark.e2e
 
-PAGE = REPOSITORY / "docs" / "how-to" / "sensors.md"
+PAGE = REPOSITORY / "docs" / "how-to" / "write-a-service.md"
 SERVICE = next(section.files["mocap.py"] for section in sections(PAGE) if "mocap.py" in section.files)
 MORE = """
 

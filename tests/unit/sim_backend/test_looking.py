@@ -138,7 +138,7 @@ def test_noise_and_dropouts_have_the_size_of_the_robot_file():
 
 
 def test_a_sonar_of_ones_own_is_a_file_and_a_line_in_the_robot_file():
-    """The example of docs/how-to/sensors.md."""
+    """The example of docs/how-to/custom-sensors.md."""
     sonar = {"model": f"{Path(__file__).parents[3] / 'examples' / 'sonar.py'}:Sonar", "settings": {"cone_rad": 0.5}}
     aside = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.2], "radius_m": 0.05, "height_m": 1.0}]}
     place = {"position_m": [0.095, 0.0, 0.5], "pitch_rad": 0.0, "range_max_m": 2.0}
