@@ -24,7 +24,15 @@ def typed_in(page: str) -> list[Section]:
     return [section for section in sections(REPOSITORY / page) if section.has_commands]
 
 
-TUTORIAL, EVALUATION = typed_in("docs/tutorials/complete-tour.md"), typed_in("docs/how-to/evaluate-controllers.md")
+TOUR = (
+    "get-started/first-run",
+    "tutorials/explore-runs",
+    "tutorials/watch-a-running-robot",
+    "tutorials/recover-from-faults",
+    "tutorials/write-a-controller",
+)
+TUTORIAL = [section for page in TOUR for section in typed_in(f"docs/{page}.md")]
+EVALUATION = typed_in("docs/how-to/evaluate-controllers.md")
 JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
 HIL = [section for section in sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
 CONTROLLERS, ROBOTS, SCENES = (
