@@ -398,6 +398,7 @@ ERROR_CODES = {
         "The robot refused a request.",
         "The message has the reason of the host.",
         "Do what the reason says; see `snakesim status`.",
+        page="troubleshooting/not-armed.md",
     ),
     "robot/not-confirmed": ErrorCode(
         "A request was sent, and the robot's status does not confirm it.",
