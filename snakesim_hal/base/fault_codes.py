@@ -12,7 +12,7 @@ FAULT_CODES = {
     "lease_expired": ErrorCode(
         "The controller's commands did not arrive in time.",
         "The controller is too slow, has ended, or the network delays its commands.",
-        "See the controller's log. On a slow network raise `lease_ms` or lower `rate_hz`.",
+        "See the controller's log. On a slow network lower `rate_hz`, which makes the lease longer.",
         page="troubleshooting/lease-expired.md",
     ),
     "service_lost": ErrorCode("A service has ended.", "Its process crashed or was killed.", "See its log."),
