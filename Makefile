@@ -36,7 +36,7 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	$(bin)/snakesim run peg_row --controller obstacle_aided --console --clock-mode realtime --duration 10 --out runs/demo $(ARGS)
 	@printf '%s\n' 'Next:' '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
 	  '  $(bin)/snakesim run triplet --console --clock-mode realtime      the paper'\''s case study: one joint at a time pushes' \
-	  '  docs/tutorials/complete-tour.md, 3: write a controller                       push it your way'
+	  '  docs/tutorials/write-a-controller.md                          push it your way'
 
 test: test-unit test-contract test-system test-can ## Run the tests that every change must pass (4 minutes on two cores)
 

@@ -43,7 +43,8 @@ def make_page() -> str:
 def _make_table(first_column: str, rows: Mapping[str, ErrorCode]) -> str:
     lines = [f"| {first_column} | meaning | cause | what to do |", "|---|---|---|---|"]
     for code, entry in rows.items():
-        lines.append(f"| `{code}` | {entry.title} | {entry.cause} | {entry.remedy} |")
+        steps = f" [Step by step](../{entry.page})" if entry.page else ""
+        lines.append(f"| `{code}` | {entry.title} | {entry.cause} | {entry.remedy}{steps} |")
     return "\n".join(lines) + "\n"
 
 

@@ -17,6 +17,7 @@ class ErrorCode(NamedTuple):
     title: str
     cause: str
     remedy: str
+    page: str = ""  # a page below docs/ with the steps of the remedy; empty if the remedy says everything
 
 
 ERROR_CODES = {
@@ -122,6 +123,7 @@ ERROR_CODES = {
         "An optional package is not installed.",
         "The command needs an extra, such as `snakesim[record]`.",
         "Run the `pip install` command in the message.",
+        page="troubleshooting/extra-not-installed.md",
     ),
     "plugin/not-found": ErrorCode(
         "No controller, service, backend or sensor model has this name.",
@@ -180,6 +182,7 @@ ERROR_CODES = {
         "The bus does not exist on this computer.",
         "The adapter is not plugged in, the interface is down, or the kernel has no CAN.",
         "Run the command that the message names, and see `snakesim doctor`.",
+        page="troubleshooting/no-can.md",
     ),
     "bus/invalid-channel": ErrorCode(
         "The channels of the buses are configured wrongly.",
@@ -215,11 +218,13 @@ ERROR_CODES = {
         "Not all drives of the robot answered correctly at the start.",
         "A drive has no power, a wrong id, a wrong bit rate, or wrong limits. The message lists each one.",
         "Correct the drives on the list. No drive was enabled.",
+        page="troubleshooting/drive-silent.md",
     ),
     "drive/silent": ErrorCode(
         "A drive does not answer.",
         "Power, cable, id, bit rate or terminator.",
         "Check them for the joints that the message names.",
+        page="troubleshooting/drive-silent.md",
     ),
     "drive/parameter-refused": ErrorCode(
         "A drive refuses a parameter.",
@@ -261,6 +266,7 @@ ERROR_CODES = {
         "Images cannot be rendered on this computer.",
         "OpenGL by EGL or OSMesa is not installed.",
         "Install the packages that the message names, and see `snakesim doctor`.",
+        page="troubleshooting/no-opengl.md",
     ),
     "backend/failed": ErrorCode(
         "The backend cannot continue.",
@@ -276,6 +282,7 @@ ERROR_CODES = {
         "A part of the control cycle did not return in time.",
         "Code of a backend, service or controller blocks, or the machine is too slow for it.",
         "Make the named line faster, or raise the limit that the message names.",
+        page="troubleshooting/computer-too-slow.md",
     ),
     "backend/wrong-clock-mode": ErrorCode(
         "The backend cannot keep this clock mode.",
@@ -287,6 +294,7 @@ ERROR_CODES = {
         "No robot was found at this endpoint and namespace.",
         "Its HAL host is not running, or has another namespace.",
         "Start the robot, and see `snakesim status`.",
+        page="troubleshooting/no-robot.md",
     ),
     "network/several-robots": ErrorCode(
         "Several robots were found, and the command is for one.",
@@ -302,6 +310,7 @@ ERROR_CODES = {
         "Nothing listens at this address.",
         "No run, router or scheduler was started there, or a firewall is between.",
         "Start it, or give another address.",
+        page="troubleshooting/no-robot.md",
     ),
     "network/no-ticks": ErrorCode(
         "The robot's clock has stopped.",
@@ -312,6 +321,7 @@ ERROR_CODES = {
         "A port cannot be opened.",
         "Another run or program listens on it.",
         "Choose another port, or end that program.",
+        page="troubleshooting/port-in-use.md",
     ),
     "network/invalid-address": ErrorCode(
         "An endpoint, address or namespace is malformed.",
@@ -342,11 +352,13 @@ ERROR_CODES = {
         "The router does not accept this certificate, or a certificate is missing.",
         "It is of another authority, has expired, or no router runs at that address.",
         "Install the files of the right authority (docs/how-to/lab.md), and set RUST_LOG=zenoh=warn to see why.",
+        page="troubleshooting/certificate-rejected.md",
     ),
     "certificate/expired": ErrorCode(
         "The certificate authority has expired.",
         "It is older than its period of validity.",
         "Make a new authority, and install the new files on every machine; see docs/how-to/lab.md.",
+        page="troubleshooting/certificate-rejected.md",
     ),
     "certificate/invalid-authority": ErrorCode(
         "The folder of the certificate authority cannot be trusted or read.",
@@ -358,11 +370,13 @@ ERROR_CODES = {
         "The robot is not armed any more.",
         "A fault, an emergency stop, or another operator disarmed it.",
         "See `snakesim status` for the reason, remove the cause, then clear and arm.",
+        page="troubleshooting/not-armed.md",
     ),
     "robot/not-ready": ErrorCode(
         "The robot cannot be armed now.",
         "A condition for arming is not met; the message lists what is missing.",
         "Correct it, and arm again.",
+        page="troubleshooting/not-armed.md",
     ),
     "robot/not-disarmed": ErrorCode(
         "The robot must be disarmed for this.",
@@ -378,11 +392,13 @@ ERROR_CODES = {
         "This process may not command the robot any more.",
         "Its commands came too late, or another process took the lease.",
         "Acquire the lease again. If this repeats, send commands faster.",
+        page="troubleshooting/lease-expired.md",
     ),
     "robot/request-refused": ErrorCode(
         "The robot refused a request.",
         "The message has the reason of the host.",
         "Do what the reason says; see `snakesim status`.",
+        page="troubleshooting/not-armed.md",
     ),
     "robot/not-confirmed": ErrorCode(
         "A request was sent, and the robot's status does not confirm it.",
@@ -445,6 +461,7 @@ ERROR_CODES = {
         "A record is used although data is missing in it (exit code 3).",
         "Samples were lost, the file was cut off, or numbers are invalid.",
         "Check the result, or record again. The message lists what is missing.",
+        page="troubleshooting/recording-incomplete.md",
     ),
     "recording/not-a-run": ErrorCode(
         "The folder does not hold a run.",
@@ -455,6 +472,7 @@ ERROR_CODES = {
         "A recording is damaged, or is a file of another kind.",
         "The file was cut off or changed, or its name is wrong.",
         "Name another file, or recover what is readable; see docs/how-to/recordings.md.",
+        page="troubleshooting/recording-incomplete.md",
     ),
     "recording/missing-data": ErrorCode(
         "A recording does not hold what this command needs.",
@@ -501,6 +519,7 @@ ERROR_CODES = {
         "A commissioning step cannot be done now.",
         "The robot moves, an angle is unknown, or file and record do not fit each other.",
         "Do what the message says, and repeat the step.",
+        page="troubleshooting/calibration-missing.md",
     ),
     "machine/not-permitted": ErrorCode(
         "The operating system does not permit this.",

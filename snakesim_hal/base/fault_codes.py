@@ -12,7 +12,8 @@ FAULT_CODES = {
     "lease_expired": ErrorCode(
         "The controller's commands did not arrive in time.",
         "The controller is too slow, has ended, or the network delays its commands.",
-        "See the controller's log. On a slow network raise `lease_ms` or lower `rate_hz`.",
+        "See the controller's log. On a slow network lower `rate_hz`, which makes the lease longer.",
+        page="troubleshooting/lease-expired.md",
     ),
     "service_lost": ErrorCode("A service has ended.", "Its process crashed or was killed.", "See its log."),
     "service_stalled": ErrorCode(
@@ -40,6 +41,7 @@ FAULT_CODES = {
         "A sensor sample came late. This does not stop the robot.",
         "The machine is too slow to render or compute it.",
         "Lower the sensor's rate or resolution.",
+        page="troubleshooting/computer-too-slow.md",
     ),
     # --- heat and supply
     "overheated": ErrorCode("A joint is too hot.", "High torque for too long.", "Let it cool down, then clear."),
@@ -49,7 +51,12 @@ FAULT_CODES = {
         "Supply and heat of a joint are unknown, and ignored.", "Its power reports stopped.", "Check the joint."
     ),
     # --- drives
-    "drive_silent": ErrorCode("A drive does not answer.", "Power, cable, id or bit rate.", "Check them, then clear."),
+    "drive_silent": ErrorCode(
+        "A drive does not answer.",
+        "Power, cable, id or bit rate.",
+        "Check them, then clear.",
+        page="troubleshooting/drive-silent.md",
+    ),
     "drive_fault": ErrorCode("A drive reports an error.", "The cause quotes the drive.", "See the drive's manual."),
     "drive_not_armed": ErrorCode(
         "A drive does not follow, or has stopped by itself.", "It restarted, or has an error.", "Clear, then arm."
@@ -67,6 +74,7 @@ FAULT_CODES = {
         "A bus received no setpoints for one lease period, so that its drives were disabled.",
         "The host was suspended, or is too slow.",
         "Check the load of the computer.",
+        page="troubleshooting/computer-too-slow.md",
     ),
     # --- buses
     "interface_down": ErrorCode("A bus went down.", "Unplugged, or brought down.", "Bring it up, clear, arm."),
@@ -91,7 +99,12 @@ FAULT_CODES = {
         "A node on the bus sent an emergency stop.", "Someone stopped it there.", "Clear, then arm."
     ),
     # --- joint modules on CAN
-    "module_silent": ErrorCode("A joint module does not answer.", "Power, cable or id.", "Check them, then clear."),
+    "module_silent": ErrorCode(
+        "A joint module does not answer.",
+        "Power, cable or id.",
+        "Check them, then clear.",
+        page="troubleshooting/drive-silent.md",
+    ),
     "module_frozen": ErrorCode("A joint module repeats one answer.", "Its firmware hangs.", "Power-cycle it."),
     "module_babbling": ErrorCode("A joint module floods the bus.", "Its firmware is faulty.", "Power-cycle it."),
     "module_restarted": ErrorCode("A joint module restarted.", "Its supply was interrupted.", "Clear, then arm."),
@@ -134,8 +147,18 @@ REFUSAL_CODES = {
     # --- requests
     "lease_held": ErrorCode("Another controller holds the lease.", "Two controllers.", "End one, or raise priority."),
     "not_holder": ErrorCode("The lease of this epoch is not yours.", "It has changed hands.", "Acquire it again."),
-    "not_ready": ErrorCode("A condition for arming is not met.", "The answer lists it.", "Correct it, then arm."),
-    "not_checked": ErrorCode("The joints of a real robot were not checked.", "A new robot file.", "Check the joints."),
+    "not_ready": ErrorCode(
+        "A condition for arming is not met.",
+        "The answer lists it.",
+        "Correct it, then arm.",
+        page="troubleshooting/not-armed.md",
+    ),
+    "not_checked": ErrorCode(
+        "The joints of a real robot were not checked.",
+        "A new robot file.",
+        "Check the joints.",
+        page="troubleshooting/calibration-missing.md",
+    ),
     "cable": ErrorCode("A cable is wound too far, or this is unknown.", "A joint without end stops.", "Unwind it."),
     "settings_differ": ErrorCode(
         "A service has other settings than the host.", "Two versions of a file.", "Restart it."

@@ -24,7 +24,14 @@ def typed_in(page: str) -> list[Section]:
     return [section for section in sections(REPOSITORY / page) if section.has_commands]
 
 
-TUTORIAL = typed_in("docs/tutorials/complete-tour.md")
+TOUR = (
+    "get-started/first-run",
+    "tutorials/explore-runs",
+    "tutorials/watch-a-running-robot",
+    "tutorials/recover-from-faults",
+    "tutorials/write-a-controller",
+)
+TUTORIAL = [section for page in TOUR for section in typed_in(f"docs/{page}.md")]
 EVALUATION = [
     section
     for page in ("evaluate-controllers", "write-a-suite", "optimize-parameters")

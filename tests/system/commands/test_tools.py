@@ -21,7 +21,7 @@ from snakesim_testing.runs.command import SNAKESIM, Running, armed_run, call, en
 
 pytestmark = pytest.mark.e2e
 
-TUTORIAL = Path("docs/tutorials/complete-tour.md").resolve()
+TUTORIAL = Path("docs/tutorials/write-a-controller.md").resolve()
 
 
 def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any]]:

@@ -230,7 +230,7 @@ def test_a_call_that_comes_too_late_is_an_error() -> None:
 
 FIRST_EXAMPLES = [
     ("tutorials/first-controller.md", "Wave"),
-    ("tutorials/complete-tour.md", "Wave"),
+    ("tutorials/write-a-controller.md", "Wave"),
     ("how-to/python.md", "wave"),
     ("how-to/python.md", "Nod"),
 ]

@@ -78,7 +78,19 @@ def test_every_class_has_a_default_that_is_explained() -> None:
 
 def test_entries_are_sentences() -> None:
     for code, entry in [*ERROR_CODES.items(), *FAULT_CODES.items(), *REFUSAL_CODES.items()]:
-        assert all(text.endswith(".") and "|" not in text for text in entry), code
+        texts = (entry.title, entry.cause, entry.remedy)
+        assert all(text.endswith(".") and "|" not in text for text in texts), code
+
+
+def test_linked_pages_exist_and_name_the_code() -> None:
+    docs = PAGE.parents[1]
+    linked = {code: entry.page for code, entry in [*ERROR_CODES.items(), *FAULT_CODES.items(), *REFUSAL_CODES.items()]}
+    for code, page in linked.items():
+        assert not page or code in (docs / page).read_text(encoding="utf-8"), f"{code}: docs/{page}"
+    troubleshooting = {f"troubleshooting/{path.name}" for path in (docs / "troubleshooting").glob("*.md")}
+    assert troubleshooting - {"troubleshooting/README.md"} <= set(linked.values())
+    table = (docs / "troubleshooting" / "README.md").read_text(encoding="utf-8")
+    assert all(f"]({page.removeprefix('troubleshooting/')})" in table for page in linked.values() if page)
 
 
 def test_the_page_is_current() -> None:
