@@ -22,6 +22,9 @@ SITE = ROOT / "build" / "docs"
 SHOWN = (
     "README.md",
     "CHANGELOG.md",
+    "CODE_OF_CONDUCT.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
     "LICENSE",
     "docs",
     "schemas",
