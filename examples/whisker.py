@@ -1,4 +1,4 @@
-"""A sensor with a message of its own: a whisker, which says how far it is bent. See sensors.md; copy it, and change it.
+"""A sensor with a custom message: a whisker that measures how far it is bent. See sensors.md. Copy and change it.
 
 In the robot file, or as planar13_whiskers.toml beside this file has it:
 

@@ -21,9 +21,9 @@ Doer = Literal["supervisor", "process", "writer", "module", "samples", "driver",
 DOERS: Mapping[Doer, str] = {
     "supervisor": "the supervisor, `snakesim run`",
     "process": "the process itself",
-    "writer": "whoever writes the key",
+    "writer": "the publisher of the key",
     "module": "the module",
-    "samples": "the host, on what the sensors gave",
+    "samples": "the host, in the samples of the sensors",
     "driver": "the driver",
     "host": "the host",
     "simulator": "the simulator",
@@ -86,9 +86,11 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
         "flood": Kind("the newest message is sent over and over", ("writer",), Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
     },
     "joint": {
-        "mute": Kind("says nothing", ("module", "samples"), in_module="sends nothing; still hears, and follows"),
+        "mute": Kind(
+            "sends nothing", ("module", "samples"), in_module="sends nothing; still receives and follows commands"
+        ),
         "freeze": Kind(
-            "repeats what it said last; its age grows",
+            "repeats its last sample, whose age grows",
             ("module", "samples"),
             in_module="its main loop hangs: repeats its last joint state, no heartbeat; passive after its watchdog",
         ),
