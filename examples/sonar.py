@@ -1,4 +1,4 @@
-"""A sensor model of one's own: a sonar that hears the nearest surface in a cone. See docs/how-to/custom-sensors.md.
+"""A custom sensor model: a sonar that measures the distance to the nearest surface in a cone. See docs/how-to/custom-sensors.md.
 
 [[sensors.range]]
 name = "sonar"

@@ -50,7 +50,7 @@ def run(
             moves a real robot needs this.
 
     Returns:
-        The result, also of a run that ended with a fault: `Result.status` says how it ended.
+        The result, also of a run that ended with a fault: `Result.status` is how it ended.
 
     Raises:
         ConfigError: An argument is wrong; nothing was run.
@@ -102,6 +102,6 @@ def _run_in_processes(config: RunConfig, out: Path | None) -> Result:
         if run_processes(RunRequest(config, out=folder)) == INTERRUPTED:
             raise KeyboardInterrupt
         if not (folder / SUMMARY).is_file():
-            raise SnakesimError("the run left no record; what its processes said stands above")
+            raise SnakesimError("the run left no record; see the output of its processes above")
         summary = msgspec.json.decode((folder / SUMMARY).read_bytes(), type=RunSummary)
         return Result(RunRecord.load(folder), summary)

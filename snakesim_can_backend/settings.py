@@ -11,7 +11,7 @@ from snakesim_hal.wire.quantities import from_zero
 
 
 class MountedModule(Mounted, frozen=True, kw_only=True):
-    """How an emulated module is really mounted and wired, where that is not what the robot file says."""
+    """How an emulated module is really mounted and wired, where that differs from the robot file."""
 
     id: Annotated[int, Meta(ge=1, le=LAST_NODE)] | None = None
     """Id that the emulated module has instead of the one in the robot file; none: as in the robot file."""

@@ -23,8 +23,8 @@ Time
 
 Errors
     An exception of any call ends the run safely: the host reports it as a latched fault `backend_failed`, calls `close`
-    and keeps the record. Raise `BackendError` with a message that says what to do, and `ConfigError` for a value of the
-    configuration. An exception of another class is reported with the name of the call.
+    and keeps the record. Raise `BackendError` with a message that explains what to do, and `ConfigError` for a
+    value of the configuration. An exception of another class is reported with the name of the call.
 
 Units are SI, and vectors have one entry for each joint, from tail to head.
 """
@@ -52,7 +52,7 @@ class SafeSetpoints:
     """
 
     mode: list[Mode]
-    target: list[float]  # rad, rad/s or N·m, as the mode says
+    target: list[float]  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: list[float]
     isolated: frozenset[int] = frozenset()  # indices of isolated joints, which are passive here and to be switched off
 

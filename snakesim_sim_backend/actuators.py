@@ -171,10 +171,14 @@ class Motors:
         self._min_torque_nm[:] = -limit_nm
 
     def _change_modes(self, modes: list[Mode]) -> None:
-        """Set the gains of new modes, and find their inputs. Raises BackendError for a mode that a drive lacks."""
+        """Set the gains of new modes, and find their inputs.
+
+        Raises:
+            BackendError: a drive does not have a mode.
+        """
         for gains, mode, name in zip(self._gains_by_mode, modes, self._names, strict=True):
             if mode not in gains:
-                raise BackendError(f"{name} was given a setpoint in {mode.name.lower()} mode, which its drive lacks")
+                raise BackendError(f"{name} got a setpoint in {mode.name.lower()} mode, which its drive does not have")
         self._modes = list(modes)
         self._gains[:, [KP, KD, MAX_VOLTS]] = [
             gains[mode] for gains, mode in zip(self._gains_by_mode, modes, strict=True)

@@ -72,7 +72,7 @@ class DivergenceWatch:
 
     def _describe_divergence(self, number: int) -> str:
         warnings = [mujoco.mjtWarning(i).name for i in self._warnings.nonzero()[0].tolist()]
-        from_mujoco = f" MuJoCo says {', '.join(warnings)}." if warnings else ""
+        from_mujoco = f" MuJoCo reports {', '.join(warnings)}." if warnings else ""
         return (
             f"the simulation diverged at {self._counted} {number}: {self._find_cause()}.{from_mujoco} Lower "
             f"`timestep_s` or the gains in [motor]; stiff gains need armature"

@@ -99,7 +99,7 @@ class SteppedRobot:
 
         Args:
             mode: Mode of all joints.
-            target: One target per joint, tail to head; rad, rad/s or N·m as the mode says.
+            target: One target per joint, tail to head; in rad, rad/s or N·m, depending on the mode.
         """
         self._command([mode] * len(target), target)
         now_ns = self._tick * self._period_ns

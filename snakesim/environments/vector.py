@@ -199,8 +199,8 @@ def _check_seed(name: str, seed: Any) -> None:
 class _Workers:
     """Processes with environments, and the numbered requests to them.
 
-    The number tells an answer from that of an earlier request whose caller was interrupted, by Ctrl-C for example,
-    before the answer came.
+    The number distinguishes an answer from that to an earlier request, whose caller was interrupted before the answer
+    came, by Ctrl-C for example.
     """
 
     def __init__(self, counts: Sequence[int], arguments: dict[str, Any]) -> None:
@@ -251,7 +251,7 @@ class _Workers:
                 else:
                     answers += answer
         except (EOFError, ConnectionError):
-            raise BackendError("a process with environments has ended; see what it said above") from None
+            raise BackendError("a process with environments has ended; see its output above") from None
         if errors:
             raise errors[0]
         return answers

@@ -122,7 +122,7 @@ def _repeat_options(arguments: argparse.Namespace) -> list[str]:
 
 
 COMMANDS: Commands = (
-    Noun(name="policy", heading="runs and studies", help="Train policies, and show what a policy file says."),
+    Noun(name="policy", heading="runs and studies", help="Train policies, and show what a policy file describes."),
     Command(
         name="policy train",
         help="Search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE.",
@@ -138,7 +138,7 @@ COMMANDS: Commands = (
     ),
     Command(
         name="policy info",
-        help="Print what a policy file says of itself: robot, observations, actions and source.",
+        help="Print the description in a policy file: robot, observations, actions and source.",
         add=_add_info,
         run=_info,
         examples=("policy info clutter", "policy info runs/policy/policy.onnx --json"),

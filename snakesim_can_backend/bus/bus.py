@@ -59,7 +59,7 @@ class Wire(Protocol):
         """Send a frame.
 
         Returns:
-            False if the bus did not accept the frame. `errors` says why, and nothing is queued for later.
+            False if the bus did not accept the frame. `errors` has the reason, and nothing is queued for later.
         """
         ...
 
@@ -429,7 +429,7 @@ def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) ->
 
 
 def check_interface(channel: str) -> None:
-    """Raise ConfigError unless a SocketCAN interface exists and is up; the message says how to bring it up."""
+    """Raise ConfigError unless a SocketCAN interface exists and is up; the message explains how to bring it up."""
     if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
         raise ConfigError(
             f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "

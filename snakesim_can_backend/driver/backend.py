@@ -36,7 +36,7 @@ class CanBackend(DriveBackend):
             The supported clock modes: real time only on real modules, and lockstep too on emulators of this driver.
 
         Raises:
-            ConfigError: it is not possible; the message says why, and what to change.
+            ConfigError: it is not possible; the message has the reason, and what to change.
         """
         has_emulators = settings.emulators_run != "none"
         check_load(config, settings)

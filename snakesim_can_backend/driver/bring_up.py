@@ -163,7 +163,7 @@ def _identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) 
     if lockstep and not identity.stepped:
         errors.append(f"{subject} does not support lockstep: use --clock-mode realtime")
     if identity.stepped and not lockstep:
-        errors.append(f"{subject} is an emulator whose time stands still between Syncs: start it without --stepped")
+        errors.append(f"{subject} is an emulator whose time is paused between Syncs: start it without --stepped")
     return errors
 
 

@@ -122,7 +122,7 @@ class EmulatorProcess:
         if stepped:
             arguments.append("--stepped")
         try:
-            self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-", ignore_cleanup_errors=True)
+            self._folder = tempfile.TemporaryDirectory(prefix="snakesim-emulators-", ignore_cleanup_errors=True)
             self._output = Path(self._folder.name, "modules.log")
             self._process = self._start(child_config, arguments)
         except OSError as error:

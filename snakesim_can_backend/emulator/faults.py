@@ -22,7 +22,7 @@ _typed = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<joint>joint_[0-9]+)(?: +(?P<off>
 
 
 def parse_fault(text: str, joints: int) -> Injection:
-    """Return the fault that a text describes, as FORM says.
+    """Return the fault that a text describes in the notation of FORM.
 
     Args:
         text: the description.

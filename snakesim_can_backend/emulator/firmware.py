@@ -70,7 +70,7 @@ class Demand(NamedTuple):
     """What the firmware demands of its motor."""
 
     mode: Mode
-    target: float  # rad, rad/s or N·m, as the mode says
+    target: float  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: float
 
 
@@ -365,7 +365,7 @@ class ModuleFirmware:
             self._enter(ModuleState.STOPPING, now_us, LastStop.STOP, self._stopping_demand())
 
     def _stopping_demand(self) -> Demand:
-        """Return the demand while the module comes to rest, as its stop mode says."""
+        """Return the demand while the module comes to rest in its stop mode."""
         values = self.parameters.values
         if values[ModuleParameter.STOP_MODE] == SafeMotion.DAMP:
             return Demand(Mode.VELOCITY, 0.0, values[ModuleParameter.TORQUE_LIMIT])

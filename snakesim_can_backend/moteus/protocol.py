@@ -152,7 +152,7 @@ def split_addresses(frame: Frame) -> tuple[int, int]:
 
 
 def _encode_varuint(value: int) -> bytes:
-    """Return an unsigned integer in groups of 7 bits, the lowest first; bit 7 says that another group follows."""
+    """Return an unsigned integer in groups of 7 bits, the lowest first; bit 7 is set if another group follows."""
     if value < 0x80:
         return bytes([value])
     return bytes([value & 0x7F | 0x80]) + _encode_varuint(value >> 7)

@@ -353,7 +353,7 @@ def find_objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
         yield f"has its watchdog off: set `enable_watchdog` = True and `watchdog_timeout` = {watchdog_s:g}, and save"
     elif not abs(timeout_s - watchdog_s) <= ROUNDING * watchdog_s:
         yield (
-            f"has a watchdog of {timeout_s:g} s, and `backends.odrive.watchdog_s` says {watchdog_s:g} s: correct "
+            f"has a watchdog of {timeout_s:g} s, but `backends.odrive.watchdog_s` = {watchdog_s:g}: correct "
             f"`watchdog_timeout` and save, or correct the scenario"
         )
     current_a = configured[AxisSetting.CURRENT]

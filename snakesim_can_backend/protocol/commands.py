@@ -50,7 +50,7 @@ class SetpointWriter:
 
         Args:
             modes: Control mode of every joint.
-            targets: (n_joints,) rad, rad/s or N·m at the module's shaft, as the mode says.
+            targets: (n_joints,) rad, rad/s or N·m at the module's shaft, depending on the mode.
             limits_nm: (n_joints,) torque limits at the module's shaft.
         """
         mode_indices = np.array(modes, dtype=np.intp)

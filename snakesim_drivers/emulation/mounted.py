@@ -1,4 +1,4 @@
-"""How emulated drives are mounted and built in truth: as the robot file says, unless a backend's settings differ.
+"""How emulated drives are really mounted and built: as in the robot file, unless a backend's settings differ.
 
 With such settings a test, or an operator, can see the effect of a robot file that is wrong.
 """

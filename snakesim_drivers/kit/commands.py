@@ -26,7 +26,7 @@ def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
 
 
 def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
-    """Add `--pose`, for emulated motion capture. about: what else the help says."""
+    """Add `--pose`, for emulated motion capture. about: more text for the help."""
     parser.add_argument("--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})")
 
 

@@ -65,7 +65,7 @@ class Drives(ABC):
     def read(self) -> None:
         """Request motion and torque of every drive, and put the answers into the readings.
 
-        Do not wait for drives that were silent before: `DriveReadings.is_incomplete` tells whether waiting is worth it.
+        Do not wait for drives that were silent before: `DriveReadings.is_incomplete` is whether waiting is useful.
         Request also the state of the drives in `DriveReadings.drives_to_check`, and call `mark_checked` for each that
         reports it: these may have stopped by themselves.
 

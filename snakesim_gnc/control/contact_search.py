@@ -93,7 +93,7 @@ class ContactSearch:
         return self._wave
 
     def stop(self) -> None:
-        """End the search; the next one begins after the body has stood still for the whole time again."""
+        """End the search; the next one begins after the body has been stationary for the whole time again."""
         if self._wave is not None:
             self._origin_w = None
         self._wave = None

@@ -61,7 +61,7 @@ SOFT_AFTER_S = 0.1  # how long contacts must have been able to balance a push be
 MIN_SLOPE_SQUARED_PER_M2 = 20.0  # sum of theta'^2 below which the shape hardly depends on the place on the path
 
 # Reports.
-STANDSTILL_SPEED_M_S = 0.01  # a body that was slower than this for STANDSTILL_S is reported to stand still
+STANDSTILL_SPEED_M_S = 0.01  # a body that was slower than this for STANDSTILL_S is reported as stationary
 STANDSTILL_S = 0.5
 
 
@@ -390,7 +390,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _make_telemetry(
         self, observation: Observation, located: Located, look_ahead_n: float, reference: Floats
     ) -> Telemetry:
-        """Report the push, and why the body stands still, if it does; look_ahead_n: force of the look-ahead."""
+        """Report the push, and why the body is stationary, if it is; look_ahead_n: force of the look-ahead."""
         if abs(located.speed_m_s) > STANDSTILL_SPEED_M_S:
             self._moved_at_s = observation.time_s
         stands_still = observation.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
@@ -417,7 +417,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         return push_points(self._body, found.world, found.touches, found.push, self._force_n)
 
     def _explain_standstill(self, located: Located, points: list[WorldContact]) -> tuple[bool, str]:
-        """Return whether the body is jammed if it should stand still, and why it would stand still."""
+        """Return whether a stationary body would be jammed, and why it would be stationary."""
         found = self._snapshot
         if found is None:
             return False, "standing still: backing out along its own path"

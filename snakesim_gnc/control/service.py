@@ -83,7 +83,7 @@ class Control(Service):
                 self._sensor_feeds[key] = self._client.subscribe(key, message_type)
 
     def configure(self, robot: Description) -> None:
-        """Prepare to command this robot. Raises ControllerError if the robot lacks what the controller needs."""
+        """Prepare to command this robot. Raises ControllerError if the robot cannot do what the controller needs."""
         missing = describe_missing_capability(robot.joints, self._parameters.controller_class, self._config.controller)
         if missing is not None:
             raise ControllerError(f"robot {robot.robot!r}: {missing}")
@@ -143,7 +143,8 @@ class Control(Service):
         status = statuses[-1]
         why_paused = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
         is_armed = status.lifecycle == "armed"
-        return _state_messages(self._reports.make_state(clock, armed=is_armed, paused=f"time stands: {why_paused}"))
+        reason = f"robot time is paused: {why_paused}"
+        return _state_messages(self._reports.make_state(clock, armed=is_armed, paused=reason))
 
     def _apply_new_parameters(self, clock: Clock) -> None:
         """Answer requests for other parameters. If the parameters have changed, the controller is constructed again."""

@@ -1,4 +1,4 @@
-"""Detects that a body stands still, from the displacement of its center.
+"""Detects that a body is stationary, from the displacement of its center.
 
 The speed along the path cannot show it: with 5 mm of noise in a pose, that is hardly ever below 1 cm/s for a whole
 second.
@@ -26,13 +26,13 @@ class Standstill:
         self._centers = deque[tuple[float, Floats]]()
 
     def update(self, time_s: float, period_s: float, center_w: Floats, max_distance_m: float) -> bool:
-        """Add the center of this tick, and return whether the body stands still; call it in every tick.
+        """Add the center of this tick, and return whether the body is stationary; call it in every tick.
 
         Args:
             time_s: time of the tick.
             period_s: time since the last tick.
             center_w: (2,) m, center of the body.
-            max_distance_m: a body whose center moved less than this within the whole window stands still.
+            max_distance_m: a body whose center moved less than this within the whole window is stationary.
         """
         if self._window_s == 0.0:
             return False

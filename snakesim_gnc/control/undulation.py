@@ -3,7 +3,7 @@
 Lateral undulation is the serpenoid curve: every joint swings by `amplitude_rad`, with a phase `lag_rad` behind that of
 the joint ahead of it. Head-steered undulation adds a bend to all joints, in proportion to the direction of the path as
 seen from the head. Compliant undulation lets obstacles change the amplitude of the wave. It can resolve jams: when the
-body stands still, the wave travels the other way for a while.
+body is stationary, the wave travels the other way for a while.
 """
 
 import math

@@ -103,7 +103,9 @@ class _SurveyedSource:
         self._reckoned = None
         if self._config.dead_reckons(robot):
             self._reckoned = ReckonedPose(robot, _start_pose(self._config), self._known)
-            print_stderr("no pose sensor: the pose is reckoned from the start, by joints, contacts and the map")
+            print_stderr(
+                "no pose sensor: the pose is estimated by dead reckoning from the start, with joints, contacts and map"
+            )
         self._estimator = None
         has_contact_sensor = any(sensor.key == keys.CONTACTS for sensor in robot.sensors)
         if not has_contact_sensor and can_estimate_contacts(robot):

@@ -192,7 +192,7 @@ class ClutterPlanner:
             self._shown_path_id = 0
             self._start_plan(START, body_w, world, 0.0)
         elif self._goal.reached or desired.speed_m_s == 0.0:
-            self._recent_middles.clear()  # a body that must stand still is not stuck
+            self._recent_middles.clear()  # a body that must not move is not stuck
         else:
             committed_m = COMMITTED_M + max(desired.speed_m_s, 0.0) * self._planning_s
             moved_m = self._measure_movement_m(body_w, world.timestamp_ns)

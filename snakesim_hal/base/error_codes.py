@@ -39,7 +39,7 @@ ERROR_CODES = {
     ),
     "config/missing-key": ErrorCode(
         "A required setting is missing.",
-        "A file lacks a key that has no default, or a setting needs another one.",
+        "A key without a default is missing in a file, or a setting needs another setting.",
         "Add the key that the message names.",
     ),
     "config/conflict": ErrorCode(
@@ -111,7 +111,7 @@ ERROR_CODES = {
     "command/conflicting-options": ErrorCode(
         "Two options exclude each other, or one option needs another.",
         "They were given together, or one of them is missing.",
-        "Leave one out, or add the missing one, as the message says.",
+        "Leave out or add the option that the message names.",
     ),
     "python/invalid-argument": ErrorCode(
         "A function of the Python API got an argument that is not allowed.",
@@ -137,7 +137,7 @@ ERROR_CODES = {
     ),
     "plugin/not-loadable": ErrorCode(
         "A plug-in was found, but cannot be used.",
-        "Its module raises an exception when it is imported, or its class lacks a required part.",
+        "Its module raises an exception when it is imported, or a required part of its class is missing.",
         "Correct the plug-in at the line that the message names.",
     ),
     # --- scenes
@@ -175,7 +175,7 @@ ERROR_CODES = {
     "injection/not-allowed": ErrorCode(
         "This robot does not allow injected faults.",
         "Something real moves, or the run was started without permission.",
-        "Allow them explicitly, as the message says; see docs/how-to/inject-faults.md.",
+        "Allow them explicitly, as the message explains; see docs/how-to/inject-faults.md.",
     ),
     # --- buses and drives
     "bus/not-available": ErrorCode(
@@ -397,7 +397,7 @@ ERROR_CODES = {
     "robot/request-refused": ErrorCode(
         "The robot refused a request.",
         "The message has the reason of the host.",
-        "Do what the reason says; see `snakesim status`.",
+        "Correct what the reason names; see also `snakesim status`.",
         page="troubleshooting/not-armed.md",
     ),
     "robot/not-confirmed": ErrorCode(
@@ -491,7 +491,7 @@ ERROR_CODES = {
     ),
     "recording/unknown-signal": ErrorCode(
         "A run has no such signal.",
-        "The name is misspelled, or the robot lacks the sensor.",
+        "The name is misspelled, or the robot does not have the sensor.",
         "Use a signal that the message lists.",
     ),
     "recording/untrusted-code": ErrorCode(
@@ -518,7 +518,7 @@ ERROR_CODES = {
     "commissioning/not-possible": ErrorCode(
         "A commissioning step cannot be done now.",
         "The robot moves, an angle is unknown, or file and record do not fit each other.",
-        "Do what the message says, and repeat the step.",
+        "Follow the message, then repeat the step.",
         page="troubleshooting/calibration-missing.md",
     ),
     "machine/not-permitted": ErrorCode(

@@ -33,7 +33,7 @@ class Faults(Protocol):
         ...
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
-        """Begin and end the faults that are due at a tick, answer requests, and hang if a fault says so.
+        """Begin and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
 
         Args:
             timestamp_ns: robot time of the tick.

@@ -143,7 +143,7 @@ def remove_latched_stop(path: Path) -> str:
         sync_folder(path.parent)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; remove it by hand", code="file/not-writable") from error
-    return f"emergency stop by {'nobody' if latched is None else latched.requester}"
+    return f"emergency stop by {'an unknown client' if latched is None else latched.requester}"
 
 
 class _Once:

@@ -81,7 +81,7 @@ def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], rob
     if robot.emulated:
         return ""
     if checked is None:
-        return "nobody has checked that its joints are as its file says: do so (docs/hardware/calibration.md)"
+        return "its joints have not been checked against its file: check them (docs/hardware/calibration.md)"
     again = "check it again (docs/hardware/calibration.md)"
     since = f"since {checked.by} checked it on {checked.on}"
     if checked.joints != mounting_digest(joints):

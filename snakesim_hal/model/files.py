@@ -211,7 +211,7 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
     path = find_file(name, kind, beside)
     if path.resolve() in extended:
         raise ConfigError(
-            f"{path}: `extends` leads back to this file, so that none says what the robot or scene is",
+            f"{path}: `extends` leads back to this file; remove `extends` from one file of this chain",
             code="config/conflict",
         )
     table = read_table(path)

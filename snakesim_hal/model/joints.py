@@ -184,7 +184,7 @@ class Drive(FileStruct, frozen=True, kw_only=True):
         """Check that the drive can hold its position, as it must when a robot is armed. Raises ValueError."""
         if "position" not in self.modes:
             raise ValueError(
-                f"`modes` = {self.modes} lacks position, in which every joint holds its pose when it is armed; add it, "
+                f"in `modes` = {self.modes}, position is missing: joints hold their pose in it when armed; add it, "
                 f"or leave `modes` out"
             )
 

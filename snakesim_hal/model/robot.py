@@ -61,7 +61,7 @@ class Module(FileStruct, frozen=True, kw_only=True):
 
 
 class Safety(FileStruct, frozen=True, kw_only=True):
-    """Behaviour of the joints in a fault, and limits of commands."""
+    """Behavior of the joints in a fault, and limits of commands."""
 
     action: StopMode = "damp"
     """Stop mode: what the joints do in a fault. `damp` brakes them, `hold` holds their angles, `passive` switches the

@@ -183,7 +183,7 @@ class Client:
         """Return the next due clock from the queue.
 
         In lockstep this is the newest clock of the next tick, because the host repeats a tick's clock while time
-        stands still. Otherwise it is the newest clock of all. A pause is never skipped.
+        is paused. Otherwise it is the newest clock of all. A pause is never skipped.
 
         Raises:
             Empty: no clock arrived in time.

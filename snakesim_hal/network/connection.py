@@ -148,7 +148,7 @@ def _describe_failure(link: Link, error: zenoh.ZError) -> NotConnectedError:
     if link.session is not None:
         return NotConnectedError(
             f"nothing on {', '.join(link.session.endpoints)} lets {link.session.path} in: no router runs there, or "
-            f"it does not accept the certificate; RUST_LOG=zenoh=warn says more",
+            f"it does not accept the certificate; set RUST_LOG=zenoh=warn for details",
             code="certificate/rejected",
         )
     return NotConnectedError(

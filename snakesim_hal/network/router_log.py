@@ -37,7 +37,7 @@ LINES_PER_INTERVAL = 100  # in each REPORT_INTERVAL_S
 MAX_LINE_CHARACTERS = 300
 MAX_SESSIONS = 4000  # whose names are kept, as many as a host accepts
 
-COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+COLOR = re.compile(r"\x1b\[[0-9;]*m")
 HEAD = re.compile(r"\S+Z +(?P<level>[A-Z]+) +(?:\S+ )?ThreadId\((?P<thread>\d+)\) (?P<module>[\w:]+): (?P<text>.*)")
 ALLOWED = " is authorized to "
 LIST_BEGIN = "caching permissions for"
@@ -70,7 +70,7 @@ class RouterLog:
         """Process one line of Zenoh's log."""
         if ALLOWED in line and LIST_END not in line:
             return
-        line = COLOUR.sub("", line)
+        line = COLOR.sub("", line)
         parts = HEAD.fullmatch(line)
         if parts is None:
             self._write_once(line)

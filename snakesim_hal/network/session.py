@@ -56,17 +56,19 @@ class Arrival(msgspec.Struct, frozen=True):
 class Publisher(Generic[MessageT]):
     """Publishes messages of one type on one key."""
 
-    def __init__(self, message: type[MessageT], send: Callable[[bytes], None], heard: Callable[[], bool]) -> None:
+    def __init__(
+        self, message: type[MessageT], send: Callable[[bytes], None], has_subscriber: Callable[[], bool]
+    ) -> None:
         """Wrap the two functions of a network's publisher.
 
         Args:
             message: the type of its messages.
             send: sends bytes as they are, bypassing any reroute.
-            heard: returns whether the key has a subscriber now.
+            has_subscriber: returns whether the key has a subscriber now.
         """
         self.message = message
         self.send = send
-        self.has_subscriber = heard
+        self.has_subscriber = has_subscriber
         self._put = send
 
     def put(self, message: MessageT, encoded: bytes | None = None) -> None:

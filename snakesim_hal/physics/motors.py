@@ -83,7 +83,7 @@ class Motors:
         Args:
             i: index of the joint from the tail.
             mode: of the drive.
-            target: rad, rad/s or N·m, as the mode says; ignored in passive mode.
+            target: rad, rad/s or N·m, depending on the mode; ignored in passive mode.
             limit_nm: torque limit of the setpoint.
             gain: kp of position mode, N·m/rad.
             damping: kd of position and velocity mode, N·m·s/rad.

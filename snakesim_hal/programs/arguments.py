@@ -80,7 +80,7 @@ def add_set(parser: argparse.ArgumentParser, about: str = "change any value of t
 
 
 def add_seed(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
-    """Add `--seed`, which fixes every random number. about: what else the help says."""
+    """Add `--seed`, which fixes every random number. about: more text for the help."""
     parser.add_argument(
         "--seed", type=int, default=default, metavar="SEED", help=f"seed of all random numbers ({about})"
     )
@@ -169,7 +169,7 @@ def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SE
         "--session",
         type=Path,
         metavar="FILE",
-        help=f"connect as a Zenoh session file says (JSON5: router, certificates) {session}".rstrip(),
+        help=f"connect with the settings of a Zenoh session file (JSON5: router, certificates) {session}".rstrip(),
     )
     add_namespace(parser)
 
@@ -201,7 +201,7 @@ def add_unchecked(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--unchecked",
         action="store_true",
-        help="arm also a robot whose joints nobody has checked as they are now (simulated and emulated ones need none)",
+        help="arm also a robot whose joints were not checked as they are now (simulated and emulated ones need none)",
     )
 
 
@@ -253,7 +253,7 @@ def read_session_option(arguments: argparse.Namespace, *, or_environment: bool =
     Args:
         arguments: those of `add_network`.
         or_environment: whether SNAKESIM_SESSION counts too, unless an endpoint is given. This is for an operator's
-            tools: a process that moves a robot, or stands for one, connects only as its command line says.
+            tools: a process that moves or emulates a robot connects only as its command line specifies.
     """
     path: Path | None = arguments.session
     if path is None and or_environment and arguments.endpoint is None and arguments.router is None:

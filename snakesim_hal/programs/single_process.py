@@ -245,7 +245,7 @@ class InProcessRun:
         if self._limit.is_hurried:
             return (
                 f"{describe_interrupted_line(error)} had not returned {INTERRUPT_GRACE_S:g} s after the "
-                "run was told to stop"
+                "run received the signal to stop"
             )
         return (
             f"{describe_interrupted_line(error)} took longer than {self._limit.limit_s:g} s in one tick; if it needs "

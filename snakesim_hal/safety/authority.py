@@ -69,7 +69,7 @@ class Authority:
             first_epoch: epoch of the lease before its first holder. It must differ from that of any earlier host, so
                 that commands for another host are rejected.
             awaits_reports: whether arming waits until every joint module has reported its supply.
-            unchecked: why the joints count as not checked, so that only a request that says `unchecked` arms the
+            unchecked: why the joints count as not checked, so that only a request with `unchecked` arms the
                 robot; empty if they were checked.
             cables: cables of joints without end stops. The caller updates them.
         """
@@ -215,7 +215,7 @@ class Authority:
         if decision.changed_hands:
             self._forget_commands()
             if self.state == "armed":
-                self._transition("disarm", f"lease passed to {decision.lease.holder or 'nobody'}")
+                self._transition("disarm", f"lease passed to {decision.lease.holder or 'no client'}")
         return self._answer(decision.refusal, decision.refusal_word)
 
     def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
@@ -451,7 +451,7 @@ class Authority:
         if self._implausible is not None:
             reasons.append(self._implausible.fault.cause)
         for fault in self._derating.present_faults:
-            # The supply has a reason of its own, which says what to do about it.
+            # The supply has a separate reason, which explains what to do.
             if fault.what != "undervoltage" and not self._is_of_isolated_joint(fault):
                 reasons.append(fault.cause)
         reasons += self._derating.find_supply_problems(now_ns)

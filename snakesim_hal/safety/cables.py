@@ -1,8 +1,8 @@
 """How far the cables of joints without end stops are wound, over restarts of drives and host. Pure.
 
-A drive that was off forgets whole turns: it starts within one. So each such joint is followed from where it was last
-measured, by at most half a turn from one sample to the next. The angle of its drive differs from the counted one by
-whole turns.
+A drive that was off loses the count of whole turns: it starts within one. So each such joint is followed from its
+last measured angle, by at most half a turn from one sample to the next. The angle of its drive differs from the
+counted one by whole turns.
 """
 
 import math
@@ -102,8 +102,9 @@ def _explain_winding(joint: CableJoint, drive_rad: float, angle_rad: float) -> s
     plural = "s" if abs(turns) > 1 else ""
     direction = "lower" if turns > 0 else "higher"
     return (
-        f"{joint.name}: its drive says {drive_rad:+.2f} rad, and counted over restarts it is at {angle_rad:+.2f} rad: "
-        f"within its limits its cable would be wound by up to {max_turns:.2f} turns, and `cable_turns` = "
-        f"{joint.cable_turns:g}. Turn it by hand by {abs(turns)} turn{plural} to {direction} angles, then switch its "
-        f"drive off and on and restart the host; or, if its cable is not wound, `snakesim robot calibrate zero`"
+        f"{joint.name}: its drive reports {drive_rad:+.2f} rad, but it is at {angle_rad:+.2f} rad by the turns counted "
+        f"over restarts: within its limits its cable would be wound by up to {max_turns:.2f} turns, and "
+        f"`cable_turns` = {joint.cable_turns:g}. Turn it by hand by {abs(turns)} turn{plural} to {direction} "
+        f"angles, then switch its drive off and on and restart the host; or, if its cable is not "
+        f"wound, run `snakesim robot calibrate zero`"
     )

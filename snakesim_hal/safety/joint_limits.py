@@ -81,5 +81,5 @@ class Applied:
     """Limited setpoints of the joints, (n_joints,) each."""
 
     mode: Ints  # values of `Mode`
-    target: Floats  # rad, rad/s or N·m, as the mode says
+    target: Floats  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: Floats

@@ -66,7 +66,7 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
     KeyRow(COLOR_ALL, m.ColorImage, "HAL", "stream", _SENSOR, "what a camera sees, in color"),
     KeyRow(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
-    KeyRow(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "what a sensor with a message of its own says"),
+    KeyRow(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "samples of a sensor with a custom message"),
     KeyRow(
         PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
     ),
@@ -98,7 +98,7 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(
         PARAMETERS_IN_FORCE, m.ControlParameters, "control", "latched", "on a change", "the controller's parameters now"
     ),
-    KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
+    KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "the wanted speed and direction"),
     KeyRow(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
     KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
     KeyRow(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),

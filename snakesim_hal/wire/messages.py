@@ -182,7 +182,7 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
 
     range_min_m: Annotated[q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")]
     range_max_m: Annotated[q.Distance, about("along the optical axis; what is further is 0 in `depth`")]
-    scale_m: Annotated[float, Meta(gt=0, le=1), about("metres of one count of `depth`")]
+    scale_m: Annotated[float, Meta(gt=0, le=1), about("meters per count of `depth`")]
     depth: Annotated[
         bytes,
         Meta(max_length=2 * q.MAX_PIXELS),
@@ -254,7 +254,7 @@ class Preview(Message, frozen=True, kw_only=True):
     format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in color, png of 16 bits for depth")]
     scale_m: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
-        about("metres of one count of depth, which is 0 for nothing within range; null: it is in color"),
+        about("meters per count of depth, which is 0 for nothing within range; null: it is in color"),
     ] = None
     data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
 
@@ -327,7 +327,7 @@ class Clock(Message, frozen=True, kw_only=True):
         about("sensor key or service -> tick of its newest sample that is valid now"),
     ]
     paused: Annotated[
-        bool, about("true: no tick, only a sign of life: the last one again, while robot time stands still")
+        bool, about("true: not a new tick; the last clock is repeated as a sign of life while robot time is paused")
     ] = False
 
 
@@ -361,8 +361,8 @@ class JointDescription(Message, frozen=True, kw_only=True):
         Meta(max_length=8),
         about("beside angle and velocity; a torque that is not measured is 0, heat and voltage then stop nothing"),
     ] = msgspec.field(default_factory=lambda: list(get_args(Measurement)))
-    serial: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
-    firmware: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
+    serial: Annotated[str, Meta(max_length=64), about("serial number that its drive reports; empty: none")] = ""
+    firmware: Annotated[str, Meta(max_length=64), about("firmware version that its drive reports; empty: none")] = ""
 
     def supports_mode(self, mode: Mode) -> bool:
         """Return whether the joint may be commanded in a mode. It can always be passive."""
@@ -426,7 +426,7 @@ class Description(Message, frozen=True, kw_only=True):
     own: Annotated[
         dict[q.Name, Annotated[str, Meta(max_length=q.MAX_OWN_SCHEMA)]],
         Meta(max_length=q.MAX_OWN_SENSORS),
-        about("key -> JSON Schema of its message, of each sensor with a message of its own, whoever publishes it"),
+        about("key -> JSON Schema of its message, of each sensor with a custom message, from any process"),
     ] = {}
 
 
@@ -560,7 +560,7 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
         q.Name | None, about("`Description.config_hash`; arm needs it, others may leave it null")
     ] = None
     unchecked: Annotated[
-        bool, about("arm also where `Status.unchecked` says that the joints were not checked as they are now")
+        bool, about("arm also if `Status.unchecked` gives a reason why the joints do not count as checked")
     ] = False
 
 
@@ -651,7 +651,7 @@ class Process(Message, frozen=True, kw_only=True):
         about("messages that it knows; empty: unknown"),
     ] = {}
     waits_for: Annotated[
-        list[q.Name], Meta(max_length=16), about("keys of which it has no message yet, without which it says nothing")
+        list[q.Name], Meta(max_length=16), about("keys whose first message it waits for; it publishes nothing before")
     ] = []
 
 
@@ -721,7 +721,7 @@ class World(Message, frozen=True, kw_only=True):
     pose_from: Annotated[
         Literal["sensor", "dead_reckoning"] | None,
         about(
-            "what the base's pose is of now; its age is that of `pose_timestamp_ns` or `timestamp_ns`; null: not told"
+            "present source of the base's pose; its age is that of `pose_timestamp_ns` or `timestamp_ns`; null: unknown"
         ),
     ] = None
     contacts_from: Annotated[
@@ -747,7 +747,7 @@ class Trajectory(Message, frozen=True, kw_only=True):
     timestamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from; null: without one")]
     path_id: Annotated[q.Count, about("changes when `path_w` does")]
     path_w: Annotated[list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")]
-    speed_m_s: Annotated[q.Velocity, about("along the path; 0: stand still")]
+    speed_m_s: Annotated[q.Velocity, about("along the path; 0: stop")]
     push_points: Annotated[
         list[q.Name], Meta(max_length=512), about("obstacles within reach of the path, in the order along it")
     ]
@@ -779,7 +779,7 @@ class ControlState(Message, frozen=True, kw_only=True):
     tick: Annotated[q.Tick, about("of the clock that control acted on")]
     timestamp_ns: q.Stamp
     controller: q.Name
-    state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: not armed, or told to stand still")]
+    state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: not armed, or the speed is to be 0")]
     reason: q.Reason
     path_s_m: Annotated[q.Length | None, about("arc length of the tail along the path; null: unknown")] = None
     propulsion_joint: Annotated[q.Name | None, about("the joint that pushes; null: none does")] = None

@@ -71,7 +71,7 @@ Microseconds = Annotated[float, from_zero(1e8, "µs")]
 Speed = Annotated[float, bounded(0.1, 10.0, "1")]  # of robot time, beside the wall clock
 Fraction = Annotated[float, bounded(0.0, 1.0, "1")]
 
-Target = Annotated[float, bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, as the joint's mode says")]
+Target = Annotated[float, bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, depending on the joint's mode")]
 TorqueLimit = Annotated[float, bounded(0.0, MAX_TARGET, "N·m")]
 
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]

@@ -13,5 +13,5 @@ class RequestedSetpoints:
     """
 
     mode: list[Mode]
-    target: list[float]  # rad, rad/s or N·m, as the mode says
+    target: list[float]  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: list[float]  # maximum torque of each joint's motor, at least 0

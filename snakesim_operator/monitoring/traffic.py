@@ -46,7 +46,7 @@ class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
 
     robot: str
     key: str
-    writer: str | None  # as the key space says; None: the key is not in it
+    writer: str | None  # from the key space; None: the key is not in it
     failure: str = ""  # why the newest message cannot be read
     rate_hz: float | None
     jitter_ms: float | None  # standard deviation of the gaps

@@ -3,7 +3,7 @@
 The services are those of a run, on a network within this process; the recording stands in for the host. They get the
 recorded bytes, tick by tick, and a lease of the recorded number. From a run in lockstep the commands come out the same
 to the bit. With a changed setting they differ, but the robot moves as it did: it shows what another gain would have
-commanded in the situations of the recording, not where that would have led. Parameters that somebody changed during the
+commanded in the situations of the recording, not where that would have led. Parameters that a client changed during the
 run are changed in the same tick again.
 """
 
@@ -353,8 +353,8 @@ def replay_control(
         run_recorded_code: Allow Python files that only the recording names.
 
     Returns:
-        The exit code. 0: the commands are the same, or a setting was changed; 1: they differ; 3: the recording lacks
-        something.
+        The exit code. 0: the commands are the same, or a setting was changed; 1: they differ; 3: something is
+        missing in the recording.
 
     Raises:
         ConfigError: The recording cannot be replayed, or `out` holds a recording already.

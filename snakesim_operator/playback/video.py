@@ -132,7 +132,7 @@ def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span)
 
 
 def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> list[str]:
-    """Return a sentence for each time in which the film stands still because no pose is recorded.
+    """Return a sentence for each time in which the film is frozen because no pose is recorded.
 
     Args:
         times_s: Robot time of the pose in each picture.
@@ -143,7 +143,7 @@ def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> 
     for before_s, after_s in pairwise(np.unique(times_s).tolist()):
         if after_s - before_s > picture_s + 1.5 * period_s:
             sentences.append(
-                f"no pose is recorded between {before_s:.2f} and {after_s:.2f} s of robot time; the film stands still"
+                f"no pose is recorded between {before_s:.2f} and {after_s:.2f} s of robot time; the film is frozen"
             )
     return sentences
 

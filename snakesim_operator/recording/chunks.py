@@ -34,7 +34,7 @@ _UNPACKING_ERRORS = (zstandard.ZstdError, RuntimeError, EOFError, MemoryError)
 
 
 class DamagedError(Exception):
-    """A record is not what it must be; the text says why."""
+    """A record is damaged; the text explains how."""
 
 
 def read_chunk_length(head: bytes) -> int:

@@ -1,7 +1,7 @@
 """Makes the messages for Foxglove, PlotJuggler and Rerun from the robot's messages as they arrive.
 
 Numbers are converted at once, one message for each sample. What is drawn is made from the newest samples, a few times
-a second, when the robot's clock says that it is due. The topics are listed in `foxglove_topics`.
+a second, when it is due by the robot's clock. The topics are listed in `foxglove_topics`.
 """
 
 from collections.abc import Sequence

@@ -79,7 +79,7 @@ class RecordingWriter:
     def write_arrival(self, arrival: Arrival) -> None:
         """Write one message, unless its key is not in the key space.
 
-        A custom sensor's sample waits until the robot's description has said what it means.
+        A custom sensor's sample waits for the robot's description, which has its schema.
         """
         if self.failure:
             return

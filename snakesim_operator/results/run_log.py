@@ -59,7 +59,7 @@ class RunRecord:
     replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
 
     # How much of the run is known.
-    ending: str = COMPLETE  # COMPLETE, or a sentence that says how the run ended
+    ending: str = COMPLETE  # COMPLETE, or a sentence on how the run ended
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
     unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
 

@@ -80,7 +80,7 @@ class RunReader(Protocol):
         ...
 
     def describe_ending(self) -> str:
-        """Return COMPLETE, or a sentence that says how the run ended, as far as the store shows it."""
+        """Return COMPLETE, or a sentence on how the run ended, as far as the store shows it."""
         ...
 
 

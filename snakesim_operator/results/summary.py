@@ -64,11 +64,11 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     contacts_from: Annotated[
         str | None, Meta(description="what guidance had contacts from: sensor or joint_torques; null: none, or unknown")
     ] = None
-    reckoned_distance_m: Annotated[
-        float | None, _number("m", "advance by the reckoned pose; null: it was measured")
-    ] = None
+    reckoned_distance_m: Annotated[float | None, _number("m", "advance by dead reckoning; null: it was measured")] = (
+        None
+    )
     reckoned_off_m: Annotated[
-        float | None, _number("m", "the reckoned pose from the measured one, at most; null: one of them is unknown")
+        float | None, _number("m", "largest error of the pose by dead reckoning; null: one of the poses is unknown")
     ] = None
     locomoting_fraction: Annotated[
         float | None,

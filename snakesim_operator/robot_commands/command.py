@@ -20,7 +20,7 @@ from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
 ANSWER_S = 5.0
 DESCRIPTION_S = 3.0
-SHOWN_S = 1.5  # until the host's status must show what its answer says
+SHOWN_S = 1.5  # until the host's status must show what it answered
 DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
 
 

@@ -224,7 +224,7 @@ def _motion_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ("locomoting", _format_time_fraction(summary.locomoting_fraction)),
         ("propulsion joints", _describe_propulsion(summary)),
         ("peak joint torque", _format_number(summary.peak_joint_torque_nm, "N·m")),
-        ("energy per metre", _describe_energy(summary)),
+        ("energy per meter", _describe_energy(summary)),
         ("contact over 50 ms", _format_number(summary.peak_contact_force_n, "N", 1)),
     ]
     force_tracking = _describe_force_tracking(summary)

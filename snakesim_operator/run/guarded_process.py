@@ -108,7 +108,7 @@ class _Guard:
             return f"one step of the run took longer than {due_s - began_s:g} s, in compiled code"
         signalled_s = self._signalled_s
         if signalled_s is not None and began_s <= signalled_s < now_s - INTERRUPT_LIMIT_S:
-            return f"one step of the run had not returned {INTERRUPT_LIMIT_S:g} s after it was told to stop"
+            return f"one step of the run had not returned {INTERRUPT_LIMIT_S:g} s after it received the signal to stop"
         return ""
 
 

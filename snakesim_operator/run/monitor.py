@@ -234,7 +234,7 @@ class RunMonitor:
         stat = Path(f"/proc/{self._supervisor.pids()[HOST]}/stat").read_text()
         state = stat.rpartition(")")[2].split()[0]
         activity = PROCESS_STATES.get(state, "is there")
-        return f"the host has said nothing for {MAX_SILENCE_S:g} s, since tick {status.tick}; its process {activity}"
+        return f"the host has sent no status for {MAX_SILENCE_S:g} s, since tick {status.tick}; its process {activity}"
 
     def _print_recovery(self, status: Status) -> None:
         """Print once how to recover from a fault."""

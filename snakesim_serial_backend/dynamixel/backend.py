@@ -128,9 +128,9 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
             )
         if travel_rad + 2 * SLACK_RAD >= TURN:
             raise ConfigError(
-                f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and forgets whole turns when "
-                f"it is off: where it woke up would be ambiguous. Narrow its limits (or `gear`) to "
-                f"{TURN - 2 * SLACK_RAD:.2f} rad",
+                f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and loses the count of whole "
+                f"turns when it is off: its angle would be ambiguous afterwards. Narrow its limits (or `gear`) to "
+                f"less than {TURN - 2 * SLACK_RAD:.2f} rad",
                 code="drive/unsupported-setting",
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:

@@ -127,7 +127,10 @@ def _check_model(servo: Servo, number: int, settings: DynamixelSettings) -> str:
     """Return why a servo of this model cannot be used; empty if it can, and then its unit of current is known."""
     name = at.model_name(number)
     if settings.model and name != settings.model:
-        return f"is of another model: {name}; `backends.dynamixel.model` says {settings.model}"
+        return (
+            f"is of another model: {name}, but `backends.dynamixel.model` = {settings.model}; correct the scenario, or "
+            f"replace the servo"
+        )
     if number in at.WITHOUT_CURRENT:
         return f"is of another model: {name} neither measures nor limits current, which this driver needs"
     current_a = settings.current_unit_a.get(str(number))
@@ -207,7 +210,7 @@ def _write_registers(servo: Servo) -> None:
         if status is None:
             reason = "does not answer"
         elif status.error:
-            reason = f"says error {status.error}"
+            reason = f"reports error {status.error}"
         else:
             continue
         raise BackendError(

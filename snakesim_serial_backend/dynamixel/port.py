@@ -68,7 +68,7 @@ class Port:
         return status
 
     def write(self, id_: int, address: int, data: bytes) -> Packet | None:
-        """Write registers of a servo, and return its answer, whose error tells whether it accepted them."""
+        """Write registers of a servo, and return its answer; its `error` is 0 if the servo accepted them."""
         return self._request_one(id_, encoded(id_, Instruction.WRITE, struct.pack("<H", address) + data))
 
     def reboot(self, id_: int) -> None:

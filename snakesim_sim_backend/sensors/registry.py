@@ -97,11 +97,11 @@ def _find_model(
         if model is None:
             return None
         require_base_class(model, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
-    # A sensor with a message of its own has a schema, which is checked instead.
+    # A sensor with a custom message has a schema, which is checked instead.
     if message is not OwnSample and model.message is not message:
         raise ConfigError(
-            f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which is what {key} "
-            f"carries; its class says in `message` what it makes",
+            f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which {key} carries; "
+            f"set `message` of its class to what it makes",
             code="plugin/not-loadable",
         )
     return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")

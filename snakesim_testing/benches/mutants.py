@@ -37,7 +37,7 @@ MUTANTS: list[Mutant] = []
 
 
 class Liar(Workbench):
-    """Is told, says or does something else than is true: what one of three functions makes of it."""
+    """A workbench with one error, made by one of three functions: in description, measurements or setpoints."""
 
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)
@@ -330,7 +330,7 @@ class ForgetsAfterAPeriod(Workbench):
 
 @breaks("a_mode_that_a_joint_lacks_is_refused_and_moves_nothing")
 class MovesAfterAll(Liar):
-    """Has no torque mode, and moves when it is told nothing."""
+    """Has no torque mode, and moves without a setpoint."""
 
     def describes(self, robot):
         first = replace(robot.joints[0], modes=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY])

@@ -102,7 +102,7 @@ class BusWorkbench(DrivesWorkbench):
     """As late, coarse and slow to wake as a robot on a bus may be, and at rest by itself when it is not armed."""
 
     WAKES_AFTER = 4  # periods until joint 0 is armed; each further joint takes one more
-    KNOWN_AT_ONCE = True  # in lockstep time stands still until arming, and arming needs to know every joint
+    KNOWN_AT_ONCE = True  # in lockstep time is paused until arming, and arming needs to know every joint
 
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)

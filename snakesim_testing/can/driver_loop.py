@@ -74,7 +74,7 @@ class Loop:
         return SafeSetpoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
 
     def states(self) -> list[ModuleState]:
-        """What the modules last said."""
+        """The states that the modules reported last."""
         return [module.state for module in self.backend.modules.reading.modules]
 
     @property

@@ -85,7 +85,7 @@ class Heard:
 
 
 class Listener:
-    """Hears everything on a bus; the kernel keeps it until somebody asks."""
+    """Receives every frame on a bus; the kernel buffers them until `listen`."""
 
     def __init__(self, channel: str) -> None:
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -96,7 +96,7 @@ class Listener:
         self.heard: list[Heard] = []
 
     def listen(self) -> list[Heard]:
-        """Take in what has come; everything heard since the last `forget`."""
+        """Receive the buffered frames; return all received since the last `forget`."""
         while True:
             try:
                 data, extra, _, _ = self._socket.recvmsg(FRAME.size, socket.CMSG_SPACE(16))
@@ -114,7 +114,7 @@ class Listener:
         return [heard for heard in self.listen() if heard.opcode == opcode]
 
     def states(self) -> list[ModuleState]:
-        """The state that each module told last, in whatever frame."""
+        """The state that each module reported last, in any frame."""
         reported = dict.fromkeys(NODES, ModuleState.BOOT)
         for heard in self.listen():
             if heard.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE):
@@ -175,7 +175,7 @@ class Bench:
             raise AssertionError(f"{error}\n{logs}") from None
 
     def tell(self, *arguments: str) -> Ended:
-        """One of the operator's tools, told where the robot is."""
+        """Run one of the operator's tools with the endpoint of the robot."""
         return snakesim(*arguments, "--endpoint", self.endpoint, cwd=self.folder)
 
     def _is_armed(self) -> bool:
@@ -213,7 +213,7 @@ def stop_commands(heard: Sequence[Heard]) -> list[Heard]:
 
 
 def first_in(heard: Sequence[Heard], states: set[ModuleState], since_ns: int) -> dict[int, Heard]:
-    """Each module's first frame after a time that tells one of these states."""
+    """Each module's first frame after a time that reports one of these states."""
     found: dict[int, Heard] = {}
     for h in heard:
         if h.at_ns >= since_ns and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE) and h.says()["state"] in states:

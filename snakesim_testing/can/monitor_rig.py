@@ -58,9 +58,9 @@ def answering(state: ModuleState = ModuleState.DISARMED, *frames: Frame) -> Spea
     return speak
 
 
-def reporting(state: ModuleState = ModuleState.DISARMED, **told: float) -> Speak:
-    """Node 2 answers in this state, and a heartbeat says more of it."""
-    return answering(state, heartbeat(2, 1.0, state, **told))
+def reporting(state: ModuleState = ModuleState.DISARMED, **values: float) -> Speak:
+    """Node 2 answers in this state, and sends a heartbeat with more values."""
+    return answering(state, heartbeat(2, 1.0, state, **values))
 
 
 HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1)

@@ -26,7 +26,7 @@ def none(_frame: Frame) -> bool:
 
 
 class RecordedWire(VirtualWire):
-    """A virtual bus that keeps what went over it, and does not take, or loses, what a test says."""
+    """A virtual bus that records its frames. It refuses or loses the frames that a test selects."""
 
     def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
         super().__init__(channel, peer)
@@ -67,7 +67,7 @@ def is_set_point(frame: Frame) -> bool:
 
 
 def words(frames: list[Frame]) -> list[str]:
-    """What the host said beside Syncs and setpoints."""
+    """The frames of the host other than Syncs and setpoints, as text."""
     found = []
     for frame in frames:
         opcode = Opcode(parse_opcode(frame.id))

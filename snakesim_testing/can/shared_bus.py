@@ -1,7 +1,7 @@
 """Driver and modules on one kernel interface and in one process, on a clock that passes while the driver waits.
 
 Every frame goes through the kernel. Time is the modules': while the driver waits within a period, their clock goes on
-to the period's end, and then it stands still. So it does not matter how slow this machine is, or how long `ip` takes.
+to the period's end, and then it is paused. So it does not matter how slow this machine is, or how long `ip` takes.
 """
 
 from collections.abc import Callable, Iterator

@@ -134,7 +134,7 @@ def let_lease_expire(hosted: Hosted) -> None:
 
 
 def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: Hosted) -> None:
-    """In a pause no tick passes and no lease expires; whatever cannot stand still says so."""
+    """In a pause no tick passes and no lease expires; a robot that cannot pause refuses."""
     hosted.arm(stay)
     hosted.wait_for_ticks(t.ARMING_PERIODS)
     answer = hosted.session.request(

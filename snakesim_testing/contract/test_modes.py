@@ -40,7 +40,7 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> 
     integral = 0.5 * (velocity[1:] + velocity[:-1]).sum(axis=0) * rig.period_ns * 1e-9
     turned = angle[-1] - angle[0]
     assert turned[joint] < -t.STILL_RAD, "the joint did not move, so nothing can be compared"
-    assert np.abs(integral - turned).max() < t.INTEGRAL_RAD, f"velocity says {integral} rad, angle says {turned} rad"
+    assert np.abs(integral - turned).max() < t.INTEGRAL_RAD, f"turned {integral} rad by velocity, {turned} by angle"
 
 
 def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: Pushing) -> None:
@@ -96,11 +96,11 @@ def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
 
 def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> None:
     """Described without a mode, a joint is never given a setpoint in it: the command is refused as a whole."""
-    lacking = [mode for mode in Mode if not rig.supports_mode(0, mode)]
-    if not lacking:
+    missing = [mode for mode in Mode if not rig.supports_mode(0, mode)]
+    if not missing:
         pytest.skip(f"{rig.robot.joints[0].name} is described with every mode")
     rig.arm()
-    for mode in lacking:
+    for mode in missing:
         refused = rig.authority.rejected_counts["wrong_mode"]
         wrong = rig.make_setpoints({})
         wrong.mode[0], wrong.target[0] = mode, t.CRUISE_RAD_S

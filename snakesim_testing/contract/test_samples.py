@@ -53,7 +53,7 @@ def test_every_vector_has_one_entry_a_joint(rig: Rig, healthy: Record) -> None:
 def test_every_sample_survives_the_wire(rig: Rig, healthy: Record) -> None:
     """Finite and within the bounds of the messages: encoded and decoded by the HAL's codec it is the same.
 
-    A sensor's own message is decoded as the description says, which is all that others know of it.
+    A custom message is decoded by its schema in the description, which is all that clients know of it.
     """
     for sample in healthy.samples:
         for key, message in ((keys.JOINTS, sample.joints), *sample.others.items()):
@@ -75,7 +75,7 @@ def test_every_sample_fits_the_robot(rig: Rig, healthy: Record) -> None:
 
 
 def test_no_sample_contradicts_itself(healthy: Record) -> None:
-    """What cameras and lidars measure is within their range; the message of one's own sensor says what cannot be."""
+    """What cameras and lidars measure is within their range; a custom message finds impossible values itself."""
     for sample in healthy.samples:
         for key, message in sample.others.items():
             if isinstance(message, MountedSample):

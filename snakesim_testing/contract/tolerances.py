@@ -16,7 +16,7 @@ CLOSING_PERIODS = 5  # for how long a closed backend is observed
 
 # --- mechanics, in seconds -------------------------------------------------------------------------------------
 
-SETTLE_S = 0.6  # bench4 let go at CRUISE is at rest after 0.3 s; a reached target has settled after 0.4 s
+SETTLE_S = 0.6  # bench4, released at CRUISE, is at rest after 0.3 s; a reached target has settled after 0.4 s
 CRUISE_S = 0.3  # long enough to reach CRUISE_RAD_S, short enough to stay inside the limits of the joint
 PUSH_S = 0.5  # against a stop: the impact is over
 FROZEN_S = 1.0  # that a host does nothing: ten times a watchdog

@@ -104,7 +104,7 @@ def depth_image(
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> DepthImage:
-    """An image from a camera at a pose in the world (rotation: world_from_camera); the mount is only told."""
+    """An image from a camera at a pose in the world (rotation: world_from_camera); the mount is only reported."""
     rays = INTRINSICS.rays().astype(np.float64) @ rotation.T
     depth = (eye or Eye()).through(distance_along(position_w, rays, obstacles, ground))
     counts = np.where(np.isfinite(depth) & (depth < RANGE_M[1]) & (depth > RANGE_M[0]), depth / SCALE_M, 0.0)

@@ -71,18 +71,18 @@ class Stage:
     reported: list[ControlState] = field(default_factory=list[ControlState])
 
     def state(self) -> ControlState | None:
-        """The newest of what control told."""
+        """The newest state that control reported."""
         self.reported += self.states.drain()
         return self.reported[-1] if self.reported else None
 
     def tells(self, words: str) -> ControlState:
-        """Wait until control has told a reason with these words."""
+        """Wait until control has reported a reason with these words."""
 
         def found() -> list[ControlState]:
             self.state()
             return [state for state in self.reported if words in state.reason]
 
-        wait_until(found, f"{words!r} told; last: {self.reported[-1].reason if self.reported else 'nothing'}")
+        wait_until(found, f"{words!r} reported; last: {self.reported[-1].reason if self.reported else 'nothing'}")
         return found()[0]
 
 

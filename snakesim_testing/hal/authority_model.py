@@ -13,7 +13,7 @@ from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
 
 JOINTS = 3
 ALL = list(range(JOINTS))
-WORDS = ("overheated", "leak", "undervoltage")  # in the order in which they are told of a joint
+WORDS = ("overheated", "leak", "undervoltage")  # in the order in which they are reported for a joint
 PERIOD_S = PERIOD_NS * 1e-9
 ANGLE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, FAR = 1.5, 5.0, 100.0, 4.0, 80.0, 0.3  # of the test robot
 STIFFNESS, DAMPING, VELOCITY_GAIN = 40.0, 1.0, 1.0
@@ -36,7 +36,7 @@ def stoppable(distance: float) -> float:
 
 
 class Health:
-    """What one module said last, and what follows from it."""
+    """What one module reported last, and what follows from it."""
 
     def __init__(self) -> None:
         self.heard_ns: int | None = None
@@ -97,7 +97,7 @@ class Model(RuleBasedStateMachine):
         self.wrong: set[tuple[str, int]] = set()  # at the last tick
         self.silent: set[int] = set()
         self.shares = [1.0] * JOINTS
-        self.reported = True  # the motors were told of the last stop
+        self.reported = True  # the last stop was sent to the motors
         self.last: TickDecision | None = None
 
     @property

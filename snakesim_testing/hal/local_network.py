@@ -137,7 +137,7 @@ class LagBackend(Backend):
         return found
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Nothing to release."""
 
     def _fail(self, where: str) -> None:
         if self.fails_in == where:
@@ -153,7 +153,7 @@ class Follower:
     ticks_seen: list[int] = field(default_factory=list[int])
     armed_ticks: list[int] = field(default_factory=list[int])
     stopped: threading.Event = field(default_factory=threading.Event)
-    silent: threading.Event = field(default_factory=threading.Event)  # hears everything, says nothing
+    silent: threading.Event = field(default_factory=threading.Event)  # receives everything, sends nothing
 
     def run(self, link: Link) -> None:
         """Until stopped."""
@@ -191,7 +191,7 @@ class Running:
     host: Host
     backend: LagBackend
     link: Link  # for clients
-    session: Session  # of somebody who watches
+    session: Session  # of a client that watches
     thread: threading.Thread
     _statuses: Reader[Status]
     _status: Status | None = None
@@ -233,7 +233,7 @@ class Running:
 
 @contextmanager
 def running(config: RunConfig, **host: Any) -> Iterator[Running]:
-    """A host of a `LagBackend`, and somebody who watches it. The host is stopped at the end."""
+    """A host of a `LagBackend`, and a client that watches it. The host is stopped at the end."""
     endpoint, backend = free_endpoint(), LagBackend(config)
     link = Link(endpoint, "lab/worm")
     with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:

@@ -191,7 +191,7 @@ def write_files(
 
 
 def status(**reported: Any) -> Status:
-    """What a host of the worm tells, with these values."""
+    """A status as the worm's host publishes it, with these values."""
     values: dict[str, Any] = {
         "tick": 0,
         "timestamp_ns": 0,

@@ -99,11 +99,11 @@ class Running:
 
     @property
     def endpoint(self) -> str:
-        """Where its network meets, as it says."""
+        """The endpoint of its network, as it prints it."""
         return self.asked_endpoint or self._told(r"network: (\S+?),")
 
     def console(self) -> str:
-        """The address of its live console, once it is told."""
+        """The address of its live console, once it is printed."""
         return self._told(r"console: (http\S+)")
 
     def _told(self, pattern: str) -> str:
@@ -123,12 +123,12 @@ class Running:
         return self.out.with_suffix(".said").read_text(encoding="utf-8", errors="replace")
 
     def wait_for(self, text: str, limit_s: float = LIMIT_S) -> None:
-        """Wait until it has said something."""
+        """Wait until it has printed this text."""
         wait_until(lambda: text in self.said() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
         assert text in self.said(), self.how_it_ended()
 
     def tell(self, *arguments: str, limit_s: float = LIMIT_S) -> Ended:
-        """A tool of the same machine, told where this run is."""
+        """Run a tool on the same machine with the endpoint of this run."""
         where = (*arguments, "--endpoint", self.endpoint)
         return snakesim(*where, cwd=self.home, limit_s=limit_s, more=self.more, inside=self.inside)
 
@@ -161,7 +161,7 @@ def running(
 ) -> Iterator[Running]:
     """A run in the background; whatever is left of it at the end is killed.
 
-    endpoint: given to it; "free" for a port that nobody has, None to leave the choice to it.
+    endpoint: given to it; "free" for an unused port, None to let it choose.
     """
     asked = free_endpoint() if endpoint == "free" else endpoint
     network = ["--endpoint", asked] if asked is not None and "--router" not in arguments else []

@@ -1,4 +1,4 @@
-"""Places on the loopback that nobody listens on."""
+"""Endpoints on the loopback interface that no process uses."""
 
 import socket
 

@@ -1,4 +1,4 @@
-"""A connection to a console as its page opens one, that says what it likes; and plain HTTP."""
+"""A connection to a console as its page opens one, which can send any message; and plain HTTP."""
 
 import contextlib
 import http.client

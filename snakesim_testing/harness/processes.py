@@ -19,7 +19,7 @@ def processes_with(file: str, content: str) -> list[tuple[int, str]]:
     """(pid, NUL-separated command line) of every live process with a content in its `cmdline`, `environ` or so."""
     found: list[tuple[int, str]] = []
     for entry in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError, IndexError):  # gone in the meantime, or somebody else's
+        with contextlib.suppress(OSError, IndexError):  # gone in the meantime, or of another user
             state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
             if state != "Z" and content.encode() in (entry / file).read_bytes():
                 found.append((int(entry.name), (entry / "cmdline").read_bytes().decode(errors="replace")))

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-LIMIT_S = 90.0  # long enough for a process to start on a busy machine; whoever states a time gives its own
+LIMIT_S = 90.0  # long enough for a process to start on a busy machine; a caller may give another limit
 FoundT = TypeVar("FoundT")
 
 

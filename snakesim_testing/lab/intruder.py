@@ -1,7 +1,7 @@
 """`python -m snakesim_testing.lab.intruder SESSION.json5`: holds a viewer's certificate, and does what it can with it.
 
-It says again whatever it hears, at the same key; it commands with the epoch and the next sequence number that it reads;
-and it answers in the robot's place. Prints how often, every tenth of a second.
+It repeats every message that it receives, at the same key. It commands with the epoch and the next sequence number
+that it reads, and it answers in the robot's place. It prints how often, every tenth of a second.
 """
 
 import sys
@@ -22,7 +22,7 @@ def main(path: str) -> None:
         def say(key: zenoh.KeyExpr | str, payload: bytes, encoding: zenoh.Encoding) -> None:
             session.put(key, payload, encoding=encoding, allowed_destination=zenoh.Locality.REMOTE)
 
-        def heard(sample: zenoh.Sample) -> None:
+        def repeat(sample: zenoh.Sample) -> None:
             say(sample.key_expr, sample.payload.to_bytes(), sample.encoding)
             did["repeated"] += 1
             if str(sample.key_expr) == "actuator/joints":
@@ -37,7 +37,7 @@ def main(path: str) -> None:
             query.reply(query.key_expr, b"\x80")
             query.drop()
 
-        kept = [session.declare_subscriber("**", heard), *(session.declare_queryable(key, answer) for key in QUERIES)]
+        kept = [session.declare_subscriber("**", repeat), *(session.declare_queryable(key, answer) for key in QUERIES)]
         while kept:
             time.sleep(0.1)
             print(dict(did), flush=True)

@@ -40,7 +40,7 @@ class Machine:
     def run(
         self, *command: str, check: bool = True, cwd: Path | None = None, env: Mapping[str, str] | None = None
     ) -> str:
-        """Run a command in it to its end; what it says."""
+        """Run a command in it to its end, and return its output."""
         output, env = subprocess.PIPE, {**os.environ, **(env or {})}
         inside = self.inside(*command)
         done = subprocess.run(inside, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, cwd=cwd, env=env)

@@ -26,12 +26,12 @@ from snakesim_testing.runs.command import SNAKESIM, environment
 
 OWN, OTHER = "planar13", "second"
 LIMIT_S = 20.0
-COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+COLOR = re.compile(r"\x1b\[[0-9;]*m")
 MACHINES = ("hub", "robot1", "robot2", "ws1", "ws2", "laptop")
 
 
 def lab_text(folder: Path, port: int) -> str:
-    """Two robots, each with every role, behind one router; `spare` is a router that nobody starts."""
+    """Two robots, each with every role, behind one router; `spare` is a router that is never started."""
     machines = [f'[machines.{name}]\naddress = "127.0.0.1"\nfolder = "{folder}/{name}"' for name in MACHINES]
     routers = [
         f'[routers.main]\nmachine = "hub"\nport = {port}',
@@ -86,11 +86,11 @@ class SmallLab:
 
     def said(self) -> list[str]:
         """The router's log."""
-        return COLOUR.sub("", self.log.read_text(errors="replace")).splitlines()
+        return COLOR.sub("", self.log.read_text(errors="replace")).splitlines()
 
 
 def opened(settings: dict[str, Any]) -> zenoh.Session:
-    """A session of stock Zenoh with these settings. Raises ZError when it finds nobody who takes it."""
+    """A session of stock Zenoh with these settings. Raises ZError if no router accepts it."""
     zenoh.init_log_from_env_or("off")
     return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
 

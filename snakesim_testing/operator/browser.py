@@ -85,14 +85,14 @@ class Tab:
         return time.monotonic() - began
 
     def wait_until_loaded(self, limit_s: float = 60.0) -> None:
-        """Until the page's own scripts have run: what is typed earlier, nobody hears."""
+        """Until the page's own scripts have run: earlier input is lost."""
         deadline = time.monotonic() + limit_s
         while self.value("document.readyState") != "complete":
             assert time.monotonic() < deadline, "the page does not load"
             time.sleep(0.02)
 
     def click(self, label: str, hold_s: float = 0.0) -> None:
-        """Press what has a label, and let go. A disabled button does nothing, as for a person."""
+        """Press and release the element with this label. A disabled button does nothing, as for a person."""
         # Not at a place on the screen, and in one go: the page moves and replaces things while it changes.
         find = f"[...document.querySelectorAll('html *')].findLast(e => e.innerText?.trim() === {json.dumps(label)})"
         event = "{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}"

@@ -39,7 +39,7 @@ class Viewer:
         self._of: dict[str, dict[str, Any]] = {}  # what is on the page, by its id
 
     async def come(self) -> None:
-        """What a page says first: from then on it counts as a viewer."""
+        """Send the first message of a page: from then on it counts as a viewer."""
         await self.say(CAMERA)
 
     async def batch(self) -> list[dict[str, Any]]:

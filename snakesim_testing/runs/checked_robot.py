@@ -16,7 +16,7 @@ from snakesim_sim_backend.backend import SimBackend
 
 
 class Real(SimBackend):
-    """The simulator, which says that it is a robot, and whose drives say their serial numbers."""
+    """The simulator, described as a real robot whose drives report their serial numbers."""
 
     def describe(self):
         described = super().describe()

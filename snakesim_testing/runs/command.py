@@ -47,7 +47,7 @@ def background(
 
 @contextmanager
 def armed_run(out: Path, *arguments: str) -> Iterator[Running]:
-    """A run in the background, once its first line of progress tells that it is armed; it leaves no process behind."""
+    """A run in the background, once its first line of progress shows that it is armed; it leaves no process behind."""
     with running(out, *arguments) as run:
         run.wait_for(" s  ")
         yield run

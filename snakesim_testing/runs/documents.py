@@ -4,7 +4,7 @@
     ```sh background    a command in a terminal of its own; the next one, or the section's end, ends it with Ctrl-C
     ```python wave.py   a file that the reader is asked to save
 
-`# ... (exit code 1)` behind a command says how it ends when not with 0.
+`# ... (exit code 1)` behind a command is its exit code, if that is not 0.
 """
 
 import re

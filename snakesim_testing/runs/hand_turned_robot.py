@@ -31,7 +31,7 @@ from snakesim_drivers.mounting import Mounting
 
 
 class Held(Workbench):
-    """Drives that somebody turns by hand: their angles stand in a file."""
+    """Drives that an operator turns by hand: a file has their angles."""
 
     def sample(self, tick, timestamp_ns):
         drives = np.array(json.loads(Path("drives.json").read_text()))
@@ -68,7 +68,7 @@ def seen(home: Path, endpoint: str, angle_rad: float) -> None:
     """Wait until the host publishes an angle of joint_1."""
 
     def published() -> bool:
-        said = snakesim("topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
-        return abs(json.loads(said)["message"]["angle_rad"][0] - angle_rad) < 1e-3
+        output = snakesim("topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
+        return abs(json.loads(output)["message"]["angle_rad"][0] - angle_rad) < 1e-3
 
     wait_until(published, f"joint_1 at {angle_rad} rad")

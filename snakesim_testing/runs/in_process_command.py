@@ -22,7 +22,7 @@ def snakesim(*arguments: str, cwd: Path) -> Ended:
 
 
 def tell(run: Running, *arguments: str) -> Ended:
-    """The same, told where a run is."""
+    """The same, with the endpoint of a run."""
     return snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.home)
 
 

@@ -28,15 +28,15 @@ from pathlib import Path
 
 
 class Told(Workbench):
-    \"\"\"What it is told stands in a file.\"\"\"
+    \"\"\"Writes the setpoints that it receives to a file.\"\"\"
 
     ticks = 0
 
     def enact(self, setpoints, lifecycle):
         super().enact(setpoints, lifecycle)
         self.ticks += 1
-        told = {"tick": self.ticks, "lifecycle": lifecycle, "mode": setpoints.mode, "target": setpoints.target}
-        Path("new.json").write_text(json.dumps({**told, "limit_nm": setpoints.torque_limit_nm}))
+        received = {"tick": self.ticks, "lifecycle": lifecycle, "mode": setpoints.mode, "target": setpoints.target}
+        Path("new.json").write_text(json.dumps({**received, "limit_nm": setpoints.torque_limit_nm}))
         Path("new.json").replace("told.json")
 """
 

@@ -36,8 +36,8 @@ STEP_S = 0.002
 SHIFTS_S = np.arange(-0.1, 0.105, 0.01)  # from command to force
 CASES = "| scenario | controller | m in 8 s | J/m | N·s/m |\n|---|---|---|---|---|"
 CAUSES = (
-    "| scenario | controller | asked, N | felt, N | asked, but empty | felt, not asked | too much or little in all "
-    "| wrong share | correlation | at its best, after |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| scenario | controller | desired, N | measured, N | desired, but no contact | measured, not desired "
+    "| too much or little in all | wrong share | correlation | at its best, after |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 Forces = Mapping[str, Floats]  # of each obstacle, in every physics step
@@ -63,7 +63,7 @@ def recorded() -> Iterator[list[dict[str, float]]]:
     steps: list[dict[str, float]] = []
     feel = ContactReader._measure_force  # pyright: ignore[reportPrivateUsage] - called in every physics step
 
-    def felt(self: ContactReader) -> None:
+    def record(self: ContactReader) -> None:
         touches = self._touches  # pyright: ignore[reportPrivateUsage]
         found: dict[str, float] = {}
         names = touches._obstacle_of_geom  # pyright: ignore[reportPrivateUsage]
@@ -73,7 +73,7 @@ def recorded() -> Iterator[list[dict[str, float]]]:
         steps.append(found)
         feel(self)
 
-    with mock.patch.object(ContactReader, "_measure_force", felt):
+    with mock.patch.object(ContactReader, "_measure_force", record):
         yield steps
 
 
@@ -101,17 +101,17 @@ def cases(scenario: str) -> Iterator[str]:
 
 
 def causes(scenario: str, controller: str, **options: Any) -> str:
-    """What the difference of asked and felt forces is made of."""
+    """The parts of the difference between desired and measured forces."""
     result, forces = measured(scenario, controller, **options)
     states = [state for state in result.record.control if state.state == "Locomoting"]
-    asked, felt = table_of(states, forces, 0.0)
-    judged = [one for one in np.arange(len(asked)) if asked[one].max(initial=0.0) >= ASKED_N]
-    asked, felt = asked[judged], felt[judged]
-    empty = float(asked[felt < EMPTY_N].sum())
-    unasked = float(felt[asked == 0.0].sum())
-    both = (asked > 0.0) & (felt >= EMPTY_N)
+    desired_n, measured_n = table_of(states, forces, 0.0)
+    judged = [one for one in np.arange(len(desired_n)) if desired_n[one].max(initial=0.0) >= ASKED_N]
+    desired_n, measured_n = desired_n[judged], measured_n[judged]
+    empty = float(desired_n[measured_n < EMPTY_N].sum())
+    unasked = float(measured_n[desired_n == 0.0].sum())
+    both = (desired_n > 0.0) & (measured_n >= EMPTY_N)
     total, split = 0.0, 0.0
-    for wanted, found, here in zip(asked, felt, both, strict=True):
+    for wanted, found, here in zip(desired_n, measured_n, both, strict=True):
         if here.any():
             scale = found[here].sum() / wanted[here].sum()
             total += abs(found[here].sum() - wanted[here].sum())
@@ -121,36 +121,36 @@ def causes(scenario: str, controller: str, **options: Any) -> str:
     best = int(np.argmax(by_shift))
     shares = " | ".join(f"{part / whole:.0%}" for part in (empty, unasked, total, split))
     return (
-        f"| `{scenario}` | `{controller}` | {asked.sum(axis=1).mean():.1f} | {felt.sum(axis=1).mean():.1f} | {shares} "
-        f"| {correlation(asked, felt):.2f} | {by_shift[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
+        f"| `{scenario}` | `{controller}` | {desired_n.sum(axis=1).mean():.1f} | {measured_n.sum(axis=1).mean():.1f} | {shares} "
+        f"| {correlation(desired_n, measured_n):.2f} | {by_shift[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
     )
 
 
 def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
-    """Asked and felt forces, (n_states, n_obstacles) each; felt: mean over 50 ms, centered so long after asking."""
+    """Desired and measured forces, (n_states, n_obstacles) each; measured: mean over 50 ms, shifted by `shift_s`."""
     names = sorted({*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)})
     window = round(FORCE_WINDOW_S / STEP_S)
-    asked, felt = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
+    desired_n, measured_n = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
     for j, name in enumerate(names):
         sums = np.concatenate(([0.0], np.cumsum(forces.get(name, np.zeros(1)))))
         for i, state in enumerate(states):
             begin = round((1e-9 * state.timestamp_ns + shift_s) / STEP_S) - window // 2
             first, last = (min(max(k, 0), len(sums) - 1) for k in (begin, begin + window))
-            felt[i, j] = (sums[last] - sums[first]) / window
+            measured_n[i, j] = (sums[last] - sums[first]) / window
     column = {name: j for j, name in enumerate(names)}
     for i, state in enumerate(states):
         for point, force_n in zip(state.push_points, state.desired_force_n, strict=True):
             if point.obstacle is not None:
-                asked[i, column[point.obstacle]] += force_n
-    return asked, felt
+                desired_n[i, column[point.obstacle]] += force_n
+    return desired_n, measured_n
 
 
-def correlation(asked: Floats, felt: Floats) -> float:
+def correlation(desired_n: Floats, measured_n: Floats) -> float:
     """Over all push-points that are judged."""
-    judged = asked >= ASKED_N
-    if judged.sum() < 2 or asked[judged].std() == 0.0 or felt[judged].std() == 0.0:
+    judged = desired_n >= ASKED_N
+    if judged.sum() < 2 or desired_n[judged].std() == 0.0 or measured_n[judged].std() == 0.0:
         return 0.0
-    return float(np.corrcoef(asked[judged], felt[judged])[0, 1])
+    return float(np.corrcoef(desired_n[judged], measured_n[judged])[0, 1])
 
 
 def main() -> int:

@@ -44,12 +44,12 @@ class Run:
 
     @property
     def states(self) -> list[str]:
-        """As control told them."""
+        """As control reported them."""
         return [state.state for state in self._reported()]
 
     @property
     def reasons(self) -> list[str]:
-        """As control told them."""
+        """As control reported them."""
         return [state.reason for state in self._reported()]
 
     def _reported(self) -> list[Any]:

@@ -85,7 +85,7 @@ class Run:
         return self.sim.sample(self.tick, self.tick * self.config.period_ns)
 
     def sensed(self, kind: type[MessageT]) -> MessageT:
-        """What the one sensor with such messages says at the present tick."""
+        """The message of the only sensor with such messages at the present tick."""
         (message,) = (message for message in self.sample().others.values() if isinstance(message, kind))
         return message
 

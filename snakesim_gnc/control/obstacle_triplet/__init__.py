@@ -3,7 +3,7 @@
 `statics`     three contacts and one joint: forces and torques (the paper's equations, and a correction to them)
 `contacts`    where the path passes obstacles, and which of these places the body covers
 `selection`   the choice of three contacts and a joint
-`stall`       detects that the body stands still, and explains why
+`stall`       detects that the body is stationary, and explains why
 `parameters`  the controller's parameters
 `telemetry`   what it reports
 `controller`  combines these; the entry point `obstacle_triplet`

@@ -9,7 +9,7 @@ nothing: positions follow the path at the measured arc length, without a look-ah
 follow it no faster than the mission's speed, which brakes a body that is too fast.
 
 Between push-points the propulsion joint swings freely until its contacts carry load. It is damped, the force is reduced
-as it swings out, and a joint that has left its reference too far returns to position mode. A body that stands still
+as it swings out, and a joint that has left its reference too far returns to position mode. A body that is stationary
 while it pushes is reported with the cause; where that strains joint or contacts, the triplet is released for a while
 and others are tried.
 
@@ -97,7 +97,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             stall_m=parameters.stall_m, stall_s=parameters.stall_s, propulsion_n=parameters.propulsion_n
         )
         self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
-        self._banned: dict[Names, float] = {}  # triplet -> arc length at which it stood still
+        self._banned: dict[Names, float] = {}  # triplet -> arc length at which it was stationary
         self._barred: tuple[int, float] | None = None  # joint among those that bend, time until which
         self._position_until_s = 0.0
 

@@ -248,7 +248,7 @@ class Triplets:
         return Choice(triplet, places_m, joint, torque_per_n)
 
     def _solve(self, threes: Sequence[Three]) -> list[Triplet]:
-        """Return the triplets of these contacts. Solves those that are new, and forgets those that are gone."""
+        """Return the triplets of these contacts. Solves those that are new, and discards those that are gone."""
         solved: dict[Names, Triplet] = {}
         for three in threes:
             known = self._solved.get(_get_names(three))

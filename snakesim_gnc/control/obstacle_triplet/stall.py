@@ -1,4 +1,4 @@
-"""Detects that the body stands still although it pushes, and explains why."""
+"""Detects that the body is stationary although it pushes, and explains why."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ TIME_TOLERANCE_S = 1e-9  # rounding of sums of ticks
 
 @dataclass(frozen=True)
 class Stall:
-    """Why the body stands still."""
+    """Why the body is stationary."""
 
     jammed: bool  # obstacles hold the body back, by its measured contact forces
     release_triplet: bool  # another triplet may do better
@@ -35,7 +35,7 @@ class StallWatch:
         self._force_sum_n = 0.0
 
     def stands(self, time_s: float, tail_s_m: float, force_n: float) -> bool:
-        """Return whether the body has stood still through a whole window while pushing; call it in each such tick."""
+        """Return whether the body was stationary through a whole window while pushing; call it in each such tick."""
         recent = self._recent
         recent.append((time_s, tail_s_m, force_n))
         self._force_sum_n += force_n

@@ -9,7 +9,7 @@ By hand, or with one joint at a time:
 
 Joint check, from a run in which each joint moved by its motor:
 
-`check`        prints whether each joint is as its file says, and writes that it was checked
+`check`        prints whether each joint matches its file, and records the check in that file
 `measured`     collects the measurements of that run
 `judge`        judges which properties of each joint are confirmed, wrong or unknown; pure
 `link_shares`  how far links turned with a joint, and whose module is in whose place; pure

@@ -168,7 +168,7 @@ COMMANDS: Commands = (
     ),
     Command(
         name="robot calibrate gear",
-        help="Find whether gears are as the file says, while you turn joints by hand by a known angle.",
+        help="Find whether gear ratios match the robot file, while you turn joints by hand by a known angle.",
         add=_add_gear,
         run=_gear,
         examples=("robot calibrate gear snake.toml", "robot calibrate gear snake.toml joint_3 --degrees 90"),

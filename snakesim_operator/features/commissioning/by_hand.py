@@ -34,7 +34,7 @@ MAX_SILENCE_S = 1.0  # without joint angles
 HOST_TIMEOUT_S = 3.0  # for configuration and status of a running host
 REDRAW_PERIOD_S = 0.2
 DIRECTIONS = {"yaw": "to the left", "pitch": "downwards"}  # of what is ahead of the joint, seen towards the head
-NO_ANSWER = f"the robot's host has not said within {HOST_TIMEOUT_S:g} s how it is set up; see `snakesim status`"
+NO_ANSWER = f"the robot's host did not publish its configuration within {HOST_TIMEOUT_S:g} s; see `snakesim status`"
 
 
 def running_joints(session: Session, path: Path) -> Sequence[Joint]:
@@ -51,8 +51,8 @@ def running_joints(session: Session, path: Path) -> Sequence[Joint]:
     joints = joints_on_drives(path, running)
     if [_identity(joint) for joint in running] != [_identity(joint) for joint in joints]:
         raise ConfigError(
-            f"{path}: its joints are not those that the host was started with, so what is measured would be "
-            f"reckoned wrongly; restart the host with this file",
+            f"{path}: its joints are not those that the host was started with, so measured angles would be "
+            f"computed wrongly; restart the host with this file",
             code="commissioning/not-possible",
         )
     return joints
@@ -142,7 +142,7 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
     """Write the present pose as the straight pose into a robot file. Return 0. Raises SnakesimError."""
     with _connect(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
-            print_line("Lay the robot straight on a flat floor, let go of it, then press Enter.")
+            print_line("Lay the robot straight on a flat floor, take your hands off it, then press Enter.")
             list(robot.read_angles_rad(_line_was_typed))
         start_s = time.monotonic()
         samples = list(robot.read_angles_rad(lambda: time.monotonic() - start_s > ZERO_SAMPLING_S))
@@ -150,7 +150,7 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
             zeros_rad = find_zeros(robot.joints, np.array(samples))
         except NotStillError as error:
             raise RefusedError(
-                f"{error} within {ZERO_SAMPLING_S:g} s; let go of the robot, and try again",
+                f"{error} within {ZERO_SAMPLING_S:g} s; take your hands off the robot, and try again",
                 code="commissioning/not-possible",
             ) from None
     values: dict[str, dict[str, Any]] = {}
@@ -184,7 +184,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
             if turn is None:
                 unknown.append(joint.name)
             elif turn.by_rad > 0:
-                print_line(f"  {turn.by_rad:+.2f} rad: as the file says")
+                print_line(f"  {turn.by_rad:+.2f} rad: matches the file")
             else:
                 print_line(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
                 values[joint.name] = {"sign": -joint.drive.sign}
@@ -202,7 +202,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
         degrees: the angle.
 
     Returns:
-        0; 1 if a gear is not as the file says, or is unknown.
+        0; 1 if a gear does not match the file, or is unknown.
     """
     unknown: list[str] = []
     wrong: list[str] = []
@@ -216,10 +216,10 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
             ratio = abs(turn.by_rad) / math.radians(degrees)
             measured = f"  {math.degrees(abs(turn.by_rad)):.0f} of {degrees:g} degrees"
             if abs(ratio - 1) < MAX_RATIO_ERROR:
-                print_line(f"{measured}: as the file says")
+                print_line(f"{measured}: matches the file")
             else:
                 gear_ratio = joint.drive.gear * ratio
-                print_line(f"{measured}: gear = {gear_ratio:.3g} or so; write what its data sheet says into the file")
+                print_line(f"{measured}: gear = {gear_ratio:.3g} or so; write that of its data sheet into the file")
                 wrong.append(joint.name)
     if wrong:
         print_line(f"wrong: {', '.join(wrong)}; correct the gear in {path}, and restart the host with it")

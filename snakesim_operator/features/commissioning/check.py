@@ -106,7 +106,7 @@ def _count_line(rows: Sequence[JointVerdict]) -> str:
     wrong = sum(bool(row.properties("wrong")) for row in rows)
     unknown = len(rows) - right - wrong
     by_hand = sum(any(finding.by_hand for finding in row.findings.values()) for row in rows)
-    counts = [f"{right} of {len(rows)} joints are as the robot file says"]
+    counts = [f"{right} of {len(rows)} joints match the robot file"]
     if wrong:
         counts.append(f"{wrong} wrong")
     if unknown:
@@ -143,12 +143,12 @@ def _write_result(path: Path, record: RunRecord, rows: Sequence[JointVerdict], r
     must_be_own(path)
     if robot.emulated:
         raise ConfigError(
-            f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written",
+            f"{record.folder}: its drives were emulated, so the check is not valid for a real robot; not written",
             code="commissioning/not-possible",
         )
     if mounting_digest(joints_on_drives(path, joints)) != mounting_digest(joints):
         raise ConfigError(
-            f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again",
+            f"{path}: the mounting of the joints differs from that in {record.folder}; check the robot again",
             code="commissioning/not-possible",
         )
     unconfirmed = [row.joint for row in rows if not row.all_confirmed]

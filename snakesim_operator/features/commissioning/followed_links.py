@@ -34,7 +34,7 @@ class Unfollowed:
         """What it means, and what to do."""
         again = "run `snakesim run joint_check`, correct it, and identify again"
         if self.cause == "ratio":
-            return f"its link turns {self.ratio:+.2f} times as far as its encoder says: {again}"
+            return f"its link turns {self.ratio:+.2f} times as far as its encoder measures: {again}"
         clamp = ""
         if self.joint == 0:
             clamp = ", or a clamp that lets the tail link move"

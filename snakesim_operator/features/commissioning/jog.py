@@ -122,7 +122,7 @@ def jog(path: Path, selection: RobotSelection, request: JogRequest) -> int:
         status = session.latest(keys.STATUS, Status, CONNECT_S)
         if robot is None or status is None:
             raise RefusedError(
-                "the robot's host has not said what it is; see `snakesim status`", code="network/no-answer"
+                "the robot's host did not publish its description; see `snakesim status`", code="network/no-answer"
             )
         if status.lifecycle != "disarmed":
             raise RefusedError(

@@ -1,4 +1,4 @@
-"""Judges each joint of a joint check: whether it is mounted as the robot file says. Pure.
+"""Judges each joint of a joint check: whether its mounting matches the robot file. Pure.
 
 Five properties of a joint are judged, each from its own evidence, and each is confirmed, wrong or unknown:
 
@@ -6,7 +6,7 @@ Five properties of a joint are judged, each from its own evidence, and each is c
     order   the links on both sides of it turn, and not those of a joint whose module may be exchanged with its own
     sign    they turn in the direction in which its encoder counts
     gear    they turn as far as its encoder counts, and lose nothing when the load reverses
-    zero    its angle is what gravity says, or 0 on a robot that was laid straight
+    zero    its angle agrees with gravity, or is 0 on a robot that was laid straight
 
 A property without evidence is unknown, with a sentence on how it could be confirmed. It never counts as confirmed.
 """
@@ -31,7 +31,7 @@ from snakesim_operator.features.commissioning.lost_motion import LostMotion, fin
 from snakesim_operator.features.commissioning.measured import CheckMeasurements, Select
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
-AS_IN_FILE = "as the robot file says"
+AS_IN_FILE = "matches the robot file"
 MIN_MOVED_RAD = 0.012  # a fifth of the default motion to one side
 MIN_FOLLOWED_FRACTION = 0.3  # of its target's range and time; other joints move one without current at times
 MAX_RATIO_ERROR = 0.12  # between the fraction of the motion that the links made and the expected one
@@ -44,7 +44,7 @@ State = Literal["confirmed", "wrong", "unknown"]
 
 @dataclass(frozen=True)
 class PropertyFinding:
-    """Whether one property of a joint is as the robot file says."""
+    """Whether one property of a joint matches the robot file."""
 
     state: State
     reason: str = ""  # what is wrong and what to write, or why it is unknown and how it could be confirmed
@@ -83,7 +83,7 @@ class JointVerdict:
 
     @property
     def summary(self) -> str:
-        """What is wrong; otherwise what is unknown; otherwise that it is as the file says."""
+        """What is wrong; otherwise what is unknown; otherwise that it matches the file."""
         wrong = self.properties("wrong")
         if wrong:
             return "; ".join(self.findings[name].reason for name in wrong)
@@ -262,7 +262,7 @@ def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_ba
         or_backlash = ""
         if lost is None:
             or_backlash = ", or backlash, as it moved to one side only or its gyros are noisy"
-        reasons.append(f"turns {ratio:.2f} as far as its drive says: gear = {drive.gear / ratio:.3g}{or_backlash}")
+        reasons.append(f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}{or_backlash}")
     if reasons:
         return PropertyFinding("wrong", "; ".join(reasons))
     return CONFIRMED

@@ -5,8 +5,8 @@ measurements of the same motion with another noise, instead of with the regresso
 
     Z' X beta = Z' y                                                   Source: Durbin (1954)
 
-Residuals of neighboring ticks are correlated, so their scatter says too little. The covariance of beta comes from how
-beta changes when one of the n blocks of the record after the other is left out:
+Residuals of neighboring ticks are correlated, so their scatter is too small a measure. The covariance of beta comes
+from how beta changes when one of the n blocks of the record after the other is left out:
 
     cov(beta) = (n - 1) / n * sum over blocks of (beta_without - beta) (beta_without - beta)'      Source: Tukey (1958)
 """

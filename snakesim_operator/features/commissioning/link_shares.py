@@ -1,7 +1,7 @@
 """Measures how far each link turned while one joint moved, as a fraction of what that joint's encoder measured. Pure.
 
 The difference of the fractions of the links on both sides of joint k is the motion that the links made at joint k. On a
-robot that is as its file says, it is 1 at the joint that moves. At other joints it is only what the encoder there
+robot that matches its file, it is 1 at the joint that moves. At other joints it is only what the encoder there
 measured, too, because held joints give way a little. Two modules whose ids are swapped break this pattern, and
 exchanging them restores it.
 """

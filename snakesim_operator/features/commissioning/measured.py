@@ -31,7 +31,7 @@ class CheckMeasurements:
     period_s: float
     names: Sequence[str]
     axes: Sequence[str]  # "yaw" or "pitch"
-    drives: Sequence[Drive]  # as the robot file says
+    drives: Sequence[Drive]  # from the robot file
     angle_rad: Floats  # (n, joints)
     velocity_rad_s: Floats  # (n, joints)
     torque_nm: Floats  # (n, joints)

@@ -19,7 +19,7 @@ from snakesim_operator.features.commissioning.smoothing import filter_columns
 from snakesim_operator.features.commissioning.torque_balance import JointRecord, block_numbers
 
 SPECTRUM_S = 4.0  # length of the pieces whose spectra are averaged
-MIN_EXCITATION = 1e-4  # of the strongest power; a target with less power tells nothing at that frequency
+MIN_EXCITATION = 1e-4  # of the strongest power; with less power, a frequency is not evaluated
 DRIVE_LOOP_S = 0.001  # period of a drive's own control loop
 STEPS_PER_TICK = 10  # of the servo model
 ENCODER_SMOOTHING_S = 0.2  # time scale beyond which angles come from the encoder, below it from the velocities

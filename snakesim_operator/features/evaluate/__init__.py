@@ -7,5 +7,5 @@
 `card`       the score card, and how it pairs with others
 `optimize`   searches settings with Optuna
 
-Imports `run` and `results`. Nobody else imports Dask, Optuna or Arrow.
+Imports `run` and `results`. No other package imports Dask, Optuna or Arrow.
 """

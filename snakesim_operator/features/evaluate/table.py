@@ -239,7 +239,7 @@ def _describe_end(outcome: CaseOutcome) -> str:
     if reason:
         parts.append(f"{state}: {reason}")
     else:
-        parts.append(str(state or "controller said nothing"))
+        parts.append(str(state or "controller reported nothing"))
     if numbers.get("ended") != "complete":
         parts.append(str(numbers.get("ended")))
     if numbers.get(GAVE_UP):

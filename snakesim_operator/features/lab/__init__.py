@@ -1,4 +1,4 @@
-"""A lab: one file says which machines, robots, routers and roles there are, and everything else is made from it.
+"""A lab: one file lists the machines, robots, routers and roles, and everything else is made from it.
 
 `lab_file` and `lab_robot` read it; `drive_buses` knows what each drive type needs; `identities` names who has a
 certificate; `certificates` makes those; `access` and `zenoh_files` write what Zenoh reads; `units` what systemd and

@@ -61,7 +61,7 @@ def _certs(arguments: argparse.Namespace) -> int:
     width = max(len(identity.common_name) for identity in identities(lab))
     for identity, state, until in done:
         print_line(f"{identity.common_name:<{width}}  {state:<7}  ends {until:%Y-%m-%d %H:%M} UTC")
-    print_line(f"{authority}: keep this folder where nobody else reads it; it goes to no machine")
+    print_line(f"{authority}: keep this folder where no other user can read it; copy it to no machine")
     return 0
 
 
@@ -115,7 +115,7 @@ COMMANDS: Commands = (
         help="Check a lab as it runs: certificates, routers, processes, clocks, and what each role may do.",
         add=_add_check,
         run=_check,
-        details="Exit code: 0 all is as the lab file says, 1 something is not, 2 wrong input. It moves nothing.",
+        details="Exit code: 0 all matches the lab file, 1 something does not, 2 wrong input. It moves nothing.",
         examples=("lab check lab.toml --out lab", "lab check lab.toml --out lab --json"),
     ),
 )

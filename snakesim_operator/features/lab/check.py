@@ -1,4 +1,4 @@
-"""Checks for `snakesim lab check` that a running lab is as its lab file says.
+"""Checks for `snakesim lab check` that a running lab matches its lab file.
 
 The check connects as each identity in turn, with the certificates in the output folder, and moves nothing: it
 subscribes, looks for liveliness tokens, and sends empty queries, which a host refuses.
@@ -77,7 +77,7 @@ def check(lab: Lab, folder: Path, say: PrintLine = print_line, *, as_json: bool 
         as_json: Whether to print one JSON object at the end instead of lines.
 
     Returns:
-        The exit code: 0 when all is as the lab file says, 1 otherwise.
+        The exit code: 0 if all matches the lab file, 1 otherwise.
     """
     if as_json:
         found = Findings(discard_line)
@@ -292,7 +292,7 @@ def _check_process(process: Process, host: Process | None, clock_offsets_s: dict
 
 
 def _check_role(identity: Identity, role: Role, lab: Lab, folder: Path, found: Findings) -> None:
-    """Check that an identity can connect, and that the routers answer it as the table of roles says."""
+    """Check that an identity can connect, and that the routers answer it according to the table of roles."""
     try:
         with open_probe(json.dumps(_probe_settings(identity, lab, folder))) as probe:
             round_trip_ms = 1e3 * probe.round_trip_s()

@@ -73,7 +73,7 @@ def _scenario(robot: LabRobot) -> tuple[str, ...]:
     """Return the options for the scenario. Host and services get the same, because they compare them."""
     words = [robot.scenario, "--backend", robot.backend]
     if uses_bus(robot):
-        words += ["--clock-mode", "realtime"]  # the only one of drives on a bus, whatever the scenario says
+        words += ["--clock-mode", "realtime"]  # the only one of drives on a bus, whatever mode the scenario has
     for setting in (*host_settings(robot), *robot.set):
         words += ["--set", setting]
     return tuple(words)

@@ -166,12 +166,12 @@ def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, o
     section = built.limits if number.is_limit else built.motor
     kept = getattr(section, number.key)
     if own:
-        return kept, f"as its <snakesim> element says of {number.section}.{number.key}"
+        return kept, f"from {number.section}.{number.key} of its <snakesim> element"
     if not number.is_limit:
-        return 0.0, "as URDF says of what is absent"
+        return 0.0, "the URDF default for a missing value"
     if known:
         return min(known), "the smallest of the other joints; is there a motor in this joint?"
-    return kept, "as of the robot given by --like, because no joint says one"
+    return kept, "from the robot given by --like, because no joint has a value"
 
 
 def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exception:

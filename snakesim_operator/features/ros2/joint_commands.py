@@ -22,7 +22,7 @@ MAX_NAME_SHOWN = 40  # characters of an unknown joint name in a message to the u
 
 
 class _RefusedMessageError(Exception):
-    """A message cannot be followed; its text says why."""
+    """A message cannot be followed; its text is the reason."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class RosJointTargets:
             age_ns: How long ago the message was sent, for a message without a timestamp.
 
         Returns:
-            Whether the message was accepted. If not, `reason` says why.
+            Whether the message was accepted. If not, `reason` explains it.
         """
         if ros_now_ns is None:
             ros_now_ns = now_ns

@@ -13,7 +13,7 @@ from rosbags.typesys import get_types_from_msg
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import STORE, make_message
 
-# ROS turns char into uint8 before it hashes a definition, and rosbags does not. So the definition says uint8.
+# ROS turns char into uint8 before it hashes a definition, and rosbags does not. So the definition uses uint8.
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _EVENT_INFO_FIELDS = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
 STORE.fielddefs[_EVENT_INFO] = get_types_from_msg(_EVENT_INFO_FIELDS, _EVENT_INFO)[_EVENT_INFO]

@@ -1,7 +1,7 @@
 """Makes the URDF of a robot from its description on the network: links as capsules, joints with axes and limits.
 
 RViz draws the robot from it, and planners read it. The robot file, which knows meshes, sensors, inertia and friction,
-may be on another computer; a comment in the document says what is missing.
+may be on another computer; a comment in the document lists what is missing.
 """
 
 import math

@@ -80,7 +80,7 @@ class Advance:
 
     @property
     def percent(self) -> float | None:
-        """B - A in per cent of A. Two runs that stood still are equal; None if only A stood still."""
+        """B - A in percent of A. It is 0 if neither run moved, and None if only B moved."""
         if abs(self.a_m) < STOOD_M:
             both_stood = abs(self.difference_m) < STOOD_M
             return 0.0 if both_stood else None

@@ -71,7 +71,7 @@ def drives_in_words(a: RunRecord, b: RunRecord) -> str:
     if silent:
         other = "B" if silent[0] == "A" else "A"
         return (
-            f"drives: {silent[0]} tells no serial numbers and no firmware versions, {other} those of "
+            f"drives: {silent[0]} reports no serial numbers and no firmware versions, {other} those of "
             f"{known_count[other]} of {total} joints"
         )
     serials = sum(both["a"]["serial"] != both["b"]["serial"] for both in differing)

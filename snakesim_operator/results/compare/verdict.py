@@ -23,7 +23,7 @@ def within(difference: Difference, percent: float) -> ToleranceCheck | None:
         return None
     actual_percent = advance.percent
     if actual_percent is None:
-        words = f"A stood still and B moved {advance.b_m:.3f} m, which is more than any percentage"
+        words = f"A did not move and B moved {advance.b_m:.3f} m, which is more than any percentage"
         return ToleranceCheck(percent, False, f"not within {percent:g} %: {words}")
     holds = abs(actual_percent) <= percent
     result = "within" if holds else "not within"
@@ -87,16 +87,16 @@ def how_far(advance: Advance) -> str:
     """Return both distances, and B's relative to A's."""
     moved = f"A moved {advance.a_m:.3f} m, B {advance.b_m:.3f} m"
     if advance.percent is None:
-        return f"{moved}; A stood still"
+        return f"{moved}; A did not move"
     if max(abs(advance.a_m), abs(advance.b_m)) < STOOD_M:
-        return f"{moved}; both stood still"
+        return f"{moved}; neither moved"
     return f"{moved}: {relation(advance)}"
 
 
 def relation(advance: Advance) -> str:
     """Return B's distance relative to A's, such as `B 1.6 % less`."""
     if advance.percent is None:
-        return "A stood still"
+        return "A did not move"
     size = f"{abs(advance.percent):.1f}"
     if size == "0.0":
         return SAME

@@ -1,4 +1,4 @@
-"""How far a run advanced towards its mission's goal, what that cost, and for how long the body stood still."""
+"""How far a run advanced towards its mission's goal, what that cost, and for how long the body was stationary."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -117,7 +117,7 @@ class Advance:
 
     @property
     def stalled_s(self) -> float:
-        """The time in which the body stood still, until the goal was reached or the end."""
+        """The time in which the body was stationary, until the goal was reached or the end."""
         window = max(round(WINDOW_S / SAMPLE_S), 1)
         if len(self.time_s) <= window:
             return 0.0

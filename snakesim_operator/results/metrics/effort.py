@@ -22,7 +22,7 @@ class Effort:
     body_lengths_s: float | None = None
     cost_of_transport: float | None = None  # energy over weight times advance
     propulsive_efficiency: float | None = None  # friction of the whole weight over the advance, over energy
-    jam_ratio: float | None = None  # fraction of the time in which the body stood still
+    jam_ratio: float | None = None  # fraction of the time in which the body was stationary
     impulse_n_s_per_m: float | None = None  # of all contacts, over the advance
     torque_headroom: float | None = None  # fraction of its limit that every joint had left, in 95 % of the ticks
     form_closure: float | None = None  # fraction of the time in which obstacles would have held a stiff body

@@ -22,7 +22,7 @@ class Estimates:
 
     @staticmethod
     def of(record: RunRecord) -> "Estimates":
-        """Return the estimates of a run. Distances are known only where the pose was dead reckoned."""
+        """Return the estimates of a run. Distances are known only where the pose was estimated by dead reckoning."""
         if not record.worlds or len(record.time_s) == 0:
             return Estimates()
         last = record.worlds[-1]
@@ -41,7 +41,7 @@ class Estimates:
         """Return a phrase for each estimate."""
         phrases: list[str] = []
         if self.pose_from == "dead_reckoning":
-            phrase = "the pose is reckoned"
+            phrase = "the pose is estimated by dead reckoning"
             if self.reckoned_distance_m is not None:
                 phrase += f", {self.reckoned_distance_m:.3f} m far"
             if self.reckoned_off_m is not None:

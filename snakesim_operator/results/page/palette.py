@@ -1,4 +1,4 @@
-"""Colours, light and dark, told apart by people with any kind of color vision (after Okabe and Ito).
+"""Colors, light and dark, which people with any kind of color vision can distinguish (after Okabe and Ito).
 
 A joint has one color of its own, the same in every figure of every report.
 """

@@ -1,4 +1,4 @@
-"""The page: verdict, playback, advance, instants, joints, loads, numbers. A section with nothing to show says why."""
+"""The page: verdict, playback, advance, instants, joints, loads, numbers. An empty section gives the reason."""
 
 from pathlib import Path
 from typing import Any, get_type_hints

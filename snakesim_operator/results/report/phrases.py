@@ -114,4 +114,4 @@ def describe_last_control_state(record: RunRecord, at_s: float) -> str:
     states = [state for state in record.control if reported_at_s(record, state) <= at_s]
     if not states or states[-1].state != "NotLocomoting":
         return ""
-    return f" Control said: {as_sentence(states[-1].reason)}"
+    return f" Control reported: {as_sentence(states[-1].reason)}"

@@ -1,4 +1,4 @@
-"""The whole run as a film: a map that stands still, and for each of some hundred instants the snake and its forces.
+"""The whole run as a film: a fixed map, and for each of some hundred instants the snake and its forces.
 
 `playback.js` moves what `body` has drawn. All coordinates are those of the drawing.
 """

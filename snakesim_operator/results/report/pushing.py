@@ -24,7 +24,10 @@ MAX_MAPS_SCORED = 60
 
 @dataclass(frozen=True)
 class StandingSpan:
-    """A span in which the body stood still. why: the reason that control reported for longest, or what was measured."""
+    """A span in which the body was stationary.
+
+    why: the reason that control reported for longest, or what was measured.
+    """
 
     start_s: float
     end_s: float
@@ -177,7 +180,7 @@ def _merge_adjacent(spans: list[ForceSpan]) -> list[ForceSpan]:
 
 
 def _find_stops(record: RunRecord) -> list[StandingSpan]:
-    """Return the spans in which the body stood still, as measured; without a pose, as control reported it."""
+    """Return the spans in which the body was stationary, as measured; without a pose, as control reported it."""
     motion = measure_motion(record)
     if motion is None:
         standing = [band for band in state_bands(record) if band.what == "NotLocomoting"]

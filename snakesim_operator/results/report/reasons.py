@@ -1,4 +1,4 @@
-"""Why a tile of the report is red, as far as the record tells. Where it does not, that is said."""
+"""Why a tile of the report is red, as far as the record shows it; otherwise UNKNOWN."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import SATURATED_FROM, RunSummary
 
-UNKNOWN = "the record does not tell why"
+UNKNOWN = "the record does not show why"
 NEAR_M = 0.1  # from the push-point to the outline of a true obstacle
 TOUCHING_M = 0.0005  # a smaller gap is a touch: the body's outline is that of its angles, which are measured
 

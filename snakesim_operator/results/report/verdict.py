@@ -28,7 +28,7 @@ from snakesim_operator.results.summary import RunSummary, distance_m, estimates_
 from snakesim_operator.results.time_axis import end_s, reported_at_s
 
 MIN_STOP_S = 0.5  # a shorter stop at the end is not mentioned
-MAX_STANDING_FRACTION = 0.5  # a run that stood still for more of its time, up to its end, is a poor one
+MAX_STANDING_FRACTION = 0.5  # a run that was stationary for more of its time, up to its end, is a poor one
 MOVED_RAD = 1e-3  # a joint whose target changed by less, as by rounding, was not moved
 JUDGING_COMMANDS = {  # controller that does not locomote -> command that judges its run
     CHECK: "snakesim robot check",

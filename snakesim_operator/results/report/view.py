@@ -26,7 +26,7 @@ class View:
     """One scale for length and one for force, shared by all instants of a report."""
 
     low_w: Floats  # (2,), m: the corner that is drawn at left and bottom, in the turned frame
-    scale: float  # units per metre
+    scale: float  # units per meter
     force_scale: float  # units per newton
     width: float
     height: float

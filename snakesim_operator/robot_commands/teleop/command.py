@@ -274,7 +274,7 @@ class Teleop:
     def _describe_control(self) -> str:
         control = self._control
         if control is None:
-            return "control: nothing heard"
+            return "control: nothing received"
         return f"control: {control.state}{_describe_age(self._control_s)}: {control.reason}"
 
     def _describe_request(self) -> str:
@@ -306,7 +306,7 @@ class Teleop:
 def _describe_age(arrival_s: float) -> str:
     """Return the age of a message, if it is old; otherwise an empty text."""
     age_s = time.monotonic() - arrival_s
-    return f" (heard {age_s:.0f} s ago)" if age_s > SILENT_S else ""
+    return f" (received {age_s:.0f} s ago)" if age_s > SILENT_S else ""
 
 
 def _degrees(angle_rad: float) -> str:

@@ -57,7 +57,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
                 assert line(process).startswith(f"joint_{joint + 1}: turn what is ahead of it to the left")
                 pose_rad[joint] += 0.3
                 hold(home, pose_rad)
-                assert ("the other way round" if SIGN[joint] < 0 else "as the file says") in line(process)
+                assert ("the other way round" if SIGN[joint] < 0 else "matches the file") in line(process)
             assert "1 joints changed" in line(process) and process.wait(20) == 0
         stale = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
         assert stale.code == 2 and "restart the host with this file" in stale.err
@@ -73,7 +73,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
         with told(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
             assert line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
             hold(home, [1.2, 0.4, np.pi / 4, 0.0])
-            assert "45 of 45 degrees: as the file says" in line(process) and process.wait(20) == 0
+            assert "45 of 45 degrees: matches the file" in line(process) and process.wait(20) == 0
         hold(home, [0.0] * JOINTS)
         seen(home, endpoint, ZERO_RAD[0])
         assert snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0

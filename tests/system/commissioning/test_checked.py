@@ -26,13 +26,13 @@ def moves(home: Path, out: str, *words: str) -> bool:
 @pytest.mark.slow
 def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) -> None:
     refused = run(home, "never", "--duration", "0.1")
-    assert refused.code == 1 and "nobody has checked that its joints are as its file says" in refused.out
+    assert refused.code == 1 and "its joints have not been checked against its file" in refused.out
     assert moves(home, "word", "--unchecked")
 
     checking = run(home, "check", "--controller", "joint_check", "--duration", "4")
     assert checking.code == 0, checking.out
     judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
-    assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints are as the robot file says" in judged.out, judged.out
+    assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in judged.out, judged.out
     text = (home / "snake.toml").read_text()
     assert "[checked]" in text and 'serials = ["A1", "B2", "C3"]' in text
     assert moves(home, "checked") and moves(home, "slower", "--set", "robot.limits.speed_rad_s=1.0")
@@ -45,4 +45,4 @@ def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) 
     changed = run(home, "changed", "--duration", "0.1")
     assert changed.code == 1 and "how its joints are mounted was changed in its file since" in changed.out
     again = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
-    assert again.code == 2 and "says otherwise how the joints are mounted" in again.err
+    assert again.code == 2 and "the mounting of the joints differs" in again.err

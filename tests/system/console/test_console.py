@@ -164,7 +164,7 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         first.click("Reset fault")
         first.wait_for("DISARMED")
         first.send("Page.navigate", url="about:blank")  # and control is free again
-        second.wait_for("nobody has control")
+        second.wait_for("no viewer has control")
         assert not first.errors and not second.errors, first.errors + second.errors
         run.process.terminate()
         run.end()

@@ -51,7 +51,7 @@ async def arm_unchecked(address: str) -> None:
         await viewer.click("Arm it unchecked")  # nothing has been asked and refused yet
         await viewer.choose("Robot", "Arm")
         await until(lambda: viewer.visible("Arm it unchecked"), "the word")
-        assert viewer.shows("nobody has checked that its joints are as its file says") and viewer.shows(">DISARMED<")
+        assert viewer.shows("its joints have not been checked against its file") and viewer.shows(">DISARMED<")
         await viewer.click("Arm it unchecked")
         await until(lambda: viewer.shows(", unchecked, commanded by control"), "a robot armed by the word")
         await until(lambda: not viewer.visible("Arm it unchecked"), "the end of the offer")
@@ -78,7 +78,8 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         viewer = Viewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
-        await until(lambda: viewer.shows("not checked: nobody has checked") and viewer.shows("id 2"), "the table")
+        await until(lambda: viewer.shows("not checked: its joints have not been checked"), "the table")
+        await until(lambda: viewer.shows("id 2"), "the table")
         await viewer.click("Start step")  # of somebody who has no control
         await viewer.click("Take control")
         await until(lambda: viewer.has("Release control"), "control")

@@ -53,7 +53,7 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
             await driving  # the page is closed while its key is held
             stopped = await until(lambda: paths.newest(lambda path: path.speed_m_s == 0), "a robot told to stand")
             assert "viewer 2" in stopped.reason
-            await until(lambda: other.shows("nobody has control"), "the return of control")
+            await until(lambda: other.shows("no viewer has control"), "the return of control")
             await other.trigger("Emergency stop")
             await until(lambda: status.newest(lambda one: one.lifecycle == "estop"), "the stop")
             await until(lambda: other.shows(">ESTOP<"), "the stop on the page")

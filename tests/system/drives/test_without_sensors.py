@@ -30,7 +30,7 @@ def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is
     assert (said["blind"]["pose_from"], said["blind"]["contacts_from"]) == ("dead_reckoning", "joint_torques")
     assert said["blind"]["peak_contact_force_n"] is None, "nobody has measured a force"
     for text in (ended["blind"].out, (tmp_path / "blind" / REPORT).read_text()):
-        assert "pose is reckoned" in text and "contacts are estimated from joint torques" in text
+        assert "pose is estimated by dead reckoning" in text and "contacts are estimated from joint torques" in text
     worlds = RunRecord.load(tmp_path / "blind").worlds
     assert all(world.pose_timestamp_ns is None and world.base_position_sd_m is not None for world in worlds)
     felt = [contact for world in worlds for contact in world.contacts]

@@ -112,7 +112,7 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, 
     if controller == "Endless":
         assert "The run ended early: interrupted." in said and (tmp_path / "run" / REPORT).is_file()
     else:
-        assert "had not returned 3 s after it was told to stop; its process was killed" in said
+        assert "had not returned 3 s after it received the signal to stop; its process was killed" in said
 
 
 def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

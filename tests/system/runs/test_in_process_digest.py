@@ -29,7 +29,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
     assert ours.summary.path_distance_m == summary.path_distance_m
     for name in ("angle_rad", "torque_nm", "target", "position_w", "contact_peak_n"):
         assert np.array_equal(getattr(ours.record, name), getattr(theirs, name), equal_nan=True), name
-    # Not every tick's: on a busy computer a network drops some, and control says that time stands.
+    # Not every tick's: on a busy computer a network drops some, and control reports that time is paused.
     for name in ("control", "worlds"):
         mine, other = ({said.tick: said for said in getattr(record, name)} for record in (ours.record, theirs))
         shared = [t for t in mine.keys() & other.keys() if t and not _stands(other[t])]
@@ -38,7 +38,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
 
 
 def _stands(said: ControlState | World) -> bool:
-    return isinstance(said, ControlState) and said.reason.startswith("time stands")
+    return isinstance(said, ControlState) and said.reason.startswith("robot time is paused")
 
 
 def test_processes_and_one_process_drive_the_motors_alike(tmp_path: Path) -> None:

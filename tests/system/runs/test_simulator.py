@@ -66,7 +66,7 @@ def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_
     recorded = RunRecord.load(out / "recording.mcap").host
     assert recorded.command_digest == plain.command_digest and recorded.ticks == 100
     told = snakesim("recording", "info", str(out), cwd=tmp_path)
-    assert told.code == 0 and "lacks" not in told.out, told.said
+    assert told.code == 0 and "missing" not in told.out, told.said
     replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)
     same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}  # the last may come too late
     assert replayed.out in same, replayed.out + replayed.err

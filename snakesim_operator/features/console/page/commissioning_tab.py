@@ -28,7 +28,7 @@ MAX_IDLE_JOG_S = 60.0  # a jog leaves the robot armed, so it ends when no button
 NO_VIEWER = -1  # viewer of a step that is being ended already
 STEPS = {
     "direction": "turn joints by hand, as it asks; Enter skips one",
-    "zero": "lay the robot straight, let go of it, then Enter",
+    "zero": "lay the robot straight, take your hands off it, then Enter",
     "limits": "move joints by hand from end to end, then Enter",
     "jog": "ARMS the robot, checked or not, and moves one joint while a button below is held",
 }

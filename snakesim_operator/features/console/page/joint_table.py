@@ -1,4 +1,4 @@
-"""A table of the joints: what the robot file says about each joint, and whether the joints were checked.
+"""A table of the joints: the values of the robot file for each joint, and whether the joints were checked.
 
 Also what each drive reports about itself. Pure; everything that comes from the network is escaped.
 """

@@ -19,7 +19,7 @@ CONTROL_STATE_COLORS = {
     "Idle": "#6b7683",
     "PowerOff": "#59626d",
 }
-# Colors of the bar that tells what moves.
+# Colors of the bar that shows what moves.
 SIMULATED_COLOR = "#0067b0"
 EMULATED_COLOR = "#7a3fa8"
 REAL_COLOR = "#b3261e"
@@ -75,7 +75,7 @@ def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control
 
 
 def _format_backend_bar(robot: Description, recorded: str) -> str:
-    """Return the bar that tells a real robot from an emulated one, and a recording from a live robot."""
+    """Return the bar that distinguishes a real robot from an emulated one, and a recording from a live robot."""
     words, color = describe_backend(robot)
     place = escape_text(robot.robot)
     if robot.hardware:
@@ -92,7 +92,7 @@ def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
     lines: list[str] = []
     status = snapshot.status
     if status is not None and status.paused_by is not None:
-        lines.append(_format_bar("PAUSED", RECORDED_COLOR, f"by {escape_text(status.paused_by)}; robot time stands"))
+        lines.append(_format_bar("PAUSED", RECORDED_COLOR, f"by {escape_text(status.paused_by)}; robot time is paused"))
     if len(snapshot.hosts) > 1:
         lines.append(
             _format_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them.")

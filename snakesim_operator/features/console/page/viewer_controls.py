@@ -358,4 +358,4 @@ class ViewerControls:
 
 def format_viewer(viewer: int | None) -> str:
     """Return the name of a viewer; None is no viewer."""
-    return "nobody" if viewer is None else f"viewer {viewer + 1}"
+    return "no viewer" if viewer is None else f"viewer {viewer + 1}"

@@ -196,7 +196,7 @@ def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[s
         ),
         (
             [replace(GOOD[0], stepped=True), *GOOD[1:]],
-            "joint_1 (node 1 on can_a) is an emulator whose time stands still",
+            "joint_1 (node 1 on can_a) is an emulator whose time is paused",
         ),
     ],
 )

@@ -68,7 +68,7 @@ def test_a_joint_that_was_turned_through_is_known_after_its_drive_has_forgotten_
     bench = Bench(tmp_path)
     assert bench.host(0.1, 1.5, 3.0, 4.0) == []  # by hand; within its limits it comes back
     (refused,) = bench.host(4.0 - TURN, now_s=LATER_S)
-    assert "joint_2: its drive says -2.28 rad, and counted over restarts it is at +4.00 rad" in refused
+    assert "joint_2: its drive reports -2.28 rad, but it is at +4.00 rad by the turns counted over restarts" in refused
     assert "wound by up to 1.48 turns, and `cable_turns` = 0.6. Turn it by hand by 1 turn to lower angles" in refused
     assert bench.host(4.0 - TURN, 2.0 - TURN, -TURN, -2.0 - TURN, now_s=LATER_S) != []  # its drive counts on
     assert bench.host(-2.0, now_s=LATER_S) == []  # and has forgotten that turn, too

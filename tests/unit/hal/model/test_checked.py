@@ -34,7 +34,7 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
     ("checked", "here", "words"),
     [
         (None, robot(emulated=True), ""),
-        (None, robot(), "nobody has checked"),
+        (None, robot(), "have not been checked"),
         (CHECKED, robot(), ""),
         (msgspec.structs.replace(CHECKED, confirmed=["drive", "order", "sign"]), robot(), "of every joint: gear, zero"),
         (CHECKED, robot(hardware="can1"), "it is on can can1 now, can can0 since anna checked it on 2026-11-24"),

@@ -95,7 +95,7 @@ def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_w
     assert rows[0].summary == "its zero is off by +0.150 rad: zero_rad = 0.150"
     assert states(rows[1]) == {"gear": "unknown"} and not rows[1].all_confirmed
     lines = report_lines(rows)
-    assert "0 of 3 joints are as the robot file says; 1 wrong; 2 unknown" in lines[JOINTS]
+    assert "0 of 3 joints match the robot file; 1 wrong; 2 unknown" in lines[JOINTS]
     assert lines[JOINTS + 1].startswith("unknown: gear of every joint: ")
     assert "`snakesim robot calibrate gear`" in lines[JOINTS + 1]
 
@@ -120,7 +120,7 @@ def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
 
 def test_a_gear_of_another_ratio_is_no_backlash() -> None:
     assert verdicts(measurements(gear=1.5)) == [
-        "turns 0.67 as far as its drive says: gear = 1.5",
+        "turns 0.67 as far as its drive measures: gear = 1.5",
         AS_IN_FILE,
         AS_IN_FILE,
     ]

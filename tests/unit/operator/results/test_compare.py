@@ -222,8 +222,8 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
     assert [one.key for one in difference.settings] == [f"description.sensors.{keys.IMU}.rate_hz"]
     lines = table(difference)
     assert "1 setting differs" in lines
-    assert "drives: A tells no serial numbers and no firmware versions, B those of 13 of 13 joints" in lines
-    assert "drives: A tells no serial numbers" in shown(difference)[1]
+    assert "drives: A reports no serial numbers and no firmware versions, B those of 13 of 13 joints" in lines
+    assert "drives: A reports no serial numbers" in shown(difference)[1]
     assert for_scripts(difference)["drives"]["joint_1"]["b"] == {"serial": "AE00", "firmware": "1.0"}
 
 
@@ -280,7 +280,7 @@ def test_nobody_makes_a_percentage_of_standing_still() -> None:
     assert both.advance is not None and both.advance.percent == 0
     assert one.advance is not None and one.advance.percent is None
     asked = within(one, 1000)
-    assert asked is not None and not asked.holds and "A stood still" in asked.words
+    assert asked is not None and not asked.holds and "A did not move" in asked.words
     shown(both)
     shown(one)
 

@@ -85,7 +85,7 @@ def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
     assert "last state            NotLocomoting: standing still: less than 20 mm in 1 s\n" in printed
     assert "control reported      Locomoting: pushing\n" in printed
     assert (
-        "energy per metre      50.4 J/m along its displacement, too little advance along the first heading" in printed
+        "energy per meter      50.4 J/m along its displacement, too little advance along the first heading" in printed
     )
     print_summary(summarise(record, "complete"))
     assert "control reported" not in capsys.readouterr().out

@@ -63,7 +63,7 @@ def test_what_is_red_says_why(record: RunRecord) -> None:
         why["of the push-points carried nothing"],
     )
     assert apart is not None and sum(map(int, apart.groups())) == 100
-    assert "the record does not tell why" in why_empty(dataclasses.replace(late, position_w=late.position_w * np.nan))
+    assert "the record does not show why" in why_empty(dataclasses.replace(late, position_w=late.position_w * np.nan))
 
 
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:

@@ -339,7 +339,7 @@ def test_each_joint_has_its_own_friction_and_one_without_has_none(tmp_path: Path
     assert [joint.motor.friction_nm for joint in found.robot.joint_table] == [0.06, 0.06, 0.0]
     assert [joint.motor.viscous_nm_s_per_rad for joint in found.robot.joint_table] == [0.03, 0.03, 0.0]
     line = _line('name="j3"')
-    said = f"<dynamics friction> has no value: 0 N·m, as URDF says of what is absent: j3 (line {line})"
+    said = f"<dynamics friction> has no value: 0 N·m, the URDF default for a missing value: j3 (line {line})"
     assert said in found.assumed, "the line of the joint, which has no <dynamics>"
 
 
@@ -356,7 +356,7 @@ def test_a_joint_without_a_motor_does_not_get_that_of_its_neighbors(tmp_path: Pa
 def test_an_exporter_that_leaves_all_limits_zero_gets_a_report_of_what_is_assumed(tmp_path: Path) -> None:
     found = _edited(tmp_path, *[(f'effort="{effort}"', 'effort="0"') for effort in ("4.5", "4.6", "4.7")])
     assert {joint.limits.torque_nm for joint in found.robot.joint_table} == {7.0}, "as planar13"
-    said = "<limit effort> has 0: 7 N·m, as of the robot given by --like, because no joint says one"
+    said = "<limit effort> has 0: 7 N·m, from the robot given by --like, because no joint has a value"
     places = [f"j{i + 1} (line {_line(f'4.{5 + i}')})" for i in range(3)]
     assert f"{said}: {', '.join(places)}" in found.assumed
 
