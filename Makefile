@@ -100,6 +100,7 @@ check: $(stamp) ## Lint, format, types, import rules and English, without changi
 	    { echo "check: add $$package to root_packages under [tool.importlinter] in pyproject.toml"; exit 1; }; \
 	done
 	$(bin)/lint-imports
+	$(bin)/python docs/style/check_prose.py
 	$(bin)/zizmor --quiet --offline .github
 
 bench: $(stamp) ## Measure the ratios in benchmarks/

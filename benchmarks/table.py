@@ -3,7 +3,7 @@
 import statistics
 from collections.abc import Sequence
 
-HEADER = "| what | against | ours, µs | theirs, µs | ratio (median) | aim | |\n|---|---|---|---|---|---|---|"
+HEADER = "| what | against | ours, µs | theirs, µs | ratio (median) | aim | result |\n|---|---|---|---|---|---|---|"
 
 
 def format_row(

@@ -1,4 +1,4 @@
-"""A custom sensor model: a sonar that measures the distance to the nearest surface in a cone. See docs/how-to/custom-sensors.md.
+"""A custom sensor model: a sonar that measures the distance to the nearest surface in a cone.
 
 [[sensors.range]]
 name = "sonar"

@@ -168,7 +168,7 @@ def main() -> None:
             print(lines[-1], flush=True)
         slow = [
             "",
-            f"With a camera whose images somebody reads by one router over a link of {RATE_MBIT:g} Mbit/s (`tbf`),",
+            f"With a camera whose images a client reads by one router over a link of {RATE_MBIT:g} Mbit/s (`tbf`),",
             "less than the images need; against quiet. Before the link is one queue, or three by priority.",
             "",
             "| queue | watched p50 / p99, µs | quiet p50 / p99, µs | ratio p50 | ratio p99 | aim | images, Mbit/s |",
@@ -181,7 +181,7 @@ def main() -> None:
 
 
 def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path, state: bytes, command: bytes) -> list[str]:
-    """The loop over a slow link while somebody behind it watches the camera, against quiet: lines of a table."""
+    """The loop over a slow link while a client behind it watches the camera, against quiet: lines of a table."""
     lab.robot.run(*f"tc qdisc add dev robot root handle 1: tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
     rows: list[str] = []
     way = lab.one_router()
@@ -213,7 +213,7 @@ def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path, state: bytes
 
 
 def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]:
-    """The loop while somebody reads the images, and how much of them comes through, in Mbit/s."""
+    """The loop while a client reads the images, and how much of them comes through, in Mbit/s."""
     seen = folder / "seen.json"
     with ExitStack() as stack:
         reading = ("--key", IMAGES, "--out", str(seen))
@@ -225,7 +225,7 @@ def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]
 
 
 def beside_images(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
-    """Raw Zenoh while somebody reads the images of a robot that runs on the same way."""
+    """Raw Zenoh while a client reads the images of a robot that runs on the same way."""
     with ThreadPoolExecutor(1) as other:
         images = other.submit(watched, way, seconds + 2 * IMAGES_FIRST_S, folder)
         time.sleep(IMAGES_FIRST_S)

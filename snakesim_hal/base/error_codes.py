@@ -80,7 +80,7 @@ ERROR_CODES = {
     "file/not-writable": ErrorCode(
         "A file or folder cannot be written.",
         "The disk is full or read-only, permissions are missing, or a folder in the path is a file.",
-        "Make room, or choose another place.",
+        "Free some space, or choose another place.",
     ),
     "file/already-exists": ErrorCode(
         "The output exists already, and is never overwritten.",

@@ -1,4 +1,4 @@
-"""Emulated drives of any type in a process of their own, which notes when each of them was enabled and let go.
+"""Emulated drives of any type in a process of their own, which notes when each of them was enabled and disabled.
 
 `python -m verification.faults.drives_process CONFIG NOTES --pose HOST:PORT`: on the buses that the configuration names.
 """

@@ -108,7 +108,7 @@ def sensor_row(name: str, fault: str, kind: str) -> Row:
 
 def isolated_row(name: str, fault: str, kind: str) -> Row:
     """One joint fails, and the robot may lose one."""
-    expected = "fault names the joint, it alone is let go; the others go on; a reset takes it back"
+    expected = "fault names the joint, it alone is disabled, the others continue, and a reset enables it again"
     return asked_row(name, fault, expected, partial(isolation.set_aside, kind))
 
 
@@ -358,7 +358,7 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "one joint fails, and the robot file allows for it (`max_isolated_joints = 1`)",
-        "that joint is let go, the others go on",
+        "that joint is disabled, the others continue",
         "50 ms",
         (
             isolated_row("isolated_silent", "a joint says nothing", "mute"),
