@@ -68,7 +68,7 @@ def seen(home: Path, endpoint: str, angle_rad: float) -> None:
     """Wait until the host publishes an angle of joint_1."""
 
     def published() -> bool:
-        output = snakesim("echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
+        output = snakesim("topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
         return abs(json.loads(output)["message"]["angle_rad"][0] - angle_rad) < 1e-3
 
     wait_until(published, f"joint_1 at {angle_rad} rad")
