@@ -194,8 +194,8 @@ def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
     of_what = " of these ticks alone" if info.missing else ""
     say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
     for change in info.parameter_changes:
-        said = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
-        say(f"  set       at {change.time_s:.2f} s by {change.requester}: {said}")
+        changes = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
+        say(f"  set       at {change.time_s:.2f} s by {change.requester}: {changes}")
     say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]

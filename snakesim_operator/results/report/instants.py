@@ -81,7 +81,7 @@ class Instant:
     row: int  # of the record
     state: ControlState | None
     balance: Balance | None
-    felt: list[WorldContact]  # measured contacts
+    measured_contacts: list[WorldContact]
     propulsion_joint: int | None
 
 
@@ -148,14 +148,14 @@ def instant_at(record: RunRecord, time_s: float) -> Instant | None:
 def measured_along_n(instant: Instant, direction_w: Floats) -> float:
     """Return how much the measured contact forces push along a direction, (2,) of any length."""
     unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
-    return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.felt)
+    return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.measured_contacts)
 
 
 def count_unmeasured(instant: Instant) -> int:
     """Count the solved contacts at which no sensor measured a force."""
     if instant.balance is None:
         return 0
-    return sum(not is_measured(contact, instant.felt) for contact in instant.balance.contacts)
+    return sum(not is_measured(contact, instant.measured_contacts) for contact in instant.balance.contacts)
 
 
 def _make_instant(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Instant:
@@ -169,7 +169,7 @@ def _make_instant(record: RunRecord, time_s: float, state: ControlState | None, 
         row=record.row_at(robot_time_s),
         state=state,
         balance=balance,
-        felt=world.contacts if world is not None else [],
+        measured_contacts=world.contacts if world is not None else [],
         propulsion_joint=names.index(propelling) if propelling in names else None,
     )
 

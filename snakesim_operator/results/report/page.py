@@ -108,7 +108,9 @@ def _instants(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
         else:
             forward = instant.balance.resultant_n
             scale = common_scale(balances, *POLYGON_SIZE, upright=view.upright)
-            polygon = Markup(force_polygon(instant.balance, instant.felt, *POLYGON_SIZE, scale, upright=view.upright))
+            polygon = Markup(
+                force_polygon(instant.balance, instant.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
+            )
         cards.append(
             {
                 "event": event,

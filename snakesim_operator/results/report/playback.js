@@ -2,7 +2,7 @@
 (() => {
   const player = document.querySelector(".player");
   if (!player) return;
-  const { frames, said, joints, end, maps, paths } = JSON.parse(player.querySelector("script").textContent);
+  const { frames, captions, joints, end, maps, paths } = JSON.parse(player.querySelector("script").textContent);
   const find = (what) => player.querySelector(what);
   const slider = find("input"), button = find(".play"), speed = find("select"), words = find("output");
   const links = [...player.querySelectorAll(".snake line")], dots = [...player.querySelectorAll(".snake circle")];
@@ -40,7 +40,7 @@
       + (paths[path] ? `<polyline class="planned" points="${paths[path]}"/>` : "");
     forces.innerHTML = pieces(felt).map((one) => arrow(one, "felt")).join("")
       + pieces(solved).map((one, k) => arrow(one, kinds[k])).join("");
-    words.innerHTML = `<b>${time.toFixed(2)} s</b> ${propels < 0 ? "" : `<b>${joints[propels]} propels.</b> `}${said[what]}`;
+    words.innerHTML = `<b>${time.toFixed(2)} s</b> ${propels < 0 ? "" : `<b>${joints[propels]} propels.</b> `}${captions[what]}`;
     slider.value = time;
   };
   const seek = (to) => document.dispatchEvent(new CustomEvent("seek", { detail: to }));

@@ -90,7 +90,7 @@ def playback(record: RunRecord) -> Playback | None:
         )
     data = {
         "frames": frames,
-        "said": captions,
+        "captions": captions,
         "joints": names,
         "end": round(end_s(record), 3),
         "maps": maps,

@@ -37,7 +37,7 @@ def top_view(record: RunRecord, instant: Instant, view: View) -> str:
     nodes = nodes_xy_w(record, instant.row)
     labels = Labels(view.width, view.height - FOOT)
     parts = [ground(record, view, labels), body(record, view, nodes, labels)]
-    parts += [_draw_measured_force(contact, view, labels) for contact in instant.felt]
+    parts += [_draw_measured_force(contact, view, labels) for contact in instant.measured_contacts]
     parts.append(_draw_solved_forces(instant, view, labels))
     description = f"Top view at {instant.time_s:.2f} s"
     joint = instant.propulsion_joint
@@ -158,7 +158,7 @@ def _draw_solved_forces(instant: Instant, view: View, labels: Labels) -> str:
     if balance is None:
         return ""
     parts: list[str] = []
-    contact_classes, resultant_class = balance.force_classes(instant.felt)
+    contact_classes, resultant_class = balance.force_classes(instant.measured_contacts)
     for contact, force_n, class_ in zip(balance.contacts, balance.contact_n, contact_classes, strict=True):
         foot = view.at(contact.position_w)
         tip = view.along(foot, force_n, view.force_scale)

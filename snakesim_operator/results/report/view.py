@@ -81,7 +81,7 @@ def _max_force_n(instants: list[Instant]) -> float:
     for instant in instants:
         if instant.balance is not None:
             solved_n += [*instant.balance.size_n, float(np.hypot(*instant.balance.resultant_n))]
-        measured_n += [math.hypot(*contact.force_w[:2]) for contact in instant.felt]
+        measured_n += [math.hypot(*contact.force_w[:2]) for contact in instant.measured_contacts]
     return max(solved_n or measured_n, default=0.0)
 
 

@@ -75,7 +75,7 @@ def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) ->
     solved, felt = ([len(frame[k]) for frame in frames] for k in (4, 5))
     assert set(solved) == {0, 16} and set(felt) <= set(range(0, 24, 4)) and max(felt) >= 12
     assert not page.film["maps"] and not page.film["paths"]  # its map is known, its route is the scene's
-    assert page.film["said"][frames[-1][3]].startswith(f"not moving: {LOST}")
+    assert page.film["captions"][frames[-1][3]].startswith(f"not moving: {LOST}")
 
 
 def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
