@@ -44,5 +44,5 @@ def test_a_turn_that_a_drive_has_forgotten_is_not_wound_again(tmp_path: Path) ->
     drives(tmp_path, 4.0 - TURN)  # it was switched off and on
     with host(tmp_path, BACKEND) as endpoint:
         shown = why(tmp_path, endpoint)
-        assert "counted over restarts it is at +4.00 rad" in shown, shown
+        assert "it is at +4.00 rad by the turns counted over restarts" in shown, shown
         assert "Turn it by hand by 1 turn to lower angles" in shown
