@@ -44,7 +44,9 @@ FAULT_CODES = {
         page="troubleshooting/computer-too-slow.md",
     ),
     # --- heat and supply
-    "overheated": ErrorCode("A joint is too hot.", "High torque for too long.", "Wait until it is cooler, then reset the fault."),
+    "overheated": ErrorCode(
+        "A joint is too hot.", "High torque for too long.", "Wait until it is cooler, then reset the fault."
+    ),
     "leak": ErrorCode("A joint module reports water inside.", "A seal leaks.", "Take the robot out of the water."),
     "undervoltage": ErrorCode("The supply voltage is too low.", "Battery, cable or fuse.", "Charge or check it."),
     "power_unknown": ErrorCode(

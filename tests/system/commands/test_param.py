@@ -34,7 +34,8 @@ def test_they_are_listed_with_unit_range_and_meaning(param) -> None:
     listed = param("list")
     assert listed.code == 0 and listed.out.startswith("controller obstacle_triplet, 26 parameters, ")
     row = next(line for line in listed.out.splitlines() if "control.gap_m " in line)
-    said = "control.gap_m 0.06 m >= 0, <= 1 Maximum gap between the skin and an obstacle that is chosen as a push-point."
+    meaning = "Maximum gap between the skin and an obstacle that is chosen as a push-point."
+    said = f"control.gap_m 0.06 m >= 0, <= 1 {meaning}"
     assert row.split() == said.split()
 
 
