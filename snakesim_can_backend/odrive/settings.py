@@ -29,14 +29,12 @@ class MountedAxis(Mounted, frozen=True, kw_only=True):
 class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
     """The scenario's `[backends.odrive]` section. `watchdog_s` is what the axes have in `watchdog_timeout`."""
 
-    # Files flat_endpoints.json that ODrive publishes with each firmware: one for each firmware and hardware on the bus.
-    # With them the driver reads watchdog, current and speed limits of every axis at the start. Empty: they are unknown.
     endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
-    """Files flat_endpoints.json of every firmware on the bus, to read watchdog, current and speed limits at the start;
-    empty: they are unknown.
+    """Files flat_endpoints.json, which ODrive publishes with each firmware: one for each firmware on the bus.
+
+    With them the driver reads watchdog, current and speed limits of every axis at the start; empty: they are unknown.
     """
 
-    # The driver never sets a higher current limit. Default: what each axis is configured for; 1 A where it is unknown.
     max_current_a: Amperes | None = None
     """Current limit above which the driver never sets an axis; none: what each axis is configured for, or 1 A where
     that is unknown.

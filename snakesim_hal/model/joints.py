@@ -1,7 +1,7 @@
 """The joints of a robot file: sections for all joints, and a table of exceptions for single ones.
 
 `[limits]`, `[motor]`, `[drive]`, `[heat]` and `[supply]` are for every joint. `[joints.joint_3]` contains the values
-that differ for one joint, with the same keys. `table` combines them into one `Joint` for each, tail to head.
+that differ for one joint, with the same keys. `make_joints` combines them into one `Joint` for each, tail to head.
 """
 
 import math

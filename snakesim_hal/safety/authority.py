@@ -136,7 +136,7 @@ class Authority:
         self._measured = self._plausibility.measured
 
     def observe_power(self, power: Power, now_ns: int) -> None:
-        """Process the newest power sample: supply, heat and leaks. `expire` acts on it."""
+        """Process the newest power sample: supply, heat and leaks. `check_deadlines` acts on it."""
         self._derating.update(power, now_ns)
 
     def replace_unreadable(self, joints: JointState) -> JointState:
@@ -312,7 +312,7 @@ class Authority:
             self._drop_lease()
 
     def decide(self, up_to: int | None = None) -> TickDecision:
-        """Return the setpoints for the next period. Call `expire` first.
+        """Return the setpoints for the next period. Call `check_deadlines` first.
 
         Args:
             up_to: in lockstep, the newest tick whose command is used; None means the newest command.
