@@ -8,6 +8,8 @@ PYTHON ?=
 ARGS ?=
 UPGRADE ?=
 WORKERS ?= 2
+# More than cores: these tests wait for processes most of the time.
+SYSTEM_WORKERS ?= 3
 PAYLOADS ?= 1000000
 MINUTES ?= 30
 TRIALS ?= 300
@@ -47,7 +49,7 @@ test-contract: compiled ## Run the contracts of backends and drives
 	$(pytest) tests/contract -n $(WORKERS) --dist worksteal $(ARGS)
 
 test-system: compiled ## Run the tests with real processes, but those on a CAN bus
-	$(pytest) tests/system --ignore tests/system/can -n $(WORKERS) --dist worksteal $(ARGS)
+	$(pytest) tests/system --ignore tests/system/can -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)
 
 test-can: compiled ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none
 	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- $(pytest) tests/system/can --timeout 900 $(ARGS)

@@ -16,6 +16,7 @@ from snakesim_testing.gnc.stage import known
 from snakesim_testing.hal.local_network import threads_switching
 from snakesim_testing.harness.wait import wait_until
 
+pytestmark = pytest.mark.quiet  # a busy computer lets the command lease expire, and then nothing is observed
 PERIOD_NS = 20_000_000
 SEEN = 3  # observations in a row
 
@@ -76,7 +77,6 @@ def test_a_command_names_the_joint_state_that_it_answers() -> None:
         assert len(named - felt) <= 2  # at the ends of what was heard
 
 
-@pytest.mark.quiet
 def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_leaves_grows_old() -> None:
     limits = {"pose_s": 0.3, "trajectory_s": 0.5}
     with stage(max_age=limits) as made:
@@ -103,7 +103,6 @@ def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_
         assert made.run.status.lifecycle == "armed"
 
 
-@pytest.mark.quiet  # a busy computer lets the command lease expire before the intent does
 def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why() -> None:
     with stage() as made:
         clocks, operator = made.run.session.reader(keys.CLOCK, Clock), made.run.session
