@@ -6,9 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from snakesim_hal.model.files import SHIPPED
-from snakesim_testing.runs.command import SNAKESIM, environment
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import SNAKESIM, environment
 from snakesim_testing.runs.in_process_command import snakesim
 
 

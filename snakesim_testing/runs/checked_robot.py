@@ -1,11 +1,8 @@
 """A robot with serial numbers whose joints can be checked."""
 
 from pathlib import Path
-import pytest
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.runs.bench import lab_folder
-from snakesim_testing.runs.command import Ended, snakesim
 
+from snakesim_testing.runs.bench import lab_folder
 
 REAL = '''
 from pathlib import Path

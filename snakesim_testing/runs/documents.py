@@ -14,6 +14,7 @@ import subprocess
 import sys
 import sysconfig
 from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,18 @@ import pytest
 REPOSITORY = Path(__file__).parents[2]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
-LEFT_OUT = shutil.ignore_patterns(".venv", ".tools", ".git", "runs", "build", "*.egg-info", "__pycache__", ".*_cache")
+LEFT_OUT_EVERYWHERE = ("*.egg-info", "__pycache__", ".*_cache")
+LEFT_OUT_OF_ROOT = (".venv", ".tools", ".git", "runs", "build")
+
+
+def leave_out(folder: str, names: list[str]) -> set[str]:
+    """Return what a copy of the repository leaves out. `snakesim_testing/runs` is part of it, `runs` is not."""
+    patterns = LEFT_OUT_EVERYWHERE
+    if Path(folder) == REPOSITORY:
+        patterns += LEFT_OUT_OF_ROOT
+    return {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
+
+
 PROLOGUE = """\
 set -eum
 ip link set lo up 2>/dev/null || true
@@ -99,7 +111,7 @@ def _expecting(command: str) -> str:
 
 def clone(folder: Path) -> None:
     """The repository's files, and an environment that `make` takes for its own: it lends what is installed here."""
-    shutil.copytree(REPOSITORY, folder, ignore=LEFT_OUT, symlinks=True)
+    shutil.copytree(REPOSITORY, folder, ignore=leave_out, symlinks=True)
     (folder / ".tools").symlink_to(REPOSITORY / ".tools")
     venv = folder / ".venv"
     subprocess.run([UV, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True)

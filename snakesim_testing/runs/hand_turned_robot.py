@@ -1,20 +1,14 @@
 """A robot whose emulated drives a test turns as a person would by hand."""
 
 import json
-import subprocess
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
-import numpy as np
-import pytest
+
 from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_testing.benches.workbench import text_of_the_example
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.bench import host, lab_folder
-from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.bench import lab_folder
 from snakesim_testing.runs.in_process_command import snakesim
-
 
 JOINTS = 4
 

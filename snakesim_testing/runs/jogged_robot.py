@@ -1,22 +1,12 @@
 """A robot that claims to be real and was not checked, and what its backend received."""
 
 import json
-import os
-import pty
-import subprocess
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-import pytest
-from snakesim_testing.benches.workbench import text_of_the_example
-from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.bench import host, lab_folder
-from snakesim_testing.runs.command import background
-from snakesim_testing.runs.in_process_command import snakesim
-from snakesim_testing.runs.hand_turned_robot import JOINTS, SCENARIO
 
+from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.runs.bench import lab_folder
+from snakesim_testing.runs.hand_turned_robot import JOINTS, SCENARIO
 
 BACKEND = "./told.py:Told"
 

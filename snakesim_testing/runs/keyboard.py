@@ -1,23 +1,16 @@
 """An operator at the keyboard of `snakesim teleop`."""
 
 import contextlib
-import math
 import os
 import pty
-import signal
 import subprocess
-import sys
 import termios
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-import pytest
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
-from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM, Running, environment, running
 
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import SNAKESIM, Running, environment
 
 UP, LEFT = b"\x1b[A", b"\x1b[D"
 

@@ -1,19 +1,14 @@
 """Host, services and router as programs of their own."""
 
 import contextlib
-import signal
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
-import pytest
+
 from snakesim_hal.model.files import ROUTER
-from snakesim_hal.network.session_file import read_session
-from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.runs.command import SNAKESIM, Ended, environment
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-
+from snakesim_testing.runs.command import SNAKESIM, Ended, environment
 
 SCENARIO = ("triplet", "--duration", "1")
 

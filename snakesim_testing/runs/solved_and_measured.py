@@ -37,7 +37,8 @@ SHIFTS_S = np.arange(-0.1, 0.105, 0.01)  # from command to force
 CASES = "| scenario | controller | m in 8 s | J/m | N·s/m |\n|---|---|---|---|---|"
 CAUSES = (
     "| scenario | controller | desired, N | measured, N | desired, but no contact | measured, not desired "
-    "| too much or little in all | wrong share | correlation | at its best, after |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| too much or little in all | wrong share | correlation | at its best, after |\n"
+    "|---|---|---|---|---|---|---|---|---|---|"
 )
 
 Forces = Mapping[str, Floats]  # of each obstacle, in every physics step
@@ -121,7 +122,8 @@ def causes(scenario: str, controller: str, **options: Any) -> str:
     best = int(np.argmax(by_shift))
     shares = " | ".join(f"{part / whole:.0%}" for part in (empty, unasked, total, split))
     return (
-        f"| `{scenario}` | `{controller}` | {desired_n.sum(axis=1).mean():.1f} | {measured_n.sum(axis=1).mean():.1f} | {shares} "
+        f"| `{scenario}` | `{controller}` | {desired_n.sum(axis=1).mean():.1f} | {measured_n.sum(axis=1).mean():.1f} "
+        f"| {shares} "
         f"| {correlation(desired_n, measured_n):.2f} | {by_shift[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
     )
 

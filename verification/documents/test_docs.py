@@ -107,7 +107,7 @@ def test_the_readme_as_printed(tmp_path: Path) -> None:
     """
     origin = tmp_path / "origin"
     git = ["git", "-c", "user.name=x", "-c", "user.email=x@example.org"]
-    shutil.copytree(REPOSITORY, origin, ignore=documents.LEFT_OUT, symlinks=True)
+    shutil.copytree(REPOSITORY, origin, ignore=documents.leave_out, symlinks=True)
     for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "As it is"]):
         subprocess.run([*git, "-C", str(origin), *arguments], check=True)
     clone = tmp_path / "snakesim"

@@ -24,13 +24,12 @@ from snakesim_testing.benches.workbench import text_of_the_example
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import Ended, call, environment
-from snakesim_testing.runs.documents import REPOSITORY, UV, needs_uv
+from snakesim_testing.runs.documents import REPOSITORY, UV, leave_out, needs_uv
 from verification.installation.distributions import required
 
 pytestmark = pytest.mark.e2e
 
 SCHEMAS = REPOSITORY / "schemas"
-NOT_SOURCES = shutil.ignore_patterns(".*", "runs", "build", "dist", "*.egg-info", "__pycache__")
 PACKAGES = ("snakesim_can_backend", "snakesim_gnc", "snakesim_hal", "snakesim_operator", "snakesim_sim_backend")
 
 
@@ -48,7 +47,7 @@ def ended(*command: object, cwd: Path, **more: str) -> Ended:
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy, so that the build leaves nothing in the repository. Links stay links, as in a clone."""
     folder = tmp_path_factory.mktemp("sources") / "snakesim"
-    shutil.copytree(REPOSITORY, folder, ignore=NOT_SOURCES, symlinks=True)
+    shutil.copytree(REPOSITORY, folder, ignore=leave_out, symlinks=True)
     return folder
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.harness.bad_plugins import BAD
-from snakesim_testing.runs.command import run_to_summary, running
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
+from snakesim_testing.runs.command import run_to_summary, running
 
 pytestmark = pytest.mark.e2e
 

@@ -1,6 +1,5 @@
 """What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
 
-
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import ControllerError

@@ -13,10 +13,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import armed_run
-from snakesim_testing.runs.command import run_to_summary
-from snakesim_testing.runs.command import snakesim
-from snakesim_testing.runs.command import summary_of
+from snakesim_testing.runs.command import armed_run, run_to_summary, snakesim, summary_of
 
 pytestmark = pytest.mark.e2e
 

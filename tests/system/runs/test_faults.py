@@ -8,8 +8,7 @@ import pytest
 
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.runs.in_process_command import run_to_summary
-from snakesim_testing.runs.in_process_command import snakesim
+from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 MAY_LOSE_ONE = "robot.safety.max_isolated_joints=1"
 slow = partial(pytest.param, marks=pytest.mark.slow)

@@ -7,9 +7,7 @@ import pytest
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import armed_run
-from snakesim_testing.runs.command import run_to_summary
-from snakesim_testing.runs.command import snakesim
+from snakesim_testing.runs.command import armed_run, run_to_summary, snakesim
 from snakesim_testing.runs.in_process_command import tell
 
 pytestmark = pytest.mark.e2e

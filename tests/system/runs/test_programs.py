@@ -1,32 +1,19 @@
 """Host, services and router as programs of their own, as on the machines of a lab: any order, and again at will."""
 
-import contextlib
 import signal
-import subprocess
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.session_file import read_session
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.command import Ended
-from snakesim_testing.runs.command import SNAKESIM
-from snakesim_testing.runs.command import environment
-from snakesim_testing.runs.lab_programs import Lab
-from snakesim_testing.runs.lab_programs import SCENARIO
+from snakesim_testing.runs.lab_programs import SCENARIO, Lab
 
 pytestmark = pytest.mark.e2e
 
 SERVICES = ("guidance", "navigation", "control")
-
-
-
-
 
 
 def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_host(lab: Lab) -> None:

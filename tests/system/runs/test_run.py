@@ -11,10 +11,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_reader import REPORT
-from snakesim_testing.runs.command import TOO_SLOW
-from snakesim_testing.runs.command import armed_run
-from snakesim_testing.runs.command import run_to_summary
-from snakesim_testing.runs.command import summary_of
+from snakesim_testing.runs.command import TOO_SLOW, armed_run, run_to_summary, summary_of
 
 pytestmark = pytest.mark.e2e
 

@@ -13,10 +13,10 @@ from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.recording_contents import read_recording
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import LOG_FILE
-from snakesim_testing.runs.command import SNAKESIM, Ended, environment, run_to_summary
-from snakesim_testing.runs.documents import REPOSITORY, sections
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.runs import in_process_command as in_process
+from snakesim_testing.runs.command import SNAKESIM, Ended, environment, run_to_summary
+from snakesim_testing.runs.documents import REPOSITORY, sections
 
 pytestmark = pytest.mark.e2e
 

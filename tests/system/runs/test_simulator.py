@@ -12,9 +12,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest, Status
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.runs.command import running
 from snakesim_testing.harness.processes import nothing_left
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import running
 from snakesim_testing.runs.in_process_command import snakesim, tell
 
 pytestmark = pytest.mark.e2e

@@ -12,9 +12,9 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
 from snakesim_operator.results.summary import RunSummary
-from snakesim_testing.runs.command import Running, armed_run, running, summary_of
 from snakesim_testing.harness.processes import nothing_left, processes_of
 from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.runs.command import Running, armed_run, running, summary_of
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e

@@ -1,9 +1,9 @@
 """What a run says of itself is what happened: who stands still does not locomote, and a run that ended has an end."""
 
-import pytest
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys

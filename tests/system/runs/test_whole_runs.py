@@ -1,9 +1,9 @@
 """Whole runs: a snake that moves can be told apart from one that does not, whatever its size, world and files."""
 
-import pytest
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.report.playback import playback
