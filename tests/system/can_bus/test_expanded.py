@@ -26,7 +26,7 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_can_backend.protocol.expanded import list_nodes
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.harness.registered import run_registered
+from snakesim_testing.operator.registered import run_registered
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
 

@@ -21,8 +21,8 @@ from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 from snakesim_testing.can.frames import health, heartbeat
-from snakesim_testing.harness.registered import run_registered
 from snakesim_testing.messages import raises_error
+from snakesim_testing.operator.registered import run_registered
 
 run = partial(run_registered, COMMANDS)
 TRIPLET = load_scenario("triplet").config
