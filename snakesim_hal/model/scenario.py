@@ -106,7 +106,9 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
     """Standard deviation of each obstacle's position in a known map; the errors follow from the run's seed."""
 
-    peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
+    assumed_obstacle_friction: Annotated[
+        float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})
+    ] = 0.0
     """Friction of obstacles that navigation assumes when it plans, and the controller when it pushes."""
 
     max_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1

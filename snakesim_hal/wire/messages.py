@@ -757,7 +757,7 @@ class Trajectory(Message, frozen=True, kw_only=True):
         q.Reason, about("why another path is being searched, while this one is followed; empty: none is")
     ] = ""
     searched_nodes: Annotated[q.Count, about("work on that search in this turn, in nodes that were expanded")] = 0
-    peg_friction: Annotated[
+    assumed_obstacle_friction: Annotated[
         float, q.from_zero(2, "1 (Coulomb coefficient)"), about("of the obstacles, as the path is planned with it")
     ] = 0.0
     goal_w: Annotated[
