@@ -148,10 +148,10 @@ class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
     external: bool = False
     """True: the run waits for the process of the service, but does not start it."""
 
-    place: Literal["process", "host"] = "process"
-    """`process`: the service has a process; `host`: it is a thread in the process of the HAL host."""
+    process: Literal["own", "host"] = "own"
+    """`own`: the service has a process of its own; `host`: it is a thread in the process of the HAL host."""
 
-    code: str = ""
+    plugin: str = ""
     """Name of an installed service, or ./file.py:Class; empty: the installed service of the section's name."""
 
     def used_output_tick(self, tick: int) -> int:
@@ -285,8 +285,8 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def beside(self) -> list[str]:
-        """Return the names of the services that run in the process of the HAL host, beside the driver."""
-        return [name for name, service in self.own_services.items() if service.place == "host"]
+        """Return the names of the services that run in the process of the HAL host."""
+        return [name for name, service in self.own_services.items() if service.process == "host"]
 
     @property
     def has_own_control(self) -> bool:
