@@ -15,7 +15,7 @@ ATTEMPTS = 3  # a machine that pauses for 50 ms stops a run in real time
 RUN_TIMEOUT_S = 300
 RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
 MIN_ANSWERED_FRACTION = 0.99  # of the ticks, for a rate that counts as reached
-CONTROL_IN_HOST = ("--set", "services.control.place=host")
+CONTROL_IN_HOST = ("--set", "services.control.process=host")
 
 
 def run(*arguments: str, scenario: str = "triplet") -> RunSummary:

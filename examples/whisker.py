@@ -2,7 +2,7 @@
 
 In the robot file, or as planar13_whiskers.toml beside this file has it:
 
-[[sensors.own]]
+[[sensors.custom]]
 name = "left"
 model = "./examples/whisker.py:WhiskerModel"
 position_m = [0.08, 0.03, 0.0]
@@ -17,13 +17,13 @@ import numpy as np
 
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.wire.messages import OwnSample
+from snakesim_hal.wire.messages import CustomSample
 from snakesim_hal.wire.quantities import about, bounded
 
 STEPS = 45  # to either side
 
 
-class Whisker(OwnSample, frozen=True, kw_only=True):
+class Whisker(CustomSample, frozen=True, kw_only=True):
     """A hair at a link, and how far what it touches has bent it."""
 
     bend_rad: Annotated[float, bounded(-1.6, 1.6, "rad"), about("from its rest, positive to the left; 0: it is free")]

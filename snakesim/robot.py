@@ -25,6 +25,7 @@ from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_hal.wire.custom_sample import find_message_type
 from snakesim_hal.wire.messages import (
     Clock,
     Contacts,
@@ -36,7 +37,6 @@ from snakesim_hal.wire.messages import (
     Status,
     make_arm_request,
 )
-from snakesim_hal.wire.own_sample import find_message_type
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots

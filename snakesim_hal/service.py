@@ -111,7 +111,7 @@ class ServiceLoop:
         schedule = config.services.get(name, ServiceSchedule())
 
         # For errors.
-        self._label = f"service {schedule.code or name} (class {service_type.__name__})"
+        self._label = f"service {schedule.plugin or name} (class {service_type.__name__})"
         self._module = service_type.__module__
 
         # The service, which subscribes in its constructor, before the robot is there.

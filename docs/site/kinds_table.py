@@ -32,16 +32,15 @@ def table() -> str:
         target = f"{sort}: {TARGETS[sort]}" if sort in ("process", "key", "joint", "bus") else TARGETS[sort]
         for name, kind in kinds.items():
             amount = "" if kind.amount is None else _amount(kind.amount)
-            rows.append(
-                f"| {target} | `{name}` | {kind.about} | {amount} | {', else '.join(DOERS[doer] for doer in kind.by)} |"
-            )
+            doers = ", else ".join(DOERS[doer] for doer in kind.by)
+            rows.append(f"| {target} | `{name}` | {kind.description} | {amount} | {doers} |")
             target = ""
     return "\n".join(rows) + "\n"
 
 
 def _amount(amount: Amount) -> str:
     unit = "" if amount.unit == "1" else f" {amount.unit}"
-    return f"{amount.about}, {amount.default:g}{unit} ({amount.low:g} to {amount.high:g})"
+    return f"{amount.description}, {amount.default:g}{unit} ({amount.low:g} to {amount.high:g})"
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from snakesim.environments.stepped import SteppedRobot
 from snakesim_gnc.control.observations import Observer, select_parts
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.controller import Observation, SensorSamples, Task
-from snakesim_hal.model.drawn import make_draws
 from snakesim_hal.model.plugins import FILMS, find_plugin
+from snakesim_hal.model.randomization import make_randomizations
 from snakesim_hal.model.scenario import Override, RunConfig, describe_run_robot
 from snakesim_hal.wire.messages import JointState
 
@@ -50,7 +50,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         frame_skip: int = 5,
         duration: float | None = None,
         set: Mapping[str, Any] | None = None,
-        draw: Mapping[str, Sequence[float]] | None = None,
+        randomize: Mapping[str, Sequence[float]] | None = None,
         new_field: bool = True,
         safe: bool = True,
         residual_rad: float = 0.2,
@@ -70,7 +70,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             frame_skip: Ticks of the robot in one step.
             duration: Robot time in s until an episode is truncated; None takes the scenario's duration.
             set: Values by their dotted keys, as in `snakesim.run`.
-            draw: Dotted keys with two bounds each. Every seed has its own number between them.
+            randomize: Dotted keys with two bounds each. Every seed has its own number between them.
             new_field: Whether each reset draws the scene's random fields again.
             safe: Whether the HAL's limiter limits every command.
             residual_rad: Largest correction of a joint in rad, for "residual:CONTROLLER".
@@ -113,7 +113,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         # The scenario, and what each seed changes in it.
         self._scenario = os.fspath(scenario)
         self._overrides = overrides
-        self._draws = make_draws(draw)
+        self._randomizations = make_randomizations(randomize)
         self._new_field = new_field
         self._scenario_config = self._load_config(0)
         self.config: RunConfig = self._scenario_config  # of this episode: `snakesim run` takes it, written to a file
@@ -324,7 +324,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
     def _config_of_seed(self, seed: int) -> RunConfig:
         """Return the configuration of an episode."""
         new_fields = len(self._scenario_config.scene.random_field) if self._new_field else 0
-        if not self._draws and not new_fields:
+        if not self._randomizations and not new_fields:
             return msgspec.structs.replace(self._scenario_config, seed=seed)  # faster than to load the scenario again
         field_keys = [f"scene.random_field.{i}.seed" for i in range(new_fields)]
         return self._load_config(seed, ["seed", *field_keys])
@@ -336,8 +336,8 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         """
         overrides = [*self._overrides]
         overrides += [Override(key, seed, "seed") for key in seed_keys]
-        for draw in self._draws:
-            overrides += draw.overrides_for_scene(seed, "draw")
+        for randomization in self._randomizations:
+            overrides += randomization.overrides_for_scene(seed, "randomize")
         return load_checked(self._scenario, overrides, processes=False)
 
     def _observe(self) -> ObservationValues:

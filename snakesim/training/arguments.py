@@ -44,7 +44,11 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     )
     add_set(parser)
     parser.add_argument(
-        "--draw", action="append", default=[], metavar="KEY=LOW:HIGH", help="a number for each field; may be repeated"
+        "--randomize",
+        action="append",
+        default=[],
+        metavar="KEY=LOW:HIGH",
+        help="a number for each field; may be repeated",
     )
     add_workers(parser)
     add_out(parser, "folder of what comes of it", required=True)
@@ -79,7 +83,7 @@ def _train(arguments: argparse.Namespace) -> int:
         extras.require(extra, "`snakesim policy train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import train
-    from snakesim_hal.model.drawn import parse_draw
+    from snakesim_hal.model.randomization import parse_randomization
     from snakesim_hal.model.scenario import parse_set
 
     environment = {
@@ -87,7 +91,7 @@ def _train(arguments: argparse.Namespace) -> int:
         "duration": arguments.duration,
         "reward": {override.key: override.value for override in map(parse_set, arguments.reward)},
         "set": {override.key: override.value for override in map(parse_set, arguments.set)},
-        "draw": dict(map(parse_draw, arguments.draw)),
+        "randomize": dict(map(parse_randomization, arguments.randomize)),
     }
     effort = Effort(**{field.name: getattr(arguments, field.name) for field in dataclasses.fields(Effort)})
     return train(
@@ -115,7 +119,7 @@ def _repeat_options(arguments: argparse.Namespace) -> list[str]:
         options += ["--init", arguments.begin]
     if arguments.spread != 1.0:
         options += ["--spread", f"{arguments.spread:g}"]
-    for name in ("reward", "set", "draw"):
+    for name in ("reward", "set", "randomize"):
         for value in getattr(arguments, name):
             options += [f"--{name}", value]
     return options

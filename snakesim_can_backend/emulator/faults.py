@@ -14,7 +14,7 @@ from snakesim_hal.model.fault_kinds import KINDS, Injection
 
 # What each kind does to a module.
 FAULT_DESCRIPTIONS: Mapping[str, str] = {
-    name: kind.in_module or kind.about for name, kind in KINDS["joint"].items() if "module" in kind.by
+    name: kind.in_module or kind.description for name, kind in KINDS["joint"].items() if "module" in kind.by
 }
 FORM = "KIND:JOINT@START or KIND:JOINT@START-END, in seconds, such as mute:joint_3@2.0 or leak:joint_1@1-4"
 SHOWN_CHARACTERS = 40  # of a text that is too long

@@ -347,7 +347,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             self._body.radius_m,
             Outlines.from_obstacles(obstacles),
             reach_m=parameters.reach_m,
-            friction=located.trajectory.peg_friction,
+            friction=located.trajectory.assumed_obstacle_friction,
         )
         names = [obstacles[k].name for k in touches.obstacle.tolist()]
         push = push_forward(

@@ -300,7 +300,7 @@ class BeamSearch:
         )
         push = normals @ task.goal_w
         skin_from_origin = points_w - normals * parameters.radius_m - task.origin_w
-        unit_push = normals - parameters.peg_friction * tangents
+        unit_push = normals - parameters.assumed_obstacle_friction * tangents
         nodes.add_contacts(
             touches=is_contact & (push > MIN_PUSH),
             obstacle=nearest.obstacle,

@@ -168,7 +168,7 @@ class ClutterPlanner:
             reason=reason,
             searching=self._reason,
             searched_nodes=self.searched_nodes,
-            peg_friction=self._search.peg_friction,
+            assumed_obstacle_friction=self._search.assumed_obstacle_friction,
             goal_w=(float(goal_x), float(goal_y)),
         )
 

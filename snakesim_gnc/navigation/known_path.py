@@ -17,10 +17,16 @@ MAX_REASON_LENGTH = 500
 class KnownPath:
     """Follows one route at the desired speed."""
 
-    def __init__(self, route: Route, obstacles: Sequence[Obstacle], peg_friction: float = 0.0) -> None:
-        """Find the push-points beside the route. peg_friction: Coulomb coefficient, which the trajectory passes on."""
+    def __init__(self, route: Route, obstacles: Sequence[Obstacle], assumed_obstacle_friction: float = 0.0) -> None:
+        """Find the push-points beside the route.
+
+        Args:
+            route: the route to follow.
+            obstacles: the known obstacles.
+            assumed_obstacle_friction: Coulomb coefficient, which the trajectory passes on.
+        """
         self.route = route
-        self._peg_friction = peg_friction
+        self._assumed_obstacle_friction = assumed_obstacle_friction
         self._path_w = [(float(x), float(y)) for x, y in route.points_w]
         self._push_points = _find_push_points(route, obstacles)
         self._tail_s_m: float | None = None
@@ -40,7 +46,7 @@ class KnownPath:
             push_points=self._list_push_points_ahead(),
             finished=finished,
             reason="the path is finished" if finished else desired.reason[:MAX_REASON_LENGTH],
-            peg_friction=self._peg_friction,
+            assumed_obstacle_friction=self._assumed_obstacle_friction,
         )
 
     def _list_push_points_ahead(self) -> list[str]:

@@ -18,7 +18,7 @@ class SearchParameters:
     kept_nodes: int = 900
     kept_per_wide_cell: int = 16
     # The propulsion margin.
-    peg_friction: float = 0.0  # Coulomb coefficient mu of the obstacles
+    assumed_obstacle_friction: float = 0.0  # Coulomb coefficient mu of the obstacles
     unused_tail_m: float = 0.2  # contacts this near to the tail end do not count
     unused_head_m: float = 0.1  # likewise to the head end
     wanted_margin_n: float = 40.0  # F_wanted

@@ -57,7 +57,7 @@ class Navigation(Service):
                 body_length_m=self._body.length_m,
                 radius_m=self._body.radius_m,
                 segment_m=max(self._body.segments_m),
-                peg_friction=config.mission.peg_friction,
+                assumed_obstacle_friction=config.mission.assumed_obstacle_friction,
             ),
             turn_s=min(schedule.decimation, schedule.latency_ticks) / config.rate_hz,
         )
@@ -114,4 +114,4 @@ def _make_known_path(config: RunConfig, known: Sequence[Obstacle]) -> KnownPath:
         start = find_start_pose(config)
         ahead = np.array([np.cos(start.yaw_rad), np.sin(start.yaw_rad)]) * NO_ROUTE_LENGTH_M
         route = Route(np.array([start.position_w, start.position_w + ahead]))
-    return KnownPath(route, known, config.mission.peg_friction)
+    return KnownPath(route, known, config.mission.assumed_obstacle_friction)

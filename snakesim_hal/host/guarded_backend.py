@@ -19,9 +19,9 @@ from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.base.step_limit import StepTooLongError, describe_interrupted_line
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState
 from snakesim_hal.wire.outgoing import encode_checked, encode_unchecked
-from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
@@ -56,7 +56,7 @@ class GuardedBackend(Backend):
         self._inner = inner
         self.name = type(inner).__name__
         self._sensor_keys: list[str] | None = None  # None: not read yet
-        self._own_kinds: dict[str, CustomMessage] = {}  # custom messages, by key
+        self._custom_messages: dict[str, CustomMessage] = {}  # custom messages, by key
 
     @_guarded
     def describe(self) -> Description:
@@ -74,7 +74,7 @@ class GuardedBackend(Backend):
                 if key not in self._find_sensor_keys():
                     known = ", ".join(self._find_sensor_keys())
                     raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
-                encoded[key] = encode_checked(key, message, self._own_kinds.get(key))
+                encoded[key] = encode_checked(key, message, self._custom_messages.get(key))
         except WireError as error:
             raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
         return replace(samples, encoded=encoded)
@@ -104,6 +104,6 @@ class GuardedBackend(Backend):
         """Return the keys of the described sensors. The description is read at the first call."""
         if self._sensor_keys is None:
             robot = self._inner.describe()
-            self._own_kinds = find_custom_messages(robot)
+            self._custom_messages = find_custom_messages(robot)
             self._sensor_keys = [sensor.key for sensor in robot.sensors]
         return self._sensor_keys

@@ -47,7 +47,7 @@ _numbered = re.compile(r"(?P<type>joint|bus)_(?P<number>[1-9][0-9]*)")
 class Amount:
     """The strength of an injected fault: the number behind `=`."""
 
-    about: str  # what the number is
+    description: str  # what the number is
     unit: str  # "1": it has no unit
     default: float
     low: float
@@ -58,11 +58,11 @@ class Amount:
 class Kind:
     """One kind of injected fault."""
 
-    about: str
+    description: str
     by: tuple[Doer, ...]  # who carries it out; of two, the first one if it can
     amount: Amount | None = None  # none: it has no strength
     once: bool = False  # true: it happens at its start, and has no end
-    in_module: str = ""  # what it does in a joint module, where that is more than `about`
+    in_module: str = ""  # what it does in a joint module, where that is more than `description`
 
 
 SHARE = Amount("share of the messages", "1", 1.0, 0.0, 1.0)
@@ -285,7 +285,7 @@ def check_injection(injection: Injection, given_text: str | None = None) -> Inje
     amount = kind.amount.default if injection.amount is None else injection.amount
     if not isfinite(amount) or not kind.amount.low <= amount <= kind.amount.high:
         raise ConfigError(
-            f"fault {text!r}: {kind.amount.about} = {amount:g} must be from {kind.amount.low:g} to "
+            f"fault {text!r}: {kind.amount.description} = {amount:g} must be from {kind.amount.low:g} to "
             f"{kind.amount.high:g} {kind.amount.unit}",
             code="injection/unknown-fault",
         )
@@ -408,7 +408,7 @@ def explain_kinds() -> str:
     for sort, kinds in KINDS.items():
         lines.append(f"{sort}:")
         for name, kind in kinds.items():
-            lines.append(f"  {name:<14} {kind.about}{_explain_amount(kind.amount)}")
+            lines.append(f"  {name:<14} {kind.description}{_explain_amount(kind.amount)}")
     return "\n".join(lines)
 
 
@@ -417,7 +417,7 @@ def _explain_amount(amount: Amount | None) -> str:
     if amount is None:
         return ""
     unit = "" if amount.unit == "1" else f" {amount.unit}"
-    return f"; amount: {amount.about}, {amount.default:g}{unit} if not given"
+    return f"; amount: {amount.description}, {amount.default:g}{unit} if not given"
 
 
 def kinds_in_short() -> str:

@@ -79,8 +79,8 @@ def check_planned(config: RunConfig, table: Table | None = None, buses: int = MA
             check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)
             if injection.part == RUN and injection.target in config.beside:
                 raise ConfigError(
-                    f"fault {str(injection)!r}: {injection.target} is no process of its own; it is beside the driver "
-                    f'(services.{injection.target}.place = "host")',
+                    f"fault {str(injection)!r}: {injection.target} has no process of its own; it runs in the host "
+                    f'(services.{injection.target}.process = "host")',
                     code="injection/not-supported",
                 )
         except ConfigError as error:

@@ -21,6 +21,7 @@ from snakesim_hal.model.plugins import SENSORS, find_plugin, require_base_class
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import CustomSensor, LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.custom_sample import make_message_schema
 from snakesim_hal.wire.messages import (
     Axis,
     Description,
@@ -31,7 +32,6 @@ from snakesim_hal.wire.messages import (
     SensorDescription,
     StopMode,
 )
-from snakesim_hal.wire.own_sample import make_message_schema
 from snakesim_hal.wire.quantities import MAX_JOINTS, above
 
 
@@ -133,7 +133,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
                 f"[[links]] has {len(self.links)} entries, and {joint_count} joints connect {joint_count + 1} links; "
                 f"list each, tail to head, or none"
             )
-        for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.own):
+        for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.custom):
             self._check_place(sensor)
 
     def _check_place(self, sensor: Mounted) -> None:
@@ -286,7 +286,7 @@ def describe_robot(
         joints=joints,
         links=_describe_links(robot),
         sensors=_describe_sensors(robot, period_ns),
-        own={keys.custom_key(sensor.name): _own_schema(sensor) for sensor in robot.sensors.own},
+        custom={keys.custom_key(sensor.name): _make_custom_schema(sensor) for sensor in robot.sensors.custom},
     )
 
 
@@ -327,7 +327,7 @@ def with_serials(robot: Description, serials: Sequence[str], firmware: Sequence[
     return msgspec.structs.replace(robot, joints=joints)
 
 
-def _own_schema(sensor: CustomSensor) -> str:
+def _make_custom_schema(sensor: CustomSensor) -> str:
     """Return the schema of a custom sensor's message. Raises ConfigError if its class cannot be loaded or has none."""
     model = find_plugin(SENSORS, sensor.model)
     label = f"sensor {sensor.name!r}: model {shorten(sensor.model)}"

@@ -106,7 +106,9 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
     """Standard deviation of each obstacle's position in a known map; the errors follow from the run's seed."""
 
-    peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
+    assumed_obstacle_friction: Annotated[
+        float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})
+    ] = 0.0
     """Friction of obstacles that navigation assumes when it plans, and the controller when it pushes."""
 
     max_climb_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.1
@@ -146,10 +148,10 @@ class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
     external: bool = False
     """True: the run waits for the process of the service, but does not start it."""
 
-    place: Literal["process", "host"] = "process"
-    """`process`: the service has a process; `host`: it is a thread in the process of the HAL host."""
+    process: Literal["own", "host"] = "own"
+    """`own`: the service has a process of its own; `host`: it is a thread in the process of the HAL host."""
 
-    code: str = ""
+    plugin: str = ""
     """Name of an installed service, or ./file.py:Class; empty: the installed service of the section's name."""
 
     def used_output_tick(self, tick: int) -> int:
@@ -283,8 +285,8 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def beside(self) -> list[str]:
-        """Return the names of the services that run in the process of the HAL host, beside the driver."""
-        return [name for name, service in self.own_services.items() if service.place == "host"]
+        """Return the names of the services that run in the process of the HAL host."""
+        return [name for name, service in self.own_services.items() if service.process == "host"]
 
     @property
     def has_own_control(self) -> bool:

@@ -14,10 +14,10 @@ from snakesim_hal.model.links import Offset
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.quantities import (
     MAX_BEAMS,
+    MAX_CUSTOM_SENSORS,
     MAX_IMAGE_HEIGHT,
     MAX_IMAGE_WIDTH,
     MAX_JOINTS,
-    MAX_OWN_SENSORS,
     above,
     bounded,
     from_zero,
@@ -246,12 +246,12 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
     range: Annotated[list[RangeSensor], Meta(max_length=MAX_MOUNTED)] = []
     """Range sensors, each an entry `[[sensors.range]]`."""
 
-    own: Annotated[list[CustomSensor], Meta(max_length=MAX_OWN_SENSORS)] = []
-    """Custom sensors, each an entry `[[sensors.own]]`."""
+    custom: Annotated[list[CustomSensor], Meta(max_length=MAX_CUSTOM_SENSORS)] = []
+    """Custom sensors, each an entry `[[sensors.custom]]`."""
 
     def __post_init__(self) -> None:
         """Check that no two sensors of a kind have the same name. Raises ValueError, which the file reader explains."""
-        for kind, sensors in (("depth", self.depth), ("range", self.range), ("own", self.own)):
+        for kind, sensors in (("depth", self.depth), ("range", self.range), ("custom", self.custom)):
             names = [sensor.name for sensor in sensors]
             for name in names:
                 if names.count(name) > 1:
@@ -277,7 +277,7 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
                 yield keys.color_key(camera.name), camera
         for sensor in self.range:
             yield keys.ranges_key(sensor.name), sensor
-        for sensor in self.own:
+        for sensor in self.custom:
             yield keys.custom_key(sensor.name), sensor
 
     @property

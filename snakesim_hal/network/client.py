@@ -20,6 +20,7 @@ from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Publisher, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, MessageT
+from snakesim_hal.wire.custom_sample import find_custom_message
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
@@ -33,7 +34,6 @@ from snakesim_hal.wire.messages import (
     Mode,
 )
 from snakesim_hal.wire.outgoing import encode_checked
-from snakesim_hal.wire.own_sample import find_custom_message
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 MISSING_SAMPLE_TIMEOUT_S = 2.0  # in lockstep, for a sample or a description that must exist
@@ -282,8 +282,8 @@ class Client:
         """
         robot = self._filter.robot
         try:
-            own_kind = None if robot is None else find_custom_message(key, robot)
-            payload = encode_checked(key, message, own_kind)
+            custom_message = None if robot is None else find_custom_message(key, robot)
+            payload = encode_checked(key, message, custom_message)
             error = None if robot is None else find_mismatch(message, robot)
             if error is not None:
                 raise error

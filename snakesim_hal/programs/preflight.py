@@ -80,8 +80,8 @@ def _check_in_host_services(config: RunConfig, source: str) -> None:
     others = [name for name in config.beside if name != CONTROL]
     if others:
         raise ConfigError(
-            f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
-            'what plans or looks would keep the host from its ticks; leave it at "process"',
+            f'{source}: `services.{others[0]}.process` = "host": only control may run in the host, '
+            'because other services would delay its control cycle; leave it at "own"',
             code="config/conflict",
         )
 
@@ -105,8 +105,8 @@ def find_service(config: RunConfig, name: str) -> type[Service]:
 def _service_code(config: RunConfig, name: str) -> str:
     """Return the plugin name of a service."""
     section = config.services.get(name)
-    if section is not None and section.code:
-        return section.code
+    if section is not None and section.plugin:
+        return section.plugin
     return name
 
 
@@ -118,7 +118,7 @@ def _check_service(config: RunConfig, name: str, code: str, service: Any) -> Non
         raise ConfigError(
             f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
             f"services.{shorten(name)}, and both "
-            f"have one name. Write [services.{service.name}] with code = {shorten(code)!r}, or change the "
+            f"have one name. Write [services.{service.name}] with plugin = {shorten(code)!r}, or change the "
             "class's `name`",
             code="plugin/not-loadable",
         )

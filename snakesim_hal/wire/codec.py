@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.messages import VERSIONS, ColorImage, DepthImage, Message, OwnSample
+from snakesim_hal.wire.messages import VERSIONS, ColorImage, CustomSample, DepthImage, Message
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -28,8 +28,8 @@ encode = _encoder.encode
 def format_encoding(message: type[Message]) -> str:
     """Return the Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
     known = message
-    if issubclass(message, OwnSample):
-        known = OwnSample  # the further fields of a custom message are in the robot's description
+    if issubclass(message, CustomSample):
+        known = CustomSample  # the further fields of a custom message are in the robot's description
     return f"{ENCODING_PREFIX}{known.__name__}/{VERSIONS[known]}"
 
 

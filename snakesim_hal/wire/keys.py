@@ -12,7 +12,7 @@ POWER = "sensor/power"
 DEPTH_ALL = "sensor/depth/*"
 COLOR_ALL = "sensor/color/*"
 RANGE_ALL = "sensor/range/*"
-OWN_ALL = "sensor/own/*"
+CUSTOM_ALL = "sensor/custom/*"
 PREVIEW_DEPTH_ALL = "preview/depth/*"
 PREVIEW_COLOR_ALL = "preview/color/*"
 JOINT_COMMAND = "actuator/joints"
@@ -66,7 +66,7 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
     KeyRow(COLOR_ALL, m.ColorImage, "HAL", "stream", _SENSOR, "what a camera sees, in color"),
     KeyRow(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
-    KeyRow(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "samples of a sensor with a custom message"),
+    KeyRow(CUSTOM_ALL, m.CustomSample, "HAL", "stream", _SENSOR, "samples of a sensor with a custom message"),
     KeyRow(
         PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
     ),
@@ -123,8 +123,8 @@ def ranges_key(sensor: str) -> str:
 
 
 def custom_key(sensor: str) -> str:
-    """Return the key of a sensor with a message of its own."""
-    return f"sensor/own/{sensor}"
+    """Return the key of a custom sensor."""
+    return f"sensor/custom/{sensor}"
 
 
 def preview_key(image_key: str) -> str:

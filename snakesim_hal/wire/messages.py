@@ -240,8 +240,8 @@ def _describe_beyond_range(min_m: float, max_m: float, distances_m: list[float])
     return f"{measured} was measured, and its range is {min_m} to {max_m} m"
 
 
-class OwnSample(MountedSample, frozen=True, kw_only=True):
-    """`sensor/own/<name>`: of a sensor with a message of its own, which has more fields: those of `Description.own`."""
+class CustomSample(MountedSample, frozen=True, kw_only=True):
+    """`sensor/custom/<name>`: of a custom sensor, whose message has further fields: those in `Description.custom`."""
 
 
 class Preview(Message, frozen=True, kw_only=True):
@@ -423,9 +423,9 @@ class Description(Message, frozen=True, kw_only=True):
         about("tail to head: joint i, from 0, connects link i and link i + 1"),
     ]
     sensors: Annotated[list[SensorDescription], Meta(max_length=48)]
-    own: Annotated[
-        dict[q.Name, Annotated[str, Meta(max_length=q.MAX_OWN_SCHEMA)]],
-        Meta(max_length=q.MAX_OWN_SENSORS),
+    custom: Annotated[
+        dict[q.Name, Annotated[str, Meta(max_length=q.MAX_CUSTOM_SCHEMA)]],
+        Meta(max_length=q.MAX_CUSTOM_SENSORS),
         about("key -> JSON Schema of its message, of each sensor with a custom message, from any process"),
     ] = {}
 
@@ -757,7 +757,7 @@ class Trajectory(Message, frozen=True, kw_only=True):
         q.Reason, about("why another path is being searched, while this one is followed; empty: none is")
     ] = ""
     searched_nodes: Annotated[q.Count, about("work on that search in this turn, in nodes that were expanded")] = 0
-    peg_friction: Annotated[
+    assumed_obstacle_friction: Annotated[
         float, q.from_zero(2, "1 (Coulomb coefficient)"), about("of the obstacles, as the path is planned with it")
     ] = 0.0
     goal_w: Annotated[
@@ -862,7 +862,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         DepthImage,
         ColorImage,
         Ranges,
-        OwnSample,
+        CustomSample,
         Preview,
         JointCommand,
         AppliedCommand,

@@ -13,8 +13,8 @@ import msgspec
 from snakesim_hal.base.errors import WireError, shorten, suggest_word
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
-from snakesim_hal.wire.messages import VERSIONS, Message, OwnSample
-from snakesim_hal.wire.own_sample import CustomMessage
+from snakesim_hal.wire.custom_sample import CustomMessage
+from snakesim_hal.wire.messages import VERSIONS, CustomSample, Message
 
 NOT_PLAIN = (TypeError, ValueError, OverflowError, RecursionError)  # what the encoder raises
 MAX_VALUE_LENGTH = 100  # characters of a value that an error quotes
@@ -25,18 +25,18 @@ ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 _decoder = cache(Decoder[Any])
 
 
-def encode_checked(key: str, message: Message, own: CustomMessage | None = None) -> bytes:
+def encode_checked(key: str, message: Message, custom: CustomMessage | None = None) -> bytes:
     """Encode a message, after a check that readers of its key accept it.
 
     Args:
         key: where it is sent, relative to the robot's namespace.
         message: the message.
-        own: the description of a custom sensor's message by the robot; None: its class describes it.
+        custom: the description of a custom sensor's message by the robot; None: its class describes it.
 
     Raises:
         WireError: readers would reject it; names field, value, and what is allowed.
     """
-    expected = _find_message_type(key, message, own)
+    expected = _find_message_type(key, message, custom)
     payload = encode_unchecked(message)
     try:
         _decoder(expected).decode(payload, format_encoding(expected))
@@ -45,14 +45,14 @@ def encode_checked(key: str, message: Message, own: CustomMessage | None = None)
     return payload
 
 
-def _find_message_type(key: str, message: Message, own: CustomMessage | None) -> type[Message]:
+def _find_message_type(key: str, message: Message, custom: CustomMessage | None) -> type[Message]:
     """Return the type that readers of a key expect. Raises WireError if the message is of another one."""
     expected = keys.find_message(key)
     if expected is None:
         known = suggest_word(key, keys.ROW_AT)
         raise WireError("unknown_key", f"there is no such key; {known}`snakesim topic echo` lists them")
-    if expected is OwnSample and isinstance(message, OwnSample):
-        return type(message) if own is None else own.message
+    if expected is CustomSample and isinstance(message, CustomSample):
+        return type(message) if custom is None else custom.message
     if type(message) is not expected:
         raise WireError("unknown_message", f"a {type(message).__name__}, must be a {expected.__name__}")
     return expected
@@ -60,7 +60,7 @@ def _find_message_type(key: str, message: Message, own: CustomMessage | None) ->
 
 def encode_unchecked(message: Message) -> bytes:
     """Encode a message, within bounds or not. Raises WireError for values that no message can carry."""
-    if type(message) not in VERSIONS and not isinstance(message, OwnSample):
+    if type(message) not in VERSIONS and not isinstance(message, CustomSample):
         raise WireError("unknown_message", f"a {type(message).__name__} is no message")
     try:
         return encode(message)

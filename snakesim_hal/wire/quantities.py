@@ -17,8 +17,8 @@ MAX_PIXELS = MAX_IMAGE_WIDTH * MAX_IMAGE_HEIGHT
 MAX_BEAMS = 4096
 MAX_PARAMETERS_JSON = 8192  # characters
 MAX_SCHEMA = 65536  # characters
-MAX_OWN_SENSORS = 16  # sensors with a message of their own
-MAX_OWN_SCHEMA = 8192  # characters of the schema of each
+MAX_CUSTOM_SENSORS = 16  # sensors with a custom message
+MAX_CUSTOM_SCHEMA = 8192  # characters of the schema of each
 MAX_PREVIEW_BYTES = 128 * 1024
 MAX_TARGET = 1e5  # of a setpoint or a torque limit, in the unit of its mode
 

@@ -17,7 +17,7 @@ from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Session, intersects, key_expression
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import OwnSample
+from snakesim_hal.wire.messages import CustomSample
 from snakesim_operator.base.targets import RobotSelection, sessions_on
 from snakesim_operator.monitoring.traffic import decoder_of
 
@@ -207,7 +207,7 @@ def _decode_content(arrival: Arrival) -> dict[str, Any]:
         decoded = decoder_of(message).decode(arrival.payload, arrival.encoding)
     except WireError as error:
         return {"error": str(error)}
-    if message is OwnSample:  # as it was sent, because only its robot describes some of the fields
+    if message is CustomSample:  # as it was sent, because only its robot describes some of the fields
         return {"message": msgspec.msgpack.decode(arrival.payload)}
     return {"message": msgspec.to_builtins(decoded)}
 

@@ -137,8 +137,8 @@ def _refuse_recorded_files(path: Path, config: RunConfig, overridden: set[str]) 
     """
     named = [("controller", "--controller ", "its controller", config.controller)]
     for name in SERVICE_OUTPUTS:
-        key = f"services.{name}.code"
-        code = config.services[name].code if name in config.own_services else ""
+        key = f"services.{name}.plugin"
+        code = config.services[name].plugin if name in config.own_services else ""
         named.append((key, f"--set {key}=", f"its service {name}", code))
     for key, flag, what, code in named:
         if in_file(code) and key not in overridden:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import PrintLine, escape_invisible
 from snakesim_hal.model.textfiles import exported
-from snakesim_hal.wire.own_sample import find_custom_messages
+from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording

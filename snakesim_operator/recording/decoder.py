@@ -9,11 +9,11 @@ from mcap.decoder import DecoderFactory as McapDecoderFactory
 from mcap.records import Schema
 
 from snakesim_hal.base.errors import WireError
+from snakesim_hal.wire.custom_sample import parse_custom_message
 from snakesim_hal.wire.messages import VERSIONS
-from snakesim_hal.wire.own_sample import parse_custom_message
 
 PREFIX = "snakesim."  # of the names of all schemas of the robot's messages
-CUSTOM_PREFIX = f"{PREFIX}own."  # of the schemas of custom sensors
+CUSTOM_PREFIX = f"{PREFIX}custom."  # of the schemas of custom sensors
 
 
 class DecoderFactory(McapDecoderFactory):

@@ -24,6 +24,7 @@ from snakesim_hal.model.scene import place_scene
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import (
     ColorImage,
     Configuration,
@@ -36,7 +37,6 @@ from snakesim_hal.wire.messages import (
     World,
     WorldContact,
 )
-from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyMessages
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
@@ -215,7 +215,7 @@ class FoxgloveChannels:
             frame_id = f"{name}_frame"
             mount = shapes.make_frame(time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz)
             messages.append(self._encode_frame(mount))
-        messages.append(self._encode_json(f"own/{name}", sample))
+        messages.append(self._encode_json(f"custom/{name}", sample))
         return messages
 
     # --- a few times a second

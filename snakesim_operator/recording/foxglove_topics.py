@@ -20,11 +20,11 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Protobuf
 
-from snakesim_hal.wire.messages import OwnSample
+from snakesim_hal.wire.messages import CustomSample
 from snakesim_operator.recording.state_messages import ContactForces, State
 
-JsonMessage = State | ContactForces | OwnSample
-MessageType = type[Protobuf] | type[State] | type[ContactForces] | type[OwnSample]
+JsonMessage = State | ContactForces | CustomSample
+MessageType = type[Protobuf] | type[State] | type[ContactForces] | type[CustomSample]
 
 COMMON_TOPICS: dict[str, MessageType] = {  # below the robot's name; every robot may have them, unlike cameras
     "tf": FrameTransforms,
@@ -78,7 +78,7 @@ def make_topic(robot: str, name: str) -> str:
 @cache
 def make_schema(message_type: MessageType) -> FoxgloveSchema:
     """Return the schema of a message type as MCAP requires it."""
-    if issubclass(message_type, State | ContactForces | OwnSample):
+    if issubclass(message_type, State | ContactForces | CustomSample):
         return _make_json_schema(message_type)
     return _make_protobuf_schema(message_type)
 

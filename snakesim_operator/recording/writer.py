@@ -19,8 +19,8 @@ from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, make_schema
@@ -84,7 +84,7 @@ class RecordingWriter:
         if self.failure:
             return
         early = self._early_samples
-        if early is not None and keys.find_row_key(arrival.key) == keys.OWN_ALL and len(early) < MAX_EARLY_SAMPLES:
+        if early is not None and keys.find_row_key(arrival.key) == keys.CUSTOM_ALL and len(early) < MAX_EARLY_SAMPLES:
             early.append(arrival)
             return
         self._write(arrival)
@@ -187,6 +187,6 @@ class RecordingWriter:
         """Return the number of a custom message's schema. Its text identifies it: two authors may choose one name."""
         text = custom_type.schema
         if text not in self._schemas:
-            name = f"snakesim.own.{custom_type.message.__name__}"
+            name = f"snakesim.custom.{custom_type.message.__name__}"
             self._schemas[text] = self._mcap.add_schema(name, "jsonschema", text.encode())
         return self._schemas[text]

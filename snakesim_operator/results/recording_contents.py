@@ -20,6 +20,7 @@ from snakesim_hal.run_log.black_box import compute_digest, summarize_contacts
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
@@ -31,7 +32,6 @@ from snakesim_hal.wire.messages import (
     Trajectory,
     World,
 )
-from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.results.missing_data import describe_undecodable
 
@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
 SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 """What guidance, navigation and control publish."""
-OUTPUTS = (*SERVICE_STREAMS, keys.OWN_ALL)
+OUTPUTS = (*SERVICE_STREAMS, keys.CUSTOM_ALL)
 """What the host's black box does not have."""
 MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
 _TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
 _JOINT_COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm")  # of the messages at keys.JOINTS
 _SETPOINT_COLUMNS = ("target", "torque_limit_nm")  # of the messages at keys.APPLIED
-ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.OWN_ALL, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.CUSTOM_ALL, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
 
 
 _decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
@@ -97,7 +97,7 @@ class RecordingContents:
 
     def add(self, recorded: RecordedMessage) -> None:
         """Add one message at a key of ALL, in the order of the file."""
-        if keys.find_row_key(recorded.key) == keys.OWN_ALL:
+        if keys.find_row_key(recorded.key) == keys.CUSTOM_ALL:
             self.custom.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
             return
         message_type = keys.find_message(recorded.key)

@@ -28,7 +28,7 @@ def list_faults(*, as_json: bool) -> int:
     """Explain every kind of fault, as text or as JSON. Returns the exit code."""
     if as_json:
         kinds = [
-            {"kind": name, "target": target, "about": kind.about}
+            {"kind": name, "target": target, "description": kind.description}
             for target, kinds_of_target in KINDS.items()
             for name, kind in kinds_of_target.items()
         ]

@@ -63,7 +63,7 @@ def _print_unchecked(config: RunConfig) -> None:
         (config.control_section, config.controller),
         (config.backend_section, config.backend),
     ]
-    plugins += [(f"services.{name}", service.code) for name, service in config.own_services.items()]
+    plugins += [(f"services.{name}", service.plugin) for name, service in config.own_services.items()]
     for section, plugin in plugins:
         if in_file(plugin):
             print_line(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")

@@ -17,7 +17,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import AnyMounted, BodySensor, ContactSensor, ImuSensor, PoseSensor, PowerSensor
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColorImage, Message, OwnSample
+from snakesim_hal.wire.messages import ColorImage, CustomSample, Message
 from snakesim_sim_backend.sensors.contacts import ContactReader
 from snakesim_sim_backend.sensors.depth import RayCamera
 from snakesim_sim_backend.sensors.imu import ImuReader
@@ -98,7 +98,7 @@ def _find_model(
             return None
         require_base_class(model, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
     # A sensor with a custom message has a schema, which is checked instead.
-    if message is not OwnSample and model.message is not message:
+    if message is not CustomSample and model.message is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which {key} carries; "
             f"set `message` of its class to what it makes",

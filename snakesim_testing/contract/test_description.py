@@ -8,8 +8,8 @@ from snakesim_hal.model.robot import layout_hash
 from snakesim_hal.model.scenario import describe_run_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_hal.wire.messages import Description, Imu
-from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.rig import Record, Rig
@@ -24,7 +24,7 @@ def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> 
         drive = {"serial": joint.serial, "firmware": joint.firmware}  # from the drive, not from the file
         assert joint == msgspec.structs.replace(expected, **drive)
     assert robot.links == wanted.links
-    for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "stop_mode", "own"):
+    for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "stop_mode", "custom"):
         assert getattr(robot, name) == getattr(wanted, name), name
 
 
@@ -49,7 +49,7 @@ def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
     """Sensors are at the sensor keys, with a rate up to the control rate; the joints are always listed."""
     listed = [sensor.key for sensor in rig.robot.sensors]
     assert len(set(listed)) == len(listed), f"listed twice: {listed}"
-    assert find_custom_messages(rig.robot).keys() == rig.robot.own.keys(), "a schema in `own` describes no message"
+    assert find_custom_messages(rig.robot).keys() == rig.robot.custom.keys(), "a schema of `custom` fits no message"
     assert keys.JOINTS in listed
     for sensor in rig.robot.sensors:
         assert sensor.key.startswith("sensor/") and keys.find_message(sensor.key), sensor.key

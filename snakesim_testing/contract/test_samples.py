@@ -11,9 +11,9 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.custom_sample import find_custom_message
 from snakesim_hal.wire.messages import MountedSample
 from snakesim_hal.wire.outgoing import find_wrong_value
-from snakesim_hal.wire.own_sample import find_custom_message
 from snakesim_testing.contract import tolerances as t
 from snakesim_testing.contract.rig import Record, Rig
 

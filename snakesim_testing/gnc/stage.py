@@ -99,7 +99,7 @@ class Stage:
     pegs: list[Obstacle]
     speed_m_s: float = 0.2
     path_id: int = 0
-    peg_friction: float = 0.0  # that the path was planned with
+    assumed_obstacle_friction: float = 0.0  # that the path was planned with
 
     def observe(
         self,
@@ -141,7 +141,7 @@ class Stage:
             speed_m_s=self.speed_m_s,
             push_points=[],
             finished=False,
-            peg_friction=self.peg_friction,
+            assumed_obstacle_friction=self.assumed_obstacle_friction,
         )
         return Observation(
             tick=tick,

@@ -5,10 +5,10 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
-from snakesim_hal.wire.messages import OwnSample
+from snakesim_hal.wire.messages import CustomSample
 
 
-class Skin(OwnSample, frozen=True, kw_only=True):
+class Skin(CustomSample, frozen=True, kw_only=True):
     """One of each kind of field."""
 
     pressed_n: Annotated[list[q.Force | None], Meta(max_length=3)]

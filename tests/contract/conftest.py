@@ -29,7 +29,7 @@ OF_SENSORS = ("sensor", "sample", "contradicts_itself", "listed")  # clauses tha
 LOOKS_AHEAD = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
     'robot.sensors.range=[{name="front", beams=9, fov_rad=2.0}]',
-    f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
+    f'robot.sensors.custom=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
 # moteus does it otherwise; for buses in threads see tests/system/drives/test_buses.py

@@ -82,7 +82,7 @@ def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, place
 
 def joint_row(name: str, kind: str, what: str) -> Row:
     """A joint module on CAN."""
-    about = KINDS["joint"][kind].about
+    about = KINDS["joint"][kind].description
     return Row(
         name,
         f"a joint module: {about}",

@@ -17,9 +17,9 @@
     name = "no pose sensor"
     set.robot.safety.action = "hold"
     unset = ["robot.sensors.pose"]                  # what the file may leave out, left out
-    without = ["scene.ground.friction"]             # no draw of these
+    without = ["scene.ground.friction"]             # do not randomize these
 
-    [[draw]]                                        # in every case, evenly between two numbers, one draw a field:
+    [[randomize]]                                   # in every case, evenly between two numbers, one value a field:
     set = ["scene.ground.friction"]                 # the same for every row and controller, and for all keys listed
     low = 0.1
     high = 0.4
@@ -38,8 +38,8 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.drawn import Draw
 from snakesim_hal.model.files import FileStruct, Table, decode, find_file, read_table
+from snakesim_hal.model.randomization import Randomization
 from snakesim_hal.model.scenario import Override, RunConfig, check, compose_table, encode_config
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.programs.preflight import check_plugins
@@ -62,7 +62,7 @@ class SuiteRow(FileStruct, frozen=True, kw_only=True):
     """Optional keys that this row removes, such as `robot.sensors.pose`."""
 
     without: list[str] = []
-    """Keys that no [[draw]] of the suite sets in this row."""
+    """Keys that no [[randomize]] of the suite sets in this row."""
 
 
 class Suite(FileStruct, frozen=True, kw_only=True):
@@ -102,8 +102,8 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     combinations.
     """
 
-    draw: list[Draw] = []
-    """Random values, each an entry `[[draw]]`; a value is the same for every row and controller of one field."""
+    randomize: list[Randomization] = []
+    """Random values, each an entry `[[randomize]]`; a value is the same for every row and controller of one field."""
 
     fresh: bool = False
     """True: every evaluation has new fields, unless `--seed` gives the first one; false: fields begin at the same
@@ -118,7 +118,7 @@ class SuiteSetting:
     name: str
     overrides: list[Override]
     value: float | None = None  # of what is varied, if that is one number
-    draws: Sequence[Draw] = ()
+    randomizations: Sequence[Randomization] = ()
 
 
 def read_suite(name: str) -> tuple[Suite, str]:
@@ -158,7 +158,7 @@ def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
         where = f"{source}: row {row.name!r}" if row.name else source
         of_row = list(_flatten_overrides(row.set, where))
         of_row += [Override(key, None, where) for key in row.unset]
-        draws = _draws_of_row(suite, row.without, where)
+        randomizations = _find_randomizations(suite, row.without, where)
         for combination in itertools.product(*varied.values()):
             parts = [row.name] if row.name else []
             of_combination: list[Override] = []
@@ -169,7 +169,7 @@ def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
             number = None
             if len(combination) == 1 and not row.name and _is_number(combination[0]):
                 number = combination[0]
-            settings.append(SuiteSetting(name, [*common, *of_row, *of_combination], number, draws))
+            settings.append(SuiteSetting(name, [*common, *of_row, *of_combination], number, randomizations))
     _check_names_differ(settings, source)
     return settings
 
@@ -206,7 +206,7 @@ def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: in
         for controller in controllers or [None]:
             table = _compose_setting(suite, setting, controller)
             for field in range(seed, seed + fields):
-                config = _configure_field(table, field, setting.draws)
+                config = _configure_field(table, field, setting.randomizations)
                 if field == seed:
                     _check_config(config, table, f"{source}, row {number} ({setting.name}), field {field}")
                 cases.append(
@@ -269,30 +269,34 @@ def seed_keys(table: Table) -> list[str]:
     return ["seed", *(f"scene.random_field.{i}.seed" for i in range(count))]
 
 
-def _configure_field(table: Table, field: int, draws: Sequence[Draw]) -> RunConfig:
+def _configure_field(table: Table, field: int, randomizations: Sequence[Randomization]) -> RunConfig:
     """Return the configuration of one field, with the values that are drawn for it."""
     for key in seed_keys(table):
         table.put(key, field, "--seed")
-    for draw in draws:
-        for override in draw.overrides_for_scene(field):
+    for randomization in randomizations:
+        for override in randomization.overrides_for_scene(field):
             table.put(override.key, override.value, override.flag)
     return decode(table, RunConfig)
 
 
-def _draws_of_row(suite: Suite, without: Sequence[str], where: str) -> list[Draw]:
-    """Return the suite's draws without the keys that a row leaves out. Raises ConfigError for a key of no draw."""
-    drawn_keys = {key for draw in suite.draw for key in draw.set}
+def _find_randomizations(suite: Suite, without: Sequence[str], where: str) -> list[Randomization]:
+    """Return the suite's randomizations without the keys that a row leaves out.
+
+    Raises:
+        ConfigError: The row leaves out a key that is not randomized.
+    """
+    randomized_keys = {key for randomization in suite.randomize for key in randomization.set}
     for key in without:
-        if key not in drawn_keys:
+        if key not in randomized_keys:
             raise ConfigError(
-                f"{where}: `without` names {key!r}, which no [[draw]] sets", code="command/invalid-option"
+                f"{where}: `without` names {key!r}, which no [[randomize]] sets", code="command/invalid-option"
             )
-    draws: list[Draw] = []
-    for draw in suite.draw:
-        kept = [key for key in draw.set if key not in without]
+    randomizations: list[Randomization] = []
+    for randomization in suite.randomize:
+        kept = [key for key in randomization.set if key not in without]
         if kept:
-            draws.append(msgspec.structs.replace(draw, set=kept))
-    return draws
+            randomizations.append(msgspec.structs.replace(randomization, set=kept))
+    return randomizations
 
 
 def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") -> Iterator[Override]:

@@ -5,19 +5,19 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from snakesim_hal.wire.custom_sample import CustomMessage
 from snakesim_hal.wire.messages import (
     ColorImage,
+    CustomSample,
     DepthImage,
     Imu,
     JointState,
     Obstacle,
-    OwnSample,
     Ranges,
     Status,
     World,
     WorldContact,
 )
-from snakesim_hal.wire.own_sample import CustomMessage
 from snakesim_operator.base.png import encode_png
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2.messages import Marker, Rgba, Triple
@@ -217,7 +217,7 @@ def encode_laser_scan(timestamp_ns: int, frame: str, scan: Ranges) -> bytes:
     )
 
 
-def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
+def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: str, sample: CustomSample) -> bytes:
     """Return a std_msgs/Float64MultiArray with one field of a custom sensor's sample.
 
     The array has one dimension, labeled with the field's name and unit. This type has neither timestamp nor frame.

@@ -10,7 +10,7 @@ from typing import Any
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
-from snakesim_hal.wire.own_sample import find_custom_messages, find_message_type
+from snakesim_hal.wire.custom_sample import find_custom_messages, find_message_type
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.frames import Frames, make_ros_name

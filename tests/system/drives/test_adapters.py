@@ -90,7 +90,7 @@ def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpre
     """Beside the driver compiled code without end stops the host: what is left is the modules' own watchdog."""
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
     with drives(machine, tmp_path, "modules", "can"):
-        beside = ("--set", "services.control.place=host", *LISTENING)
+        beside = ("--set", "services.control.process=host", *LISTENING)
         bad = ("--controller", "./bad.py:Controller", "--clock-mode", "realtime", "--duration", "60", *beside)
         said = run(machine, tmp_path, *bad)
         assert "(exit code 1)" in said, said

@@ -20,7 +20,7 @@ import snakesim
 import snakesim.environments
 from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
 from snakesim.environments.rewards import TERMS
-from snakesim_hal.model.drawn import Draw
+from snakesim_hal.model.randomization import Randomization
 from snakesim_hal.model.scenario import write_config
 from snakesim_operator.base.extras import BRINGS
 from snakesim_testing.messages import raises_error
@@ -127,10 +127,10 @@ def test_one_seed_and_the_same_actions_give_one_digest_and_another_seed_another_
 
 
 def test_what_a_lab_does_not_choose_is_drawn_for_each_seed_as_in_an_evaluation() -> None:
-    env = made("surveyed_clutter", draw={"scene.ground.friction": (0.1, 0.4)}, duration=0.1)
+    env = made("surveyed_clutter", randomize={"scene.ground.friction": (0.1, 0.4)}, duration=0.1)
     found = [env.reset(seed=seed) and env.config.scene.ground.friction for seed in (7, 8, 7)]
     assert found[0] == found[2] != found[1] and all(0.1 <= one <= 0.4 for one in found)
-    of_suite = Draw(set=["scene.ground.friction"], low=0.1, high=0.4)
+    of_suite = Randomization(set=["scene.ground.friction"], low=0.1, high=0.4)
     assert found[0] == of_suite.overrides_for_scene(7)[0].value
     for wrong, code in (
         ({"scene.ground.frictoin": (0.1, 0.4)}, "config/unknown-key"),
@@ -139,7 +139,7 @@ def test_what_a_lab_does_not_choose_is_drawn_for_each_seed_as_in_an_evaluation()
         ({"scene.ground.friction": (0.1, 400.0)}, "config/out-of-range"),
     ):
         with raises_error(snakesim.ConfigError, code=code):
-            made("surveyed_clutter", draw=wrong)
+            made("surveyed_clutter", randomize=wrong)
 
 
 def test_the_gate_is_inside_and_says_so() -> None:

@@ -18,8 +18,9 @@ from snakesim_operator.cli import main, make_parser
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY
 
-DRAW = ("--draw", "scene.ground.friction=0.1:0.4")
-SMALL = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5", *DRAW)
+RANDOMIZE = ("--randomize", "scene.ground.friction=0.1:0.4")
+FEW = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1")
+SMALL = (*FEW, "--duration", "0.5", *RANDOMIZE)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert told["snakesim.trained_by"].startswith(
         "snakesim policy train surveyed_clutter --form feeling --duration 0.5 "
     )
-    assert " ".join(DRAW) in told["snakesim.trained_by"]
+    assert " ".join(RANDOMIZE) in told["snakesim.trained_by"]
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
 

@@ -9,7 +9,7 @@ import snakesim
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.metrics.force_tracking import force_tracking
 
-ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.peg_friction": 0.3}
+ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.assumed_obstacle_friction": 0.3}
 FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
 
 

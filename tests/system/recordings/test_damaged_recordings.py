@@ -282,7 +282,7 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
         assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
 
 
-NAVIGATION = "services.navigation.code="
+NAVIGATION = "services.navigation.plugin="
 NAMED = {  # the class that is made another; how a run names that one, how the refusal calls it, and what stands for it
     "controller": ("control.hold import Hold", ("--controller", "./mine.py:Mine"), ("--controller", "hold")),
     "service navigation": (

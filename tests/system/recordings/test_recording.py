@@ -20,8 +20,8 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
-from snakesim_hal.wire.messages import Clock, Description, Done, Intent, OwnSample
-from snakesim_hal.wire.own_sample import make_message_schema
+from snakesim_hal.wire.custom_sample import make_message_schema
+from snakesim_hal.wire.messages import Clock, CustomSample, Description, Done, Intent
 from snakesim_hal.wire.quantities import bounded
 from snakesim_operator.recording import tap as tap_module
 from snakesim_operator.recording.reader import RecordingReader
@@ -37,7 +37,7 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.clock_samples import clock
 
 
-class Whisker(OwnSample, frozen=True, kw_only=True):
+class Whisker(CustomSample, frozen=True, kw_only=True):
     """Bend of a whisker."""
 
     bend_rad: Annotated[float, bounded(-2.0, 2.0, "rad")]
@@ -195,9 +195,9 @@ def test_a_recorder_that_is_told_to_end_waits_for_what_its_host_sends_before_it_
 def test_a_sample_that_comes_before_the_description_is_kept_with_its_own_schema(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     own = keys.custom_key("left")
-    early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.OwnSample/1", 0)
+    early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0)
     schema = make_message_schema(Whisker, "test")
-    described = encode(msgspec.structs.replace(description(), own={own: schema}))
+    described = encode(msgspec.structs.replace(description(), custom={own: schema}))
     robot = Arrival(keys.DESCRIPTION, described, format_encoding(Description), 0)
     recording = RecordingWriter(path)
     for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):
@@ -205,4 +205,4 @@ def test_a_sample_that_comes_before_the_description_is_kept_with_its_own_schema(
     recording.close({})
     with path.open("rb") as file:
         schemas = {schema.name for schema, channel, _ in make_reader(file).iter_messages(topics=[own]) if schema}
-    assert schemas == {"snakesim.own.Whisker"} and recording.counts[own] == 2
+    assert schemas == {"snakesim.custom.Whisker"} and recording.counts[own] == 2

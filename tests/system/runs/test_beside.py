@@ -11,7 +11,7 @@ from snakesim_testing.runs.command import run_to_summary, running
 
 pytestmark = pytest.mark.e2e
 
-BESIDE = ("--set", "services.control.place=host")
+BESIDE = ("--set", "services.control.process=host")
 # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
 REALTIME = ("triplet", "--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "60", *BESIDE)
 

@@ -39,7 +39,7 @@ class Empty(Service):
 from pathlib import Path
 (Path(__file__).parent / "ran").touch()
 """
-NAMED = "services.sensor.code=./lab/mocap.py:MotionCapture"
+NAMED = "services.sensor.plugin=./lab/mocap.py:MotionCapture"
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ WRONG = {
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_file_without_that_service_is_refused_before_anything_starts(home: Path, wrong: str) -> None:
     name, *words = WRONG[wrong]
-    code = f"services.sensor.code=./lab/mocap.py:{name}"
+    code = f"services.sensor.plugin=./lab/mocap.py:{name}"
     ended = in_process.snakesim("run", *SHORT, "--set", code, "--out", "run", cwd=home)
     assert ended.code == 2 and not (home / "run").exists()
     assert all(word in ended.err for word in ("./lab/mocap.py", *words)), ended.err
@@ -139,7 +139,7 @@ def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
     field, words = MALFORMED[wrong]
     lost = LOST.replace("{}", field)
     (home / "lab" / "lost.py").write_text(f"import msgspec\nimport numpy as np\n{SERVICE}{lost}")
-    code = [*SHORT, "--duration", "60", "--set", "services.sensor.code=./lab/lost.py:Lost"]
+    code = [*SHORT, "--duration", "60", "--set", "services.sensor.plugin=./lab/lost.py:Lost"]
     if clock_mode == "one":
         ended, summary = in_process.run_to_summary(home / "run", *code)
         log = (home / "run" / LOG_FILE).read_text()
@@ -157,7 +157,7 @@ def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
 def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
     lost = LOST.replace("{}", "position_w=1 / 0")
     (home / "lab" / "lost.py").write_text(f"import msgspec\n{SERVICE}{lost}")
-    code = [*SHORT, "--set", "services.sensor.code=./lab/lost.py:Lost"]
+    code = [*SHORT, "--set", "services.sensor.plugin=./lab/lost.py:Lost"]
     ended, summary = in_process.run_to_summary(home / "run", *code)
     said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
     assert ended.code == 1 and said in summary.ended and said in (home / "run" / LOG_FILE).read_text()
@@ -174,7 +174,7 @@ class Silent(MotionCapture):
 @pytest.mark.slow
 def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Path) -> None:
     (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
-    flags = [*SHORT, "--set", "services.sensor.code=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
+    flags = [*SHORT, "--set", "services.sensor.plugin=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
     ended, summary = run_to_summary(home / "run", *flags)
     why = "waiting for guidance, which has no sensor/pose yet (mission.localization=dead_reckoning does without"
     given_up = "not ready to arm within 3 s"
@@ -197,7 +197,7 @@ class Frozen(MotionCapture):
 
 def test_control_holds_when_a_service_tells_an_old_pose_again_and_again(home: Path) -> None:
     (home / "lab" / "frozen.py").write_text("import msgspec\n" + SERVICE + FROZEN)
-    code = ["--set", "services.sensor.code=./lab/frozen.py:Frozen", "--duration", "1"]
+    code = ["--set", "services.sensor.plugin=./lab/frozen.py:Frozen", "--duration", "1"]
     ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
     assert ended.code == 0 and summary.pose_from == "sensor", ended.out
     assert summary.reported_state == "NotLocomoting" and re.search(

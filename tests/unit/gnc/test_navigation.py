@@ -33,7 +33,7 @@ def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float
 def test_the_trajectory_is_as_old_as_the_world_model_that_it_was_planned_from() -> None:
     planner = KnownPath(ROUTE, [PEG], 0.15)
     blind = planner.update(0, None, MISSION)
-    assert blind.peg_friction == 0.15
+    assert blind.assumed_obstacle_friction == 0.15
     assert blind.timestamp_ns is None and blind.push_points == [] and not blind.finished
     seen = planner.update(20, world(0.5, timestamp_ns=18 * 10**7), MISSION)
     assert (seen.tick, seen.timestamp_ns, seen.push_points) == (20, 18 * 10**7, ["peg"])

@@ -75,7 +75,7 @@ def test_a_push_reckons_with_the_friction_that_the_path_was_planned_with() -> No
     tilts: list[float] = []
     for friction in (0.0, 0.2):
         stage = make_stage()
-        stage.peg_friction = friction
+        stage.assumed_obstacle_friction = friction
         controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
         points = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(50)][-1].telemetry.push_points
         assert len(points) >= 3

@@ -114,7 +114,7 @@ def test_a_plan_gives_every_change_once_in_the_order_of_time(given_: list[Inject
 def test_help_explains_every_kind() -> None:
     for kinds in KINDS.values():
         for name, kind in kinds.items():
-            assert name in kinds_in_short() and name in explain_kinds() and kind.about in explain_kinds()
+            assert name in kinds_in_short() and name in explain_kinds() and kind.description in explain_kinds()
 
 
 def test_the_page_has_every_kind() -> None:

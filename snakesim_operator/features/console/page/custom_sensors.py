@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from snakesim_hal.wire.own_sample import CustomMessage, find_custom_messages
+from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_operator.features.console.page.joint_charts import (
     HISTORY_S,
     MAX_SAMPLES,
@@ -34,7 +34,7 @@ def collect_numbers(snapshot: RobotSnapshot) -> dict[Quantity, dict[str, float]]
     """Return the numbers of all custom sensors by quantity, then by sensor: `left`, or `left.0` of a list."""
     numbers: dict[Quantity, dict[str, float]] = {}
     for key, kind in find_custom_messages(snapshot.robot).items():
-        sample = snapshot.own.get(key)
+        sample = snapshot.custom.get(key)
         if sample is None:
             continue
         sensor = key.rpartition("/")[2]
@@ -49,7 +49,7 @@ def format_sensor_table(snapshot: RobotSnapshot) -> str:
     """Return a table of each sensor's newest message and its age."""
     rows: list[tuple[str, str]] = []
     for key, kind in find_custom_messages(snapshot.robot).items():
-        sample = snapshot.own.get(key)
+        sample = snapshot.custom.get(key)
         if sample is None:
             rows.append((escape_text(key), "nothing yet"))
             continue

@@ -353,7 +353,7 @@ class Page:
         if self._sensor_charts is not None:
             self._sensor_charts.remove()
             self._sensor_charts = None
-        if robot.own:
+        if robot.custom:
             with self._sensors_tab:
                 self._sensor_charts = CustomSensorCharts(self._server.gui)
 

@@ -14,18 +14,18 @@ from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_hal.wire.messages import (
     Clock,
     ColorImage,
     Configuration,
+    CustomSample,
     DepthImage,
     Description,
     JointState,
-    OwnSample,
     Pose,
     World,
 )
-from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, Stream
 
@@ -109,7 +109,7 @@ class LiveRobot:
         for key in STREAM_KEYS:
             buffer = self._add_buffer(key, keys.find_message(key), MAX_ARRIVALS)
             session.on_arrival(key, buffer.store)
-        for key in (*IMAGE_ROWS, keys.OWN_ALL):
+        for key in (*IMAGE_ROWS, keys.CUSTOM_ALL):
             session.on_arrival(key, self._store_described)
 
     def _add_buffer(self, key: str, message_type: Any, max_arrivals: int) -> KeyBuffer:
@@ -164,7 +164,7 @@ class LiveRobot:
             power=newest(keys.POWER),
             imu=newest(keys.IMU),
             images={key: image for key, image in self._newest.items() if isinstance(image, DepthImage | ColorImage)},
-            own={key: sample for key, sample in self._newest.items() if isinstance(sample, OwnSample)},
+            custom={key: sample for key, sample in self._newest.items() if isinstance(sample, CustomSample)},
             # Controller.
             world=world,
             trajectory=newest(keys.TRAJECTORY),
@@ -190,7 +190,7 @@ class LiveRobot:
                     self._keep_message(key, message)
 
     def _keep_message(self, key: str, message: Any) -> None:
-        if keys.find_row_key(key) == keys.OWN_ALL and key not in self._buffers:
+        if keys.find_row_key(key) == keys.CUSTOM_ALL and key not in self._buffers:
             return  # a custom sensor of a former host, whose description this host has just replaced
         self._newest[key] = message
         if key == keys.STATUS:
@@ -207,13 +207,13 @@ class LiveRobot:
             self._newest = {key: message for key, message in self._newest.items() if key == keys.CONFIG}
             self._joint_states.clear()
             self._host_times_s.clear()
-        if former is None or former.own != robot.own:
+        if former is None or former.custom != robot.custom:
             self._replace_sensor_buffers(robot)
         self._newest[keys.DESCRIPTION] = robot
 
     def _replace_sensor_buffers(self, robot: Description) -> None:
         """Add a buffer for each custom sensor that the robot describes, in the place of the former ones."""
-        former_keys = [key for key in self._buffers if keys.find_row_key(key) == keys.OWN_ALL]
+        former_keys = [key for key in self._buffers if keys.find_row_key(key) == keys.CUSTOM_ALL]
         for key in former_keys:
             del self._buffers[key]
             self._newest.pop(key, None)

@@ -9,15 +9,15 @@ from typing import Any
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.custom_sample import find_message_type
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.own_sample import find_message_type
 from snakesim_operator.features.console.robot_data.snapshot import Stream
 from snakesim_operator.recording.message import RecordedMessage
 
 IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOR_ALL)
 
 # Rows of the key space whose messages are kept, because the rows of a run's record do not have them.
-KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.PARAMETERS_IN_FORCE, keys.OWN_ALL, *IMAGE_ROWS})
+KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.PARAMETERS_IN_FORCE, keys.CUSTOM_ALL, *IMAGE_ROWS})
 
 # Rows of which only the times are kept, to show their rates and ages.
 TIMED_ROWS = frozenset(

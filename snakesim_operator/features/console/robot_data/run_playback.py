@@ -76,7 +76,7 @@ class RunPlayback:
             power=history.find_newest(keys.POWER, time_s),
             parameters=history.find_newest(keys.PARAMETERS_IN_FORCE, time_s),
             images=self._find_images(time_s),
-            own=history.find_all_newest(keys.OWN_ALL, time_s),
+            custom=history.find_all_newest(keys.CUSTOM_ALL, time_s),
             streams=history.measure_streams(time_s),
             log=self._read_log(time_s),
         )

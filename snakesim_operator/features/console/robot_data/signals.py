@@ -18,8 +18,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.run_log.black_box import summarize_contacts
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_hal.wire.messages import AppliedCommand, ControlState, Description, Imu, JointState, Message, Power
-from snakesim_hal.wire.own_sample import find_custom_messages
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 LIVE_HISTORY_S = 60.0
@@ -234,7 +234,7 @@ def _add_joint_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
 def _add_sensor_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
     """Add the numbers of custom sensors: field, sensor, and part of a list."""
     for key, kind in find_custom_messages(snapshot.robot).items():
-        sample = snapshot.own.get(key)
+        sample = snapshot.custom.get(key)
         if sample is None:
             continue
         sensor = key.rpartition("/")[2]

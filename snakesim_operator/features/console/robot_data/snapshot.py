@@ -13,11 +13,11 @@ from snakesim_hal.wire.messages import (
     Contacts,
     ControlParameters,
     ControlState,
+    CustomSample,
     DepthImage,
     Description,
     Imu,
     JointState,
-    OwnSample,
     Power,
     Status,
     Trajectory,
@@ -57,7 +57,7 @@ class RobotSnapshot:
     power: Power | None = None
     imu: Imu | None = None
     images: dict[str, DepthImage | ColorImage] = field(default_factory=dict)  # by key
-    own: dict[str, OwnSample] = field(default_factory=dict[str, OwnSample])  # of custom sensors, by key
+    custom: dict[str, CustomSample] = field(default_factory=dict[str, CustomSample])  # of custom sensors, by key
 
     # Controller.
     world: World | None = None

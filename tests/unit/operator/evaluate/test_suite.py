@@ -120,7 +120,7 @@ def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
 
 LAB = """
 scenario = "surveyed_clutter"
-[[draw]]
+[[randomize]]
 set = ["scene.random_field.0.friction", "scene.pegs_along_route.0.friction"]
 low = 0.1
 high = 0.3

@@ -11,7 +11,7 @@ from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
 from snakesim_hal.wire import messages as m
-from snakesim_hal.wire.own_sample import make_message_schema, parse_custom_message
+from snakesim_hal.wire.custom_sample import make_message_schema, parse_custom_message
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType

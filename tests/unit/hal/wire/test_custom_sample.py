@@ -1,4 +1,4 @@
-"""Messages of sensors of one's own: their schema says what their class does, and what cannot be one is refused."""
+"""Messages of custom sensors: their schema says what their class does, and what cannot be one is refused."""
 
 from typing import Annotated, Any
 
@@ -8,8 +8,8 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
-from snakesim_hal.wire.messages import OwnSample
-from snakesim_hal.wire.own_sample import make_message_schema, parse_custom_message
+from snakesim_hal.wire.custom_sample import make_message_schema, parse_custom_message
+from snakesim_hal.wire.messages import CustomSample
 from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
 from snakesim_testing.messages import raises_error
 
@@ -24,7 +24,7 @@ def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_re
         | {f"flow_m_s.{i}": i + 1 for i in range(3)},
         nan_ok=True,
     )
-    assert Decoder(OwnSample).decode(encode(sample), format_encoding(Skin)) == OwnSample(**PLACE)
+    assert Decoder(CustomSample).decode(encode(sample), format_encoding(Skin)) == CustomSample(**PLACE)
 
 
 @pytest.mark.parametrize(
@@ -49,19 +49,19 @@ def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
         assert next(iter(wrong)) in str(caught.value)
 
 
-class Unbounded(OwnSample, frozen=True, kw_only=True):
+class Unbounded(CustomSample, frozen=True, kw_only=True):
     bend_rad: float
 
 
-class WithoutUnit(OwnSample, frozen=True, kw_only=True):
+class WithoutUnit(CustomSample, frozen=True, kw_only=True):
     bend: Annotated[float, Meta(ge=0, le=1)]
 
 
-class Nested(OwnSample, frozen=True, kw_only=True):
+class Nested(CustomSample, frozen=True, kw_only=True):
     skin: Skin
 
 
-class Empty(OwnSample, frozen=True, kw_only=True):
+class Empty(CustomSample, frozen=True, kw_only=True):
     """Nothing of its own."""
 
 

@@ -61,7 +61,7 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
 
             def shown() -> bool:
                 snapshot = watch.take_snapshot()
-                return snapshot is not None and {LEFT, keys.custom_key("right")} <= snapshot.own.keys()
+                return snapshot is not None and {LEFT, keys.custom_key("right")} <= snapshot.custom.keys()
 
             wait_until(shown, "whiskers on the console")
             snapshot = watch.take_snapshot()
@@ -81,11 +81,11 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
     with (tmp_path / "whole.mcap").open("rb") as file:
         found = make_reader(file, decoder_factories=[DecoderFactory()])
         schema, _, _, whisker = next(found.iter_decoded_messages([LEFT]))
-        _, _, _, plotted = next(found.iter_decoded_messages([f"/{namespace}/own/left"]))
+        _, _, _, plotted = next(found.iter_decoded_messages([f"/{namespace}/custom/left"]))
     assert plotted["bend_max_rad"] == 1.4
     assert (
         schema is not None
-        and schema.name == "snakesim.own.Whisker"
+        and schema.name == "snakesim.custom.Whisker"
         and "bend_rad" in json.loads(schema.data)["properties"]
     )
     assert type(whisker).__name__ == "Whisker" and whisker.bend_max_rad == 1.4
@@ -98,9 +98,9 @@ LIES = {
     "link=self._mount.link": "link=99",
 }
 SAID = {
-    "every_sample_survives_the_wire": "sensor/own/left: Whisker.bend_rad is 7.0",
-    "no_sample_contradicts_itself": "sensor/own/left: bent by 7.0 rad, and it bends no further than 1.4 rad",
-    "other_sensors_are_stamped_when_they_were_read": "sensor/own/left: -",
+    "every_sample_survives_the_wire": "sensor/custom/left: Whisker.bend_rad is 7.0",
+    "no_sample_contradicts_itself": "sensor/custom/left: bent by 7.0 rad, and it bends no further than 1.4 rad",
+    "other_sensors_are_stamped_when_they_were_read": "sensor/custom/left: -",
     "every_sample_fits_the_robot": "Whisker.link is 99, must be 0 (tail) to 13 (head)",
 }
 
@@ -132,4 +132,4 @@ def test_a_lying_whisker_stops_the_robot_and_is_named(tmp_path: Path, robot: str
     late = "bend_rad=7.0 if tick > 30 else 0.0"
     whisker.write_text(whisker.read_text().replace(BENT, late))
     done = in_process.snakesim("run", "peg_row", "--in-process", "--set", robot, "--duration", "5", cwd=tmp_path)
-    assert done.code != 0 and "sensor/own/left cannot be published: Whisker.bend_rad is 7.0" in done.said, done.said
+    assert done.code != 0 and "sensor/custom/left cannot be published: Whisker.bend_rad is 7.0" in done.said, done.said

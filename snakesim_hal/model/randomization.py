@@ -12,7 +12,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import Override
 
 
-class Draw(FileStruct, frozen=True, kw_only=True):
+class Randomization(FileStruct, frozen=True, kw_only=True):
     """A uniform distribution of one value, which all keys in `set` get; the number of a random scene decides it."""
 
     set: Annotated[list[str], Meta(min_length=1)]
@@ -30,11 +30,11 @@ class Draw(FileStruct, frozen=True, kw_only=True):
         if not are_finite or self.low > self.high:
             raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
 
-    def overrides_for_scene(self, field: int, origin: str = "[[draw]]") -> list[Override]:
+    def overrides_for_scene(self, field: int, origin: str = "[[randomize]]") -> list[Override]:
         """Return the value of every key for one random scene.
 
-        Only the number of the scene and the first key seed the value, so that an additional `Draw` does not change the
-        values of the others.
+        Only the number of the scene and the first key seed the value, so that an additional `Randomization` does not
+        change the values of the others.
 
         Args:
             field: number of the random scene.
@@ -46,28 +46,28 @@ class Draw(FileStruct, frozen=True, kw_only=True):
         return [Override(key, value, origin) for key in self.set]
 
 
-def make_draws(given: Mapping[str, Sequence[Any]] | None) -> list[Draw]:
+def make_randomizations(given: Mapping[str, Sequence[Any]] | None) -> list[Randomization]:
     """Return the distributions of `{"key": (low, high)}`; keys that a comma separates get the same value.
 
     Raises:
         ConfigError: The bounds of a key are not two finite numbers in order.
     """
-    draws: list[Draw] = []
+    randomizations: list[Randomization] = []
     for keys, bounds in (given or {}).items():
         try:
             low, high = (float(bound) for bound in bounds)
             key_list = [key.strip() for key in keys.split(",")]
-            draws.append(Draw(set=key_list, low=low, high=high))
+            randomizations.append(Randomization(set=key_list, low=low, high=high))
         except (TypeError, ValueError):
             raise ConfigError(
-                f"draw {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite",
+                f"randomize {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite",
                 code="command/invalid-option",
             ) from None
-    return draws
+    return randomizations
 
 
-def parse_draw(text: str) -> tuple[str, list[str]]:
-    """Return keys and bounds of the `key=low:high` of a --draw option, for `make_draws`.
+def parse_randomization(text: str) -> tuple[str, list[str]]:
+    """Return keys and bounds of the `key=low:high` of a --randomize option, for `make_randomizations`.
 
     Raises:
         ConfigError: A part of it is missing.
@@ -75,7 +75,7 @@ def parse_draw(text: str) -> tuple[str, list[str]]:
     keys, equals, bounds = (part.strip() for part in text.partition("="))
     if not (keys and equals and bounds):
         raise ConfigError(
-            f"--draw {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4",
+            f"--randomize {shorten(text)}: give KEY=LOW:HIGH, such as scene.ground.friction=0.1:0.4",
             code="command/invalid-option",
         )
     return keys, bounds.split(":")

@@ -1,7 +1,7 @@
 """The message of a custom sensor: a Struct that its author writes, and the same one made from its JSON Schema.
 
 A process that has the author's class uses that. All others (host, recorder, console, bridges, tables) have the schema
-in `Description.own`, so that no process runs code because a robot or a recording names it. Fields are flat: numbers,
+in `Description.custom`, so that no process runs code because a robot or a recording names it. Fields are flat: numbers,
 flags, words, texts, and lists of the first two; each with bounds, and numbers that are no counts with a unit.
 """
 
@@ -18,14 +18,14 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, WireError, shorten
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Message, OwnSample
-from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_OWN_SCHEMA
+from snakesim_hal.wire.messages import CustomSample, Description, Message
+from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_CUSTOM_SCHEMA
 
 MAX_FIELDS = 32
 MAX_TEXT_LENGTH = 200  # characters of a text field, and of the description of a message
 MAX_UNIT_LENGTH = 20  # characters
 SCHEMAS_CACHED = 128  # more than a robot may have custom sensors, for programs that watch several robots
-SHARED_FIELDS = frozenset(OwnSample.__struct_fields__)
+SHARED_FIELDS = frozenset(CustomSample.__struct_fields__)
 EXAMPLE = 'Annotated[float, bounded(-1.6, 1.6, "rad")], or q.Angle, of snakesim_hal.wire.quantities'
 # What msgspec raises for a schema or a class that cannot be a message.
 UNBUILDABLE = (TypeError, ValueError, OverflowError, RecursionError)
@@ -38,11 +38,11 @@ _BOUNDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiv
 class CustomMessage:
     """What is known of a custom message from its schema alone."""
 
-    message: type[OwnSample]
+    message: type[CustomSample]
     units: dict[str, str]  # unit of each numeric field; "1": a count, a flag or a ratio
     schema: str
 
-    def numbers(self, sample: OwnSample) -> dict[str, float]:
+    def numbers(self, sample: CustomSample) -> dict[str, float]:
         """Return the numbers of a sample by field, those of a list as `field.0`, `field.1` ...
 
         A null becomes NaN. Words and texts are left out.
@@ -75,9 +75,9 @@ def make_message_schema(message: Any, whose: str) -> str:
     Raises:
         ConfigError: it is not a class that can be a message.
     """
-    if not (isinstance(message, type) and issubclass(message, OwnSample) and message is not OwnSample):
+    if not (isinstance(message, type) and issubclass(message, CustomSample) and message is not CustomSample):
         raise ConfigError(
-            f"{whose}: `message` is {shorten(repr(message))}, must be a class derived from OwnSample of "
+            f"{whose}: `message` is {shorten(repr(message))}, must be a class derived from CustomSample of "
             "snakesim_hal.wire.messages, frozen and keyword-only",
             code="plugin/not-loadable",
         )
@@ -100,8 +100,8 @@ def parse_custom_message(schema: str) -> CustomMessage:
     Raises:
         WireError: the schema is of no use; the error's detail begins with the field.
     """
-    if len(schema) > MAX_OWN_SCHEMA:
-        raise WireError("malformed", f" has a schema of {len(schema)} characters, at most {MAX_OWN_SCHEMA}")
+    if len(schema) > MAX_CUSTOM_SCHEMA:
+        raise WireError("malformed", f" has a schema of {len(schema)} characters, at most {MAX_CUSTOM_SCHEMA}")
     try:
         return _make_kind(schema)
     except WireError:
@@ -120,14 +120,14 @@ def _make_kind(schema: str) -> CustomMessage:
     definitions: list[Any] = []  # as `msgspec.defstruct` wants them
     units: dict[str, str] = {}
     for name, field in fields.items():
-        if not _FIELD_NAME.fullmatch(name) or hasattr(OwnSample, name):
+        if not _FIELD_NAME.fullmatch(name) or hasattr(CustomSample, name):
             raise WireError("malformed", f".{shorten(name)} is no name of a field: lower case, at most 40 characters")
         field_type = _make_type(field, name, units)
         if name in required:
             definitions.append((name, field_type))
         else:
             definitions.append((name, field_type | None, None))
-    message: Any = msgspec.defstruct(content["title"], definitions, bases=(OwnSample,), frozen=True, kw_only=True)
+    message: Any = msgspec.defstruct(content["title"], definitions, bases=(CustomSample,), frozen=True, kw_only=True)
     msgspec.msgpack.Decoder(message)  # refuses bounds that it cannot check
     return CustomMessage(message, units, schema)
 
@@ -189,17 +189,17 @@ def _make_number_type(field: dict[str, Any], name: str, units: dict[str, str]) -
 
 def find_custom_message(key: str, robot: Description) -> CustomMessage | None:
     """Return the message of a robot's custom sensor; None if this key has none, or its schema is of no use."""
-    if key not in robot.own:
+    if key not in robot.custom:
         return None
     with suppress(WireError):
-        return parse_custom_message(robot.own[key])
+        return parse_custom_message(robot.custom[key])
     return None
 
 
 def find_custom_messages(robot: Description) -> dict[str, CustomMessage]:
     """Return the messages of all custom sensors of a robot, by key."""
     kinds: dict[str, CustomMessage] = {}
-    for key in robot.own:
+    for key in robot.custom:
         kind = find_custom_message(key, robot)
         if kind is not None:
             kinds[key] = kind
