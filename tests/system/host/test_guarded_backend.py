@@ -49,7 +49,7 @@ class Wrong(LagBackend):
         return Samples(joints, {**right.others, **{key: one for key, one in self.wrong.items() if key != keys.JOINTS}})
 
 
-@pytest.mark.parametrize("clock_mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("clock_mode", [pytest.param("realtime", marks=pytest.mark.quiet), "lockstep"])
 @pytest.mark.parametrize(
     ("key", "sample", "why"),
     [

@@ -4,6 +4,8 @@ import threading
 import time
 from typing import Any
 
+import pytest
+
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.injector import Injector
 from snakesim_hal.faults.message_faults import MessageFaults
@@ -24,6 +26,7 @@ def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
     return run.ask(keys.fault_key("hal"), FaultRequest(kind=kind, target=target, **more))
 
 
+@pytest.mark.quiet  # a lease of 50 ms
 def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is_refused_with_the_reason() -> None:
     with commanded(run_config(**ALLOWED)) as (run, _):
         for asked, refusal, words in (
@@ -63,6 +66,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
         Host(config, GuardedBackend(LagBackend(config)), own)
 
 
+@pytest.mark.quiet  # a lease of 50 ms
 def test_what_was_planned_and_cannot_be_done_is_told_as_a_fault_of_the_run() -> None:
     with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.faults_since_start
