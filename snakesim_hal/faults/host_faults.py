@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.faults.injector import Injector
-from snakesim_hal.model.fault_kinds import HAL, Injection
+from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import LifecycleState
@@ -18,15 +18,10 @@ class HostFaults(Injector):
 
     def __init__(self, config: RunConfig, backend: Backend, session: Session) -> None:
         """Wrap the host's backend. Declares the host's key for fault requests."""
-        faulty_backend = FaultyBackend(backend)
-        self.backend = faulty_backend
+        self.backend = FaultyBackend(backend)
         self._period_ns = config.period_ns
         self._tick = 0
-
-        def carry_out(injection: Injection, begins: bool) -> None:  # a method would form a reference cycle
-            faulty_backend.inject(injection, begins=begins)
-
-        super().__init__(HAL, config, session, carry_out=carry_out)
+        super().__init__(HAL, config, session, carry_out=self.backend.inject)
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
         """Keep the tick for the record, then do what every part does."""

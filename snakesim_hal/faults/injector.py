@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from math import inf
 from queue import Empty, SimpleQueue
+from typing import Protocol
 
 import msgspec
 
@@ -27,11 +28,16 @@ from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleSta
 
 HALF_A_NANOSECOND = 0.5e-9
 
-CarryOut = Callable[[Injection, bool], None]  # arguments: the fault, and whether it begins. Raises ConfigError
 NEVER_S = inf
 
 
-def no_action(injection: Injection, _begins: bool) -> None:
+class CarryOut(Protocol):
+    """Begins or ends a fault. Raises ConfigError if that is not possible."""
+
+    def __call__(self, injection: Injection, *, begins: bool) -> object: ...
+
+
+def no_action(injection: Injection, *, begins: bool) -> None:
     """Refuse a fault, in a part that supports only message faults and `hang`."""
     raise ConfigError(
         f"{injection.part} cannot do {injection.kind} to {injection.target}", code="injection/not-supported"
@@ -228,7 +234,7 @@ class Injector:
             case "process":
                 pass  # `turn` hangs while the fault is active
             case _:
-                self._carry_out(injection, True)
+                self._carry_out(injection, begins=True)
         if injection.about.once:
             self._note(f"{injection} happens", now_s)
         else:
@@ -247,7 +253,7 @@ class Injector:
             case "process":
                 pass
             case _:
-                self._carry_out(injection, False)
+                self._carry_out(injection, begins=False)
         self._note(f"{injection} ends", now_s)
 
     def _hangs(self) -> bool:
