@@ -52,10 +52,10 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
         controller = require_controller(plugin, config.controller)
         config = _check_controller(config, controller, source, table)
     for service in config.own_services:
-        code = _service_code(config, service)
-        service_type = find(SERVICES, code)
+        plugin_name = _service_plugin_name(config, service)
+        service_type = find(SERVICES, plugin_name)
         if service_type is not None:
-            _check_service(config, service, code, service_type)
+            _check_service(config, service, plugin_name, service_type)
     _check_in_host_services(config, source)
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
@@ -96,13 +96,13 @@ def find_service(config: RunConfig, name: str) -> type[Service]:
     Raises:
         ConfigError: the class is not found, or is not that of a service.
     """
-    code = _service_code(config, name)
-    service = find_plugin(SERVICES, code)
-    _check_service(config, name, code, service)
+    plugin_name = _service_plugin_name(config, name)
+    service = find_plugin(SERVICES, plugin_name)
+    _check_service(config, name, plugin_name, service)
     return service
 
 
-def _service_code(config: RunConfig, name: str) -> str:
+def _service_plugin_name(config: RunConfig, name: str) -> str:
     """Return the plugin name of a service."""
     section = config.services.get(name)
     if section is not None and section.plugin:
@@ -110,15 +110,15 @@ def _service_code(config: RunConfig, name: str) -> str:
     return name
 
 
-def _check_service(config: RunConfig, name: str, code: str, service: Any) -> None:
+def _check_service(config: RunConfig, name: str, plugin_name: str, service: Any) -> None:
     """Raise ConfigError if a plugin is not the class of the service of this name."""
-    require_base_class(service, Service, f"service {shorten(code)!r}")
+    require_base_class(service, Service, f"service {shorten(plugin_name)!r}")
     section = config.services.get(name)
     if section is not None and service.name != name:
         raise ConfigError(
-            f"service {shorten(code)!r} calls itself {service.name!r}, but is that of "
+            f"service {shorten(plugin_name)!r} calls itself {service.name!r}, but is that of "
             f"services.{shorten(name)}, and both "
-            f"have one name. Write [services.{service.name}] with plugin = {shorten(code)!r}, or change the "
+            f"have one name. Write [services.{service.name}] with plugin = {shorten(plugin_name)!r}, or change the "
             "class's `name`",
             code="plugin/not-loadable",
         )
