@@ -251,7 +251,7 @@ def require_controller(plugin: Any, name: str) -> type[Controller[Any]]:
     if inspect.isabstract(plugin):
         raise ConfigError(
             f"{where} has no method `update`. Add `def update(self, observation):`, which returns a "
-            f"snakesim.ControllerCommand",
+            "snakesim.ControllerCommand",
             code="plugin/not-loadable",
         )
     return plugin

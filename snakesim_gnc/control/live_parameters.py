@@ -26,9 +26,7 @@ from snakesim_hal.wire.quantities import MAX_PARAMETERS_JSON, MAX_SCHEMA
 MAX_WAITING_REQUESTS = 8  # a later request displaces the oldest, which gets no answer
 MAX_REASON = 500  # characters of a refusal, as the wire allows
 MAX_LOGGED = 2000  # characters of parameters in the log
-MAX_NAME = (
-    64  # characters of a controller's name on the wire; the end of a path identifies it better than its beginning
-)
+MAX_NAME = 64  # characters of a controller's name on the wire; of a path these are the last
 
 
 class LiveParameters:

@@ -7,7 +7,6 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from snakesim_hal.controller import Controller, decode_parameters
 from snakesim_hal.model.field_docs import FieldDoc, document_fields
 from snakesim_hal.model.field_types import alternatives
 from snakesim_hal.model.field_words import item_types
@@ -18,9 +17,9 @@ from snakesim_hal.model.plugins import (
     PHYSICS_MODELS,
     find_installed,
     list_installed,
-    plugin_settings,
 )
 from snakesim_hal.model.scenario import Loaded, RunConfig
+from snakesim_operator.this_computer.plugin_sections import decode_section, section_type
 
 PLUGIN_SECTIONS = {"controllers": CONTROLLERS, "backends": BACKENDS}
 JOINTS = "robot.joints"  # a table by name, which may have an entry for every joint of the robot
@@ -94,7 +93,7 @@ def _keys_of_physics_model(model: str, values: Any, name: str) -> Iterator[Key]:
     if plugin is None:
         yield from _keys_not_checked(values, name)
         return
-    checked = plugin_settings(plugin, values, "the scenario", name)
+    checked = decode_section(plugin, values, "the scenario", name)
     yield from _keys_of_struct(section_type(plugin), msgspec.to_builtins(checked), f"{name}.")
 
 
@@ -177,23 +176,7 @@ def _name_in(named: str, section: str) -> list[str]:
 def _keys_of_settings(loaded: Loaded, plugin: Any, given: dict[str, Any], section: str) -> Iterator[Key]:
     required = [doc.name for doc in document_fields(section_type(plugin)) if doc.default is None]
     if all(name in given for name in required):
-        checked = _check_section(plugin, given, loaded, section)
+        checked = decode_section(plugin, given, loaded.table.source, section, loaded.table.origin)
         yield from _keys_of_struct(section_type(plugin), msgspec.to_builtins(checked), f"{section}.")
     else:  # of a plugin that the scenario does not use
         yield from _keys_of_struct(section_type(plugin), given, f"{section}.")
-
-
-def section_type(plugin: Any) -> type[msgspec.Struct]:
-    """Return the Struct of a plugin's section: the parameters of a controller, or the settings of another plugin."""
-    if isinstance(plugin, type) and issubclass(plugin, Controller):
-        return plugin.Parameters
-    return plugin.Settings
-
-
-def _check_section(plugin: Any, given: dict[str, Any], loaded: Loaded, section: str) -> msgspec.Struct:
-    """Return the decoded section of a plugin. Raises ConfigError for a wrong value."""
-    source = loaded.table.source
-    origin = loaded.table.origin
-    if isinstance(plugin, type) and issubclass(plugin, Controller):
-        return decode_parameters(plugin, given, source, section, origin)
-    return plugin_settings(plugin, given, source, section, origin)

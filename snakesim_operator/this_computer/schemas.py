@@ -8,10 +8,9 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.controller import load_controller
 from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.model.json_schema import make_schema
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS, find_plugin, list_installed
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scene import SceneFile
@@ -20,6 +19,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
 from snakesim_hal.wire.messages import VERSIONS
 from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.this_computer.plugin_sections import list_shipped_plugins, section_type
 from snakesim_operator.this_computer.roles_page import roles_page
 
 KEYS, TITLE = "keys.md", "# Key space"
@@ -62,27 +62,11 @@ def contract() -> Iterator[tuple[str, str]]:
     yield "files/scene.json", _schema(SceneFile)
     yield "files/run.json", _schema(RunConfig)
     yield "files/summary.json", _schema(RunSummary)
-    for name, struct in _shipped_plugins(FILES):
+    for name, struct in list_shipped_plugins(FILES):
         yield f"files/{name}.json", _schema(struct)
-    for group, section in ((BACKENDS, "backends"), (PHYSICS_MODELS, "physics_models")):
-        for name, plugin in _shipped_plugins(group):
-            yield f"files/{section}.{name}.json", _schema(plugin.Settings)
-    for name in list_installed(CONTROLLERS):
-        controller = load_controller(name)
-        if _is_shipped(controller):
-            yield f"files/control.{name}.json", _schema(controller.Parameters)
-
-
-def _shipped_plugins(group: str) -> Iterator[tuple[str, Any]]:
-    """Yield name and object of the plugins of this project."""
-    for name in list_installed(group):
-        plugin = find_plugin(group, name)
-        if _is_shipped(plugin):
-            yield name, plugin
-
-
-def _is_shipped(plugin: Any) -> bool:
-    return plugin.__module__.startswith("snakesim_")
+    for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control"), (PHYSICS_MODELS, "physics_models")):
+        for name, plugin in list_shipped_plugins(group):
+            yield f"files/{section}.{name}.json", _schema(section_type(plugin))
 
 
 def _schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -> str:

@@ -24,16 +24,6 @@ UV = REPOSITORY / ".tools" / "bin" / "uv"
 needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
 LEFT_OUT_EVERYWHERE = ("*.egg-info", "__pycache__", ".*_cache")
 LEFT_OUT_OF_ROOT = (".venv", ".tools", ".git", "runs", "build")
-
-
-def leave_out(folder: str, names: list[str]) -> set[str]:
-    """Return what a copy of the repository leaves out. `snakesim_testing/runs` is part of it, `runs` is not."""
-    patterns = LEFT_OUT_EVERYWHERE
-    if Path(folder) == REPOSITORY:
-        patterns += LEFT_OUT_OF_ROOT
-    return {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
-
-
 PROLOGUE = """\
 set -eum
 ip link set lo up 2>/dev/null || true
@@ -52,6 +42,14 @@ await_running() {
 }
 trap 'code=$?; end_background; cat background-*.log 2>/dev/null || true; exit $code' EXIT
 """
+
+
+def leave_out(folder: str, names: list[str]) -> set[str]:
+    """Return what a copy of the repository leaves out. `snakesim_testing/runs` is part of it, `runs` is not."""
+    patterns = LEFT_OUT_EVERYWHERE
+    if Path(folder) == REPOSITORY:
+        patterns += LEFT_OUT_OF_ROOT
+    return {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
 
 
 @dataclass
