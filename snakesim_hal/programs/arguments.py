@@ -114,7 +114,7 @@ def add_fields(parser: argparse.ArgumentParser, about: str, default: int | None 
 
 def add_resume(parser: argparse.ArgumentParser) -> None:
     """Add the option that continues what is in `--out`."""
-    parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
+    parser.add_argument("--resume", action="store_true", help="continue with what is in --out")
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

@@ -192,7 +192,7 @@ COMMANDS: Commands = (
     ),
     Command(
         name="param set",
-        help="Change parameters, all or none; the controller goes on with them, and they are recorded.",
+        help="Change parameters, all or none; the controller continues with them, and they are recorded.",
         add=_add_param_set,
         run=_param_set,
         examples=("param set control.speed_kp_s=0.3", "param set control.speed_kp_s=0.3 --namespace planar13"),

@@ -453,7 +453,7 @@ HEADINGS: tuple[Heading, ...] = (
     ),
     Heading(
         "an emergency stop while the network is flooded, occupied or held up",
-        "stopped at once, whatever else goes on",
+        "stopped at once, regardless of traffic",
         f"{STOP_MS:.0f} ms",
         (
             flood_row("stop_half_open", "300 half-open connections", "half_open"),

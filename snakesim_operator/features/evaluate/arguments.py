@@ -64,7 +64,10 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
     )
     _add_seeds(parser, "runs for each trial, or fields for each row (default: 1)")
     parser.add_argument(
-        "--storage", type=Path, metavar="FILE", help="SQLite file; an old one goes on (default: a new one in runs/)"
+        "--storage",
+        type=Path,
+        metavar="FILE",
+        help="SQLite file; an existing one is continued (default: a new one in runs/)",
     )
     add_set(parser)
     _add_study_seed(parser)
@@ -233,8 +236,8 @@ COMMANDS: Commands = (
         help="Run controllers on many fields; writes a table with confidence intervals, and a page.",
         add=_add_evaluate,
         run=_evaluate,
-        details="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run; "
-        "130 stopped by Ctrl-C, and --resume goes on.",
+        details="Exit code: 0 all cases ran, also if their runs failed; 1 some could not; 2 wrong input, nothing was "
+        "run; 130 stopped by Ctrl-C; continue with --resume.",
         examples=(
             "study evaluate clutter --controllers obstacle_aided,hold --fields 20",
             "study evaluate ./suite.toml --out runs/suite --resume",

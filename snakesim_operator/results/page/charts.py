@@ -147,7 +147,7 @@ def joint_map(
 ) -> Figure:
     """Values (n, joints) over time, a row a joint, head on top; `full` is drawn in full color.
 
-    frames: from when to when a joint is framed.
+    frames: begin (s), end (s) and joint index of each frame that marks a joint.
     """
     columns = strongest(values, MAP_COLUMNS)
     step_s = until_s / len(columns)
