@@ -43,6 +43,8 @@ PARTS = {
             "verification/test_import_contracts.py",
             "verification/test_docstring_names.py",
             "verification/soak/test_judgement.py",
+            "verification/faults/test_fault_table.py",
+            "verification/attack/test_stranger.py",
             "verification/fuzz",
         ),
     ),

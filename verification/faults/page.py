@@ -41,9 +41,9 @@ INTRODUCTION = """\
 
 # The fault table
 
-`make faults` writes this page{days}; do not edit it. It summarizes
-[fault-table.csv]({table}), which has deadline, median, worst value, recovery, machine and notes of each
-measurement. [faults.json](faults.json) has every trial.
+This page summarizes [fault-table.csv]({table}){days}. The table has
+deadline, median, worst value, recovery, machine and notes of each measurement. [faults.json](faults.json) has every
+trial.
 
 **{met} of {wanted} measurements met**, {failed} not met, {left} not run. A measurement is met if the robot reacted as
 expected within the deadline in its worst trial.
@@ -61,7 +61,7 @@ EXPLANATION = """\
   angle (allowed: 0.35 rad).
 * **Retried.** A trial is repeated if the robot had stopped before the injection, as on a busy machine.
 
-Measure one row again with `python -m tests.faults --rows NAME --write`.
+Measure one row again with `python -m verification.faults --rows NAME --write`.
 """
 
 Results = Mapping[tuple[str, str], Result]
