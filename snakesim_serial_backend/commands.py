@@ -1,4 +1,4 @@
-"""The commands `snakesim drive` for Dynamixel servos. Importable without the extra `dynamixel`."""
+"""The commands `snakesim drive` for Dynamixel servos. Importable without the extra `serial`."""
 
 import argparse
 
