@@ -10,7 +10,8 @@ import numpy as np
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
-from snakesim_hal.network.session import Link, Publisher, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import JointCommand, Mode

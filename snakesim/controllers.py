@@ -16,8 +16,8 @@ from snakesim_hal.controller import (
     Observation,
     Telemetry,
     positions,
-    require_controller,
 )
+from snakesim_hal.model.plugins import require_base_class
 from snakesim_hal.wire.messages import JointState
 
 JointFunction = Callable[[float, JointState], Sequence[float]]
@@ -42,7 +42,7 @@ def name_controller(controller: ControllerArgument) -> tuple[str, type[Controlle
         return os.fspath(controller), None
     if isinstance(controller, type):
         name = f"program:{controller.__name__}"
-        return name, require_controller(controller, name)
+        return name, require_base_class(controller, Controller, f"controller {name!r}")
     if isinstance(controller, Controller):
         raise ConfigError(
             f"controller={controller!r:.60}: give its class; every arming makes an object of it",

@@ -21,8 +21,9 @@ from snakesim_hal.controller import positions
 from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import read_session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.custom_sample import find_message_type

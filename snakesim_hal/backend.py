@@ -157,7 +157,7 @@ class Backend(ABC):
 
         Args:
             setpoints: Setpoints within every limit. Isolated joints are passive in them.
-            lifecycle: "armed": drives may be switched on. "fault": drives that follow go on, to brake, and no other is
+            lifecycle: "armed": drives may be switched on. "fault": drives that follow continue, to brake; no other is
                 switched on. "disarmed" and "estop": all drives are off.
 
         Raises:
@@ -169,7 +169,7 @@ class Backend(ABC):
         """Let one control period pass: a simulator steps, a driver sends and receives, without sleeping.
 
         Raises:
-            BackendError: The robot cannot go on. The run ends.
+            BackendError: The robot cannot continue. The run ends.
         """
 
     def faults(self) -> list[Fault]:

@@ -4,7 +4,6 @@
 `ControllerCommand` what it returns. `load_controller` finds the class that a configuration names.
 """
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ import msgspec
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.files import FileStruct, Table, decode
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin
+from snakesim_hal.model.plugins import CONTROLLERS, describe_plugin, find_plugin, require_base_class
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, find_start_pose
 from snakesim_hal.wire.messages import (
     Description,
@@ -60,7 +59,7 @@ class Observation:
     """The inputs of a controller at one tick. All times are times of the robot, not of the computer."""
 
     tick: int  # number of the control cycle
-    time_s: float  # since arming; it goes on when new parameters replace the controller during an arm session
+    time_s: float  # since arming; it continues when new parameters replace the controller during an arm session
     period_s: float  # of the control cycle
     joints: JointState  # angles, velocities and torques, tail to head; always fresh
     world: World | None  # pose, contacts and obstacles; None: there is none yet, or it is too old
@@ -226,46 +225,7 @@ class Controller(ABC, Generic[ParametersT]):
 
 def load_controller(name: str) -> type[Controller[Any]]:
     """Return the class of a controller by its name; a file is loaded, which runs its code. Raises ConfigError."""
-    return require_controller(find_plugin(CONTROLLERS, name), name)
-
-
-def require_controller(plugin: Any, name: str) -> type[Controller[Any]]:
-    """Return a plugin that is a controller class with a method `update`.
-
-    Args:
-        plugin: any object, such as what a file defines.
-        name: the controller as configured, for the error.
-
-    Raises:
-        ConfigError: it is not; the text names the class, its file, and what to write instead.
-    """
-    where = f"controller {shorten(name)!r}: {_describe_plugin(plugin)}"
-    if not (isinstance(plugin, type) and issubclass(plugin, Controller)):
-        class_name = plugin.__name__ if isinstance(plugin, type) else "Name"
-        raise ConfigError(
-            f"{where} does not derive from Controller, the base class of all controllers. Write "
-            f"`class {class_name}(snakesim.Controller):`, after `import snakesim`; "
-            "docs/reference/controllers.md has an example",
-            code="plugin/not-loadable",
-        )
-    if inspect.isabstract(plugin):
-        raise ConfigError(
-            f"{where} has no method `update`. Add `def update(self, observation):`, which returns a "
-            "snakesim.ControllerCommand",
-            code="plugin/not-loadable",
-        )
-    return plugin
-
-
-def _describe_plugin(plugin: Any) -> str:
-    """Return the kind, the name and the file of an object, as an error names it."""
-    if not isinstance(plugin, type):
-        return f"the object {shorten(repr(plugin))} (of class {type(plugin).__name__})"
-    try:
-        place = inspect.getfile(plugin)
-    except (TypeError, OSError):  # such as a class of a notebook
-        place = f"module {plugin.__module__}"
-    return f"class {plugin.__name__} in {place}"
+    return require_base_class(find_plugin(CONTROLLERS, name), Controller, f"controller {shorten(name)!r}")
 
 
 def decode_parameters(
@@ -292,7 +252,7 @@ def decode_parameters(
     """
     if not (isinstance(controller.Parameters, type) and issubclass(controller.Parameters, msgspec.Struct)):
         raise ConfigError(
-            f"{_describe_plugin(controller)}: `Parameters` is {shorten(repr(controller.Parameters))}, must be a class "
+            f"{describe_plugin(controller)}: `Parameters` is {shorten(repr(controller.Parameters))}, must be a class "
             "that derives from snakesim.Parameters"
         )
     return decode(Table(section, source, origin or {}), controller.Parameters, where)

@@ -16,9 +16,9 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
+from snakesim_hal.model.placement import Placed
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
-from snakesim_hal.model.scene import Placed
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor

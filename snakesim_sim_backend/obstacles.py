@@ -8,7 +8,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.scene import Placed
+from snakesim_hal.model.placement import Placed
 from snakesim_sim_backend.ground import GROUND_GROUP, SAND
 from snakesim_sim_backend.surface import ContactParameters
 from snakesim_sim_backend.yielding import JOINT_OF_AXIS, compute_mass_kg

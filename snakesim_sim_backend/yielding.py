@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scene import Placed
+from snakesim_hal.model.placement import Placed
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_sim_backend.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
 

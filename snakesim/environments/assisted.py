@@ -10,8 +10,9 @@ import msgspec
 from snakesim_gnc.control.service import SENSED
 from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, load_controller
+from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
-from snakesim_hal.model.scenario import CONTROL, RunConfig
+from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (

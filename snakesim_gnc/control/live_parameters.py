@@ -17,7 +17,7 @@ from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Query
+from snakesim_hal.network.streams import Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE, Decoder
 from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, Description, ParametersRequest

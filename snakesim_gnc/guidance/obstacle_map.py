@@ -115,13 +115,13 @@ class ObstacleMap:
         for position_w, normal_w in touches:
             track = self.find_track(position_w)
             if track is None:
-                track = self._start_felt_track(position_w, normal_w)
+                track = self._start_touched_track(position_w, normal_w)
             self._update_drift(track)
             # The normal of a cylinder leads through its center; that of a box hardly determines its place.
             is_round = track.shape == "cylinder"
             normal_weight = 1.0 / (NORMAL_SD_RAD * track.radius_m) ** 2 if is_round else 0.0
             track.surface.add(position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([normal_weight]))
-            track.felt = True
+            track.touched = True
             track.last_seen_ns = max(track.last_seen_ns, timestamp_ns)
             track.add_evidence(TOUCH_LOG_ODDS)
             touched[track.number] = track
@@ -281,7 +281,7 @@ class ObstacleMap:
             return False
         old.surface = both.surface
         old.cost = math.inf
-        old.felt = old.felt or new.felt
+        old.touched = old.touched or new.touched
         old.top_m = max(old.top_m, new.top_m)
         old.log_odds = max(old.log_odds, new.log_odds)
         old.last_seen_ns = max(old.last_seen_ns, new.last_seen_ns)
@@ -297,9 +297,9 @@ class ObstacleMap:
     def _start_seen_track(self) -> Track:
         return self._start_track("seen")
 
-    def _start_felt_track(self, position_w: Floats, normal_w: Floats) -> Track:
+    def _start_touched_track(self, position_w: Floats, normal_w: Floats) -> Track:
         """Start a track at a touch, with its center one prior radius behind the point."""
-        track = self._start_track("felt")
+        track = self._start_track("touched")
         track.center_w = position_w - RADIUS_M * normal_w
         track.position_sd_m = RADIUS_SD_M
         return track

@@ -52,7 +52,7 @@ class Track:
     name: str
     # What was measured.
     surface: Surface = field(default_factory=Surface)
-    felt: bool = False  # the body has touched it
+    touched: bool = False  # the body has touched it
     log_odds: float = 0.0
     last_seen_ns: int = 0
     top_m: float = 0.0  # highest point seen, above the ground
@@ -106,7 +106,7 @@ class Track:
             position_sd_m=min(self.position_sd_m, MAX_SD_M),
             size_sd_m=min(self.size_sd_m, MAX_SD_M),
             last_seen_ns=self.last_seen_ns,
-            felt=self.felt,
+            touched=self.touched,
         )
 
     def use_circle(self, circles: Circles, row: int, cost: float) -> None:

@@ -1,4 +1,4 @@
-"""Names of array types. Shape and unit are given where an array is used."""
+"""Names of array types. Shape and unit stand where an array is used."""
 
 import numpy as np
 from numpy.typing import NDArray

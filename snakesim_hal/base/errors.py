@@ -71,7 +71,7 @@ class ServiceError(SnakesimError, RuntimeError):
 
 
 class BackendError(SnakesimError, RuntimeError):
-    """A backend cannot go on: a diverged simulation, a dead bus. The host reports it and stops the robot."""
+    """A backend cannot continue: a diverged simulation, a dead bus. The host reports it and stops the robot."""
 
     code = "backend/failed"
 

@@ -84,11 +84,11 @@ def discard_output(stream: TextIO) -> None:
     os.close(null)
 
 
-def print_json(value: Any, say: PrintLine = print_line) -> None:
+def print_json(value: Any, print_text: PrintLine = print_line) -> None:
     """Print a value, such as a Struct, as one line of JSON: for scripts. NaN and infinity become null."""
     import msgspec  # most commands print none
 
-    say(msgspec.json.encode(value).decode())
+    print_text(msgspec.json.encode(value).decode())
 
 
 def print_stderr(line: str) -> None:

@@ -1,4 +1,4 @@
-"""Worker threads that do not die unnoticed: an unexpected error is reported, and the work goes on.
+"""Worker threads that do not die unnoticed: an unexpected error is reported, and the work continues.
 
 A thread that ends by an exception ends nothing else, so its failure is easily missed, and other threads wait for its
 work for ever: an emergency stop is not served, or a log is not read. So every thread that serves others begins again
@@ -58,7 +58,7 @@ def _work_on(
         try:
             work()
             return
-        except Exception as error:  # noqa: BLE001 - this thread's outermost loop: it reports, and goes on
+        except Exception as error:  # noqa: BLE001 - this thread's outermost loop: it reports, and continues
             report.write(error)
             if on_error is not None:
                 _clean_up(error, on_error, report)

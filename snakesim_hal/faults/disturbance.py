@@ -115,7 +115,7 @@ class Disturbance:
         return probability > 0.0 and self._random.random() < probability
 
     def _delay(self, payloads: list[bytes], now_s: float) -> list[bytes]:
-        """Queue payloads behind the delayed ones, so that the order is kept. Returns those to send now."""
+        """Queue payloads behind the delayed ones, so that their order stays. Returns those to send now."""
         delay_s = self._amounts.get("delay", 0.0)
         if not delay_s and not self._delayed:
             return payloads

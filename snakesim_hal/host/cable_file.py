@@ -58,10 +58,10 @@ class CableFile:
         """
         self._path = folder / CABLES
         self._owners: dict[str, tuple[str, str]] = {}  # joint name -> drive, `cable_unwound`
-        wanted: list[CableJoint] = []
+        cable_joints: list[CableJoint] = []
         seen_rad: dict[str, float] = {}
         unknown: dict[str, str] = {}
-        kept = self._read()
+        stored_angles = self._read()
         for i, joint in enumerate(joints):
             turns = joint.limits.cable_turns
             if turns is None:
@@ -69,16 +69,16 @@ class CableFile:
                     unknown[joint.name] = NO_STOPS.format(joint.limits.lower_rad, joint.limits.upper_rad)
                 continue
             described = robot.joints[i]
-            wanted.append(CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, turns))
+            cable_joints.append(CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, turns))
             owner = f"{described.serial} {joint.drive.sign:+d} {joint.drive.zero_rad:.6g}".strip()
             self._owners[joint.name] = (owner, joint.limits.cable_unwound)
-            angle_rad = _find_angle(kept, joint, owner, now_s)
+            angle_rad = _find_angle(stored_angles, joint, owner, now_s)
             if isinstance(angle_rad, str):
                 reason = angle_rad
                 unknown[joint.name] = f"how far its cable is wound is not known: {reason}; {WAY_OUT}"
             else:
                 seen_rad[joint.name] = angle_rad
-        self.cables = Cables(wanted, seen_rad, unknown)
+        self.cables = Cables(cable_joints, seen_rad, unknown)
         self._writer = Sender("cables")
 
     def update(self, joints: JointState) -> None:
@@ -114,7 +114,7 @@ class CableFile:
         try:
             return msgspec.json.decode(self._path.read_bytes(), type=dict[str, StoredCable])
         except FileNotFoundError:
-            return f"no host before this one has kept it in {self._path}"
+            return f"no host before this one has stored it in {self._path}"
         except (OSError, *UNDECODABLE):
             return f"{self._path} cannot be read"
 
@@ -152,11 +152,11 @@ def _find_angle(stored_cables: Mapping[str, StoredCable] | str, joint: Joint, dr
     else:
         stored = stored_cables.get(joint.name)
         if stored is None:
-            reason = "no host has kept it"
+            reason = "no host has stored it"
         elif stored.drive == drive and stored.unwound == declared:
             return stored.angle_rad
         else:
-            reason = f"what is kept is of another drive, sign or zero ({stored.drive}, now {drive})"
+            reason = f"the stored angle is of another drive, sign or zero ({stored.drive}, now {drive})"
     if not declared:
         return reason
     try:

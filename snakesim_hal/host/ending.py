@@ -4,7 +4,7 @@ from snakesim_hal.run_log.host_record import Ending
 
 
 class RunEnding:
-    """The end of one run, once it has been requested. The first reason is kept."""
+    """The end of one run, once it has been requested. The first reason counts."""
 
     def __init__(self) -> None:
         self.requested = False

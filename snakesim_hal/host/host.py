@@ -460,7 +460,7 @@ class Host:
         self.authority.record_fault(Fault(tick=tick, what="service_stalled", cause=cause))
 
     def _wait_for_next_tick(self) -> None:
-        """Wait in real time until the next tick is due, and count how this one kept time."""
+        """Wait in real time until the next tick is due, and record whether this one was on time."""
         clock = self._state.clock
         is_armed = self.authority.state == "armed"
         late_ns: int | None = None

@@ -32,7 +32,7 @@ class HostClock:
         It is simulated time in lockstep, and otherwise the monotonic clock, except for pauses.
 
         Args:
-            monotonic_ns: The instant; None means now.
+            monotonic_ns: The moment; None means now.
         """
         return self.simulated.safety_ns(self.tick, monotonic_ns)
 

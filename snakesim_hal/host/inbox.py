@@ -15,7 +15,8 @@ from typing import Protocol
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.host.request_handler import Reply, Request
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, Query, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival, Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (

@@ -15,7 +15,8 @@ from typing import Any
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Publisher, Query, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Publisher, Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status

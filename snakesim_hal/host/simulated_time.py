@@ -13,7 +13,7 @@ from typing import NamedTuple
 from snakesim_hal.wire.messages import ClockMode, Description, SimulatorRequest
 
 MEASURED_OVER_NS = 1_000_000_000  # of the real-time factor
-MIN_SPEED_RATIO = 0.95  # of the wanted speed; below, the status reports that it is not reached
+MIN_SPEED_RATIO = 0.95  # of the requested speed; below, the status reports that it is not reached
 
 
 class Refusal(NamedTuple):
@@ -38,7 +38,7 @@ class SimulatedTime:
         self._clock_mode = clock_mode
         self._clock = clock
         # As requested.
-        self.speed = 1.0  # wanted robot time per wall time; counts in clock mode realtime
+        self.speed = 1.0  # requested robot time per wall time; counts in clock mode realtime
         self.paused_by: str | None = None
         self._steps = 0  # ticks until it pauses again
         # As measured.
@@ -57,7 +57,7 @@ class SimulatedTime:
 
         Args:
             tick: the tick.
-            monotonic_ns: the instant in that tick; None: now.
+            monotonic_ns: the moment in that tick; None: now.
         """
         period_ns = self._description.period_ns
         if self._clock_mode == "lockstep":
@@ -126,10 +126,10 @@ class SimulatedTime:
         self._steps = max(self._steps - 1, 0)
 
     def find_slowness(self) -> list[str]:
-        """Return a text that the wanted speed is not reached; empty if it is, or if no other speed than 1 is wanted."""
+        """Return a text that the requested speed is not reached; empty if it is, or if it is 1."""
         if self.speed == 1.0 or self.real_time_factor is None or self.real_time_factor >= MIN_SPEED_RATIO * self.speed:
             return []
-        return [f"speed {self.speed:g} is wanted, {self.real_time_factor:.2g} reached"]
+        return [f"speed {self.speed:g} is requested, {self.real_time_factor:.2g} reached"]
 
     def _rebase(self, tick: int) -> None:
         """Begin another rate of safety time, and another measurement, at this tick."""

@@ -99,7 +99,7 @@ def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], rob
     if (checked.backend, checked.hardware) != (robot.backend, robot.hardware):
         checked_on = f"{checked.backend} {checked.hardware}"
         now_on = f"{robot.backend} {robot.hardware}"
-        return f"its drives do not say who they are, and it is on {now_on} now, {checked_on} {since}: {again}"
+        return f"its drives do not report an identity, and it is on {now_on} now, {checked_on} {since}: {again}"
     return ""
 
 

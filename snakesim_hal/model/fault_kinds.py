@@ -105,7 +105,8 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
             in_module="a second module or drive with the same id and another serial number is on the bus",
         ),
         "overheat": Kind(
-            "its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given", ("module",)
+            "its winding is heated to 5 °C above `stop_at_c`; it stays there until the end of the fault, if one is set",
+            ("module",),
         ),
         "leak": Kind("detects water inside", ("module",)),
         "babble": Kind("sends its heartbeat as often as the bus allows", ("module",)),
@@ -417,7 +418,7 @@ def _explain_amount(amount: Amount | None) -> str:
     if amount is None:
         return ""
     unit = "" if amount.unit == "1" else f" {amount.unit}"
-    return f"; amount: {amount.description}, {amount.default:g}{unit} if not given"
+    return f"; amount: {amount.description}, {amount.default:g}{unit} by default"
 
 
 def kinds_in_short() -> str:

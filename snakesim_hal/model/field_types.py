@@ -16,39 +16,39 @@ class Violation:
     kind: Literal["unknown", "missing", "wrong"]
     steps: list[str]  # names and numbers that lead from the whole value to the place
     value: Any = None  # if it is wrong
-    wanted: Any = None  # the type that is expected there
+    expected: Any = None  # the type that is expected there
     why: str = ""  # the reason that msgspec gives
     known: Sequence[str] = ()  # the allowed fields beside an unknown one
 
 
-def first_violation(value: Any, wanted: Any, steps: Sequence[str] = ()) -> Violation | None:
-    """Return the innermost part of a value that is wrong by itself, or None if the value has the wanted type.
+def first_violation(value: Any, expected: Any, steps: Sequence[str] = ()) -> Violation | None:
+    """Return the innermost part of a value that is wrong by itself, or None if the value has the expected type.
 
     Args:
         value: as read from TOML or JSON.
-        wanted: a type that msgspec can check.
+        expected: a type that msgspec can check.
         steps: the way from the whole file to the value.
     """
     try:
-        msgspec.convert(value, wanted)
+        msgspec.convert(value, expected)
     except msgspec.ValidationError as error:
         why = str(error)
     else:
         return None
     if isinstance(value, dict):
-        violation = _violation_of_section(value, wanted, steps)
+        violation = _violation_of_section(value, expected, steps)
         if violation is not None:
             return violation
-    for step, part, part_type in _parts(value, wanted):
+    for step, part, part_type in _parts(value, expected):
         violation = first_violation(part, part_type, [*steps, step])
         if violation is not None:
             return violation
-    return Violation("wrong", list(steps), value, wanted, why)
+    return Violation("wrong", list(steps), value, expected, why)
 
 
-def _violation_of_section(section: dict[str, Any], wanted: Any, steps: Sequence[str]) -> Violation | None:
+def _violation_of_section(section: dict[str, Any], expected: Any, steps: Sequence[str]) -> Violation | None:
     """Return a violation by the section's own fields, not by what is inside of them."""
-    structs = [option for option in _options(wanted) if _is_struct(option)]
+    structs = [option for option in _options(expected) if _is_struct(option)]
     if not structs:
         return None
     matching = [struct for struct in structs if _tag_matches(section, struct)]
@@ -72,7 +72,7 @@ def _violation_of_fields(
                 return Violation("unknown", [*steps, name], known=known)
     for field in fields:
         if field.required and field.encode_name not in section:
-            return Violation("missing", [*steps, field.encode_name], wanted=field.type)
+            return Violation("missing", [*steps, field.encode_name], expected=field.type)
     return None
 
 
@@ -82,15 +82,15 @@ def _violation_of_tag(
     """Return the violation of a section whose tag is missing, or belongs to none of the Structs."""
     tag_field = str(structs[0].__struct_config__.tag_field)
     tags = tuple(struct.__struct_config__.tag for struct in structs)
-    wanted = Literal[tags]
+    expected = Literal[tags]
     if tag_field not in section:
-        return Violation("missing", [*steps, tag_field], wanted=wanted)
-    return Violation("wrong", [*steps, tag_field], section[tag_field], wanted, "there is no such kind")
+        return Violation("missing", [*steps, tag_field], expected=expected)
+    return Violation("wrong", [*steps, tag_field], section[tag_field], expected, "there is no such kind")
 
 
-def _parts(value: Any, wanted: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield every part inside of a value as (step, part, wanted type)."""
-    for option in _options(wanted):
+def _parts(value: Any, expected: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield every part inside of a value as (step, part, expected type)."""
+    for option in _options(expected):
         container = get_origin(option)
         arguments = get_args(option)
         if isinstance(value, dict) and _is_struct(option) and _tag_matches(value, option):
@@ -110,14 +110,14 @@ def _parts(value: Any, wanted: Any) -> Iterator[tuple[str, Any, Any]]:
                 yield str(i), part, part_type
 
 
-def _options(wanted: Any) -> list[Any]:
+def _options(expected: Any) -> list[Any]:
     """Return the alternatives of a union, without annotations; for any other type, only that type."""
-    origin = get_origin(wanted)
+    origin = get_origin(expected)
     if origin is Annotated:
-        return _options(get_args(wanted)[0])
+        return _options(get_args(expected)[0])
     if origin in (Union, UnionType):
-        return [leaf for option in get_args(wanted) for leaf in _options(option)]
-    return [wanted]
+        return [leaf for option in get_args(expected) for leaf in _options(option)]
+    return [expected]
 
 
 def _is_struct(option: Any) -> bool:

@@ -297,8 +297,8 @@ def _explain(violation: Violation, table: Table, under: str) -> str:
             full_key = ".".join([*steps, name])
             return _explain_unknown(violation, table, dotted, full_key)
         case "missing":
-            wanted = in_words(msgspec.inspect.type_info(violation.wanted))
-            return f"{table.file_of(dotted)}: field `{dotted}` is missing; add it ({wanted})."
+            expected = in_words(msgspec.inspect.type_info(violation.expected))
+            return f"{table.file_of(dotted)}: field `{dotted}` is missing; add it ({expected})."
         case "wrong":
             return _explain_wrong(violation, table, dotted)
 
@@ -337,7 +337,7 @@ def _explain_wrong(violation: Violation, table: Table, dotted: str) -> str:
     if each_field_is_right:  # the check of the whole section has failed
         return f"{origin}: `{dotted}`: {why}" if dotted else f"{origin}: {why}"
 
-    info = msgspec.inspect.type_info(violation.wanted)
+    info = msgspec.inspect.type_info(violation.expected)
     unit = unit_of(info)
     shown = shorten(_repr(value))
     if unit and isinstance(value, int | float):

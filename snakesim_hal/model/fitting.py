@@ -22,13 +22,13 @@ def spacing_m(robot: RobotFile) -> float | None:
     return max(between_joints_m, default=None)
 
 
-def fit_scene(scene: SceneFile, robot: RobotFile, is_given: Callable[[str], bool]) -> dict[str, Any]:
+def fit_scene(scene: SceneFile, robot: RobotFile, is_set_by_flag: Callable[[str], bool]) -> dict[str, Any]:
     """Return the values of a scene that differ for this robot, by dotted key below `scene`.
 
     Args:
         scene: laid out for its `reference_robot`.
         robot: the robot of the run.
-        is_given: returns whether a flag gives the value of a key; such a value is kept.
+        is_set_by_flag: returns whether a flag sets the value of a key; such a value does not change.
     """
     reference_robot = scene.reference_robot
     robot_spacing_m = spacing_m(robot)
@@ -50,7 +50,7 @@ def fit_scene(scene: SceneFile, robot: RobotFile, is_given: Callable[[str], bool
         changed["route.amplitude_m"] = scale * route.amplitude_m
         changed["route.wavelength_m"] = scale * route.wavelength_m
         changed["route.length_m"] = scale * route.length_m
-        if not is_given("route.length_m"):
+        if not is_set_by_flag("route.length_m"):
             longer_route_m = (scale - 1.0) * route.length_m
     for i, row in enumerate(scene.pegs_along_route):
         body_clearance_m = row.corridor_m - reference_robot.radius_m
@@ -61,4 +61,4 @@ def fit_scene(scene: SceneFile, robot: RobotFile, is_given: Callable[[str], bool
         changed[f"random_field.{i}.min_corner_m"] = [min_x + longer_route_m, min_y]
         changed[f"random_field.{i}.max_corner_m"] = [max_x + longer_route_m, max_y]
         changed[f"random_field.{i}.clearance_m"] = max(field.clearance_m + 2.0 * extra_radius_m, 0.0)
-    return {key: value for key, value in changed.items() if not is_given(key)}
+    return {key: value for key, value in changed.items() if not is_set_by_flag(key)}

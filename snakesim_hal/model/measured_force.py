@@ -1,6 +1,6 @@
 """The contact force as a robot would measure it: the impulse over 50 ms, divided by that time.
 
-The force at one instant depends more on how hard the surfaces are than on the push: a body that slides along a peg
+The force at one moment depends more on how hard the surfaces are than on the push: a body that slides along a peg
 bounces off it within milliseconds. The impulse is what the contact does to the body.
 """
 

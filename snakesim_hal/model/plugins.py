@@ -7,13 +7,13 @@ program that runs everything in one process may also offer its own objects by na
 import ast
 import contextlib
 import importlib.util
+import inspect
 import sys
-from abc import ABC
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -21,6 +21,8 @@ from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.files import Table, decode, expand_home
 from snakesim_hal.model.sibling_modules import find_siblings_of
 from snakesim_hal.model.textfiles import read_bytes
+
+BaseT = TypeVar("BaseT")
 
 # Groups of entry points.
 BACKENDS = "snakesim.backends"
@@ -233,20 +235,44 @@ def _from_file(name: str, kind: str) -> Any:
     return getattr(module, attribute)
 
 
-def require_base_class(plugin: Any, base: type[ABC], label: str) -> None:
-    """Raise ConfigError if a plugin does not derive from a base class, or does not implement its abstract methods.
+def require_base_class(plugin: Any, base: type[BaseT], label: str) -> type[BaseT]:
+    """Return a plugin that is a class derived from a base class, and that implements its abstract methods.
 
     Args:
         plugin: the object that `find_plugin` has returned.
-        base: the class that describes the interface.
-        label: kind and name of the plugin, with which the error begins.
+        base: the class that describes the interface, such as `Controller`.
+        label: kind and name of the plugin, with which the error begins, such as "controller 'wave'".
+
+    Raises:
+        ConfigError: it is not. The text names the class, its file, and what to write instead.
     """
-    file = base.__module__.replace(".", "/") + ".py"
+    where = f"{label}: {describe_plugin(plugin)}"
     if not (isinstance(plugin, type) and issubclass(plugin, base)):
-        raise ConfigError(f"{label} is not derived from `{base.__name__}` in {file}: derive its class from that one")
-    missing = sorted(plugin.__abstractmethods__)
+        class_name = plugin.__name__ if isinstance(plugin, type) else "Name"
+        raise ConfigError(
+            f"{where} does not derive from {base.__name__}. Write `class {class_name}({base.__name__}):`, after "
+            f"`from {base.__module__} import {base.__name__}`",
+            code="plugin/not-loadable",
+        )
+    missing = sorted(getattr(plugin, "__abstractmethods__", ()))
     if missing:
-        raise ConfigError(f"{label} has no {', '.join(missing)}: implement what {file} describes")
+        methods = ", ".join(f"`{name}`" for name in missing)
+        raise ConfigError(
+            f"{where} has no {methods}: implement it as {base.__name__} in {base.__module__} describes",
+            code="plugin/not-loadable",
+        )
+    return plugin
+
+
+def describe_plugin(plugin: Any) -> str:
+    """Return the kind, the name and the file of an object, as an error names it."""
+    if not isinstance(plugin, type):
+        return f"the object {shorten(repr(plugin))} (of class {type(plugin).__name__})"
+    try:
+        location = inspect.getfile(plugin)
+    except (TypeError, OSError):  # such as a class of a notebook
+        location = f"module {plugin.__module__}"
+    return f"class {plugin.__name__} in {location}"
 
 
 def plugin_settings(

@@ -15,7 +15,7 @@ from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, make_block, 
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
-TRIES = 200  # random positions for each obstacle that is wanted
+TRIES = 200  # random positions that are tried for each obstacle
 LEANING = 1  # third part of the seed of the leans, so that they do not change the positions
 
 
@@ -57,7 +57,7 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Maximum angle by which an obstacle leans, in a random direction; 0: all are upright."""
 
     @property
-    def wanted(self) -> int:
+    def target_count(self) -> int:
         """Return the number of obstacles that the density asks for on this area."""
         min_x, min_y = self.min_corner_m
         max_x, max_y = self.max_corner_m
@@ -107,8 +107,8 @@ def place_random_obstacles(
     free_areas = _areas_to_keep_free(field, route, keep_clear)
     placed: list[Obstacle] = []
     others = Outlines.from_obstacles(standing)
-    for _ in range(TRIES * field.wanted):
-        if len(placed) == field.wanted:
+    for _ in range(TRIES * field.target_count):
+        if len(placed) == field.target_count:
             return placed
         candidate = _random_obstacle(field, random, f"random_{index}_{len(placed)}")
         outline = Outlines.from_obstacles([candidate])
@@ -118,9 +118,9 @@ def place_random_obstacles(
             continue
         placed.append(candidate)
         others = Outlines.from_obstacles([*standing, *placed])
-    if len(placed) < field.wanted:
+    if len(placed) < field.target_count:
         raise ConfigError(
-            f"{where}: only {len(placed)} of {field.wanted} pegs fit; lower `density_per_m2` = "
+            f"{where}: only {len(placed)} of {field.target_count} pegs fit; lower `density_per_m2` = "
             f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}",
             code="scene/invalid",
         )
@@ -157,9 +157,9 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
             f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section",
             code="scene/no-route",
         )
-    if field.wanted > MAX_RANDOM_OBSTACLES:
+    if field.target_count > MAX_RANDOM_OBSTACLES:
         raise ConfigError(
-            f"{where}: `density_per_m2` = {field.density_per_m2} asks for {field.wanted} pegs on this area; at most "
+            f"{where}: `density_per_m2` = {field.density_per_m2} means {field.target_count} pegs on this area; at most "
             f"{MAX_RANDOM_OBSTACLES}",
             code="scene/invalid",
         )

@@ -46,14 +46,14 @@ class Randomization(FileStruct, frozen=True, kw_only=True):
         return [Override(key, value, origin) for key in self.set]
 
 
-def make_randomizations(given: Mapping[str, Sequence[Any]] | None) -> list[Randomization]:
+def make_randomizations(bounds_by_keys: Mapping[str, Sequence[Any]] | None) -> list[Randomization]:
     """Return the distributions of `{"key": (low, high)}`; keys that a comma separates get the same value.
 
     Raises:
         ConfigError: The bounds of a key are not two finite numbers in order.
     """
     randomizations: list[Randomization] = []
-    for keys, bounds in (given or {}).items():
+    for keys, bounds in (bounds_by_keys or {}).items():
         try:
             low, high = (float(bound) for bound in bounds)
             key_list = [key.strip() for key in keys.split(",")]

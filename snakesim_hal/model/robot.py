@@ -73,7 +73,7 @@ class Safety(FileStruct, frozen=True, kw_only=True):
     """
 
     max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0
-    """Number of faulty joints that may be isolated, so that the robot goes on without them; with one more it stops."""
+    """Number of faulty joints that may be isolated: the robot continues without them, and stops at one more."""
 
 
 class RobotFile(FileStruct, frozen=True, kw_only=True):

@@ -226,7 +226,7 @@ def yaw_segments_m(axes: Sequence[str], link_lengths_m: Sequence[float]) -> list
 
 
 def chain_angles(axes: Sequence[str], yaw_angles_rad: Floats) -> Floats:
-    """Return the angles of all joints, (n_joints,): the yaw joints as given, every other joint straight."""
+    """Return the angles of all joints, (n_joints,): the yaw joints with their angles, every other joint straight."""
     yaw_joints = [i for i, axis in enumerate(axes) if axis == "yaw"]
     angles_rad = np.zeros(len(axes))
     angles_rad[yaw_joints] = yaw_angles_rad

@@ -1,6 +1,6 @@
 """The sensors in a robot file. docs/how-to/sensors.md describes what they publish, and how they are simulated.
 
-All noise is given as a standard deviation. A delay is the time from the measurement to the arrival at the host.
+All noise is a standard deviation. A delay is the time from the measurement to the arrival at the host.
 """
 
 import math

@@ -1,6 +1,7 @@
 """The network: the only package that imports Zenoh.
 
-`session`         publishers, readers and queries on Zenoh; `connection` opens it, `endpoint` checks addresses
+`session`         a connection over Zenoh; `streams` has its publishers, readers and queries, `connection` opens it
+`endpoint`        checks addresses
 `local_network`   the same sessions within one process, without Zenoh
 `client`          the interface of guidance, navigation and control, independent of the backend; with `feed`, `run_key`
 `robot_mismatch`  rejects messages that do not fit the robot

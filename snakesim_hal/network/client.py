@@ -17,7 +17,8 @@ from snakesim_hal.network.feed import Feed, RobotFilter
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.run_key import is_proven, own_run_key
-from snakesim_hal.network.session import Arrival, Publisher, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival, Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, MessageT
 from snakesim_hal.wire.custom_sample import find_custom_message

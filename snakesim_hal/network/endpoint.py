@@ -25,20 +25,21 @@ def check_endpoint(text: str, origin: str) -> str:
     Raises:
         ConfigError: it is not valid.
     """
-    given = f"{origin} {shorten(text)}"
+    where = f"{origin} {shorten(text)}"
     if text.startswith("unixsock-stream/") and len(text) > len("unixsock-stream/"):
         return text
     parts = _parts.fullmatch(text)
     if parts is None:
-        raise ConfigError(f"{given}: this is not an endpoint; give one {VALID}", code="network/invalid-address")
+        raise ConfigError(f"{where}: this is not an endpoint; give one {VALID}", code="network/invalid-address")
     if parts["protocol"] not in PROTOCOLS:
         raise ConfigError(
-            f"{given}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID}",
+            f"{where}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID}",
             code="network/invalid-address",
         )
     if not 1 <= int(parts["port"]) <= 65535:
         raise ConfigError(
-            f"{given}: the port is a number from 1 to 65535; give an endpoint {VALID}", code="network/invalid-address"
+            f"{where}: the port is a number from 1 to 65535; give an endpoint {VALID}",
+            code="network/invalid-address",
         )
     return text
 

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from typing import Generic
 
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.session import Reader
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Description, Message
 
 KEPT_PER_KEY = 32  # samples
-NO_TICK = -1  # of messages without a tick, such as an intent: only the newest is kept
+NO_TICK = -1  # of messages without a tick, such as an intent: only the newest counts
 
 
 class Feed(Generic[MessageT]):

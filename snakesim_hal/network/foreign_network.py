@@ -1,7 +1,7 @@
 """A second Zenoh network, with keys and payloads that are not ours: raw bytes with attachments, no namespace.
 
 A bridge joins it as a client of an explicit endpoint. That network cannot delay the robot's own one: it is another
-session, samples are dropped rather than waited for, and only the newest of each key is kept.
+session, samples are dropped rather than waited for, and only the newest of each key stays.
 
 Threads: the bridge's thread makes every call, except `RawReader.store`, which Zenoh's thread calls.
 """
@@ -51,18 +51,18 @@ class RawReader:
 
     def __init__(self, depth: int) -> None:
         """Keep at most `depth` samples."""
-        self._kept: deque[RawSample] = deque(maxlen=depth)
+        self._arrivals: deque[RawSample] = deque(maxlen=depth)
 
     def store(self, sample: zenoh.Sample) -> None:
         """Keep a sample, in Zenoh's thread."""
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        self._kept.append(RawSample(sample.payload.to_bytes(), attachment, time.monotonic_ns()))
+        self._arrivals.append(RawSample(sample.payload.to_bytes(), attachment, time.monotonic_ns()))
 
     def drain(self) -> list[RawSample]:
-        """Return the kept samples that have arrived since the last call, oldest first."""
+        """Return the samples that have arrived since the last call, oldest first."""
         samples: list[RawSample] = []
-        while self._kept:
-            samples.append(self._kept.popleft())
+        while self._arrivals:
+            samples.append(self._arrivals.popleft())
         return samples
 
     def newest(self) -> RawSample | None:

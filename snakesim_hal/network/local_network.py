@@ -1,6 +1,6 @@
 """A network within one process: its sessions pass each other the bytes that Zenoh would carry.
 
-A message has reached its readers when `put` returns; the order is kept, and nothing is lost.
+A message has reached its readers when `put` returns, in the order of sending, and nothing is lost.
 
 Threads: one thread makes every call, so callbacks run in the thread that publishes. A query therefore first runs the
 part of the process that answers it (`LocalNetwork.answer`). Only `LocalQuery.reply` may be called from another thread.
@@ -15,16 +15,8 @@ from typing import Any
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import (
-    READER_DEPTH,
-    Arrival,
-    Publisher,
-    Query,
-    Reader,
-    Session,
-    intersects,
-    reader_depth,
-)
+from snakesim_hal.network.session import Session, intersects
+from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, reader_depth
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
@@ -59,13 +51,13 @@ class LocalNetwork:
         """Return the callbacks of all subscribers of a key."""
         takers = self._takers.get(key)
         if takers is None:
-            takers = [take for pattern, take in self.subscribers if intersects(pattern, key)]
+            takers = [handle for pattern, handle in self.subscribers if intersects(pattern, key)]
             self._takers[key] = takers
         return takers
 
-    def subscribe(self, pattern: str, take: Take) -> Callable[[], None]:
+    def subscribe(self, pattern: str, handle: Take) -> Callable[[], None]:
         """Call `take` for all samples that are published from now on. Returns a function that ends it."""
-        subscriber = (pattern, take)
+        subscriber = (pattern, handle)
         self.subscribers.append(subscriber)
         self._takers.clear()
 
@@ -75,15 +67,15 @@ class LocalNetwork:
 
         return unsubscribe
 
-    def show(self, key: str, present: bool) -> None:
+    def set_token(self, key: str, present: bool) -> None:
         """Add or remove a liveliness token, and call its watchers."""
         if present:
             self.tokens.append(key)
         else:
             self.tokens.remove(key)
-        for pattern, take in self.watchers:
+        for pattern, handle in self.watchers:
             if intersects(pattern, key):
-                take(key, present)
+                handle(key, present)
 
 
 @dataclass
@@ -96,13 +88,13 @@ class Declared:
 class LocalReader(Reader[MessageT]):
     """Reads the newest samples of one key from a queue that its subscription fills."""
 
-    def __init__(self, declared: Declared, kept: deque[Arrival], message: type[MessageT], rejected: Any) -> None:
+    def __init__(self, declared: Declared, arrivals: deque[Arrival], message: type[MessageT], rejected: Any) -> None:
         super().__init__(declared, message, rejected)
-        self._kept = kept
+        self._arrivals = arrivals
 
     def _take_samples(self) -> list[Arrival]:
-        arrived = list(self._kept)
-        self._kept.clear()
+        arrived = list(self._arrivals)
+        self._arrivals.clear()
         return arrived
 
     def _content(self, sample: Arrival) -> tuple[bytes, str]:
@@ -113,7 +105,7 @@ class LocalReader(Reader[MessageT]):
 class LocalQuery:
     """A query that waits for answers."""
 
-    asked: int  # number of queryables that have received it
+    queryable_count: int  # queryables that have received it
     answers: Mailbox[tuple[str, bytes, str]] = field(default_factory=Mailbox[tuple[str, bytes, str]])
 
     def reply(self, key: str, payload: bytes, encoding: str) -> None:
@@ -153,8 +145,8 @@ class LocalSession(Session):
             arrival = Arrival(key, payload, encoding, time.monotonic_ns())
             if latched:
                 network.latched[key] = arrival
-            for take in network.takers(key):
-                take(arrival)
+            for handle in network.takers(key):
+                handle(arrival)
 
         def has_subscribers() -> bool:
             return bool(network.takers(key))
@@ -162,48 +154,48 @@ class LocalSession(Session):
         return self._register_publisher(key, Publisher(message, send, has_subscribers))
 
     def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
-        kept: deque[Arrival] = deque(maxlen=depth or reader_depth(message))
-        declared = self._subscribe(key, kept.append)
-        return LocalReader(declared, kept, message, self.rejected)
+        arrivals: deque[Arrival] = deque(maxlen=depth or reader_depth(message))
+        declared = self._subscribe(key, arrivals.append)
+        return LocalReader(declared, arrivals, message, self.rejected)
 
     def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
-        kept: deque[Arrival] = deque(maxlen=READER_DEPTH)
+        arrivals: deque[Arrival] = deque(maxlen=READER_DEPTH)
         if key in self._network.latched:
-            kept.append(self._network.latched[key])
-        declared = self._subscribe(key, kept.append)
-        return LocalReader(declared, kept, message, self.rejected)
+            arrivals.append(self._network.latched[key])
+        declared = self._subscribe(key, arrivals.append)
+        return LocalReader(declared, arrivals, message, self.rejected)
 
-    def on_arrival(self, key: str, take: Take) -> None:
+    def on_arrival(self, key: str, handle: Take) -> None:
         """Call `take` for every sample, in the publisher's thread."""
-        self._subscribe(key, take)
+        self._subscribe(key, handle)
 
     on_urgent_arrival = on_arrival  # every sample arrives at once
 
-    def on_latched_arrival(self, key: str, take: Take) -> None:
+    def on_latched_arrival(self, key: str, handle: Take) -> None:
         """Call `take` as `on_arrival` does, and also for the values that were latched before."""
         for latched_key, arrival in list(self._network.latched.items()):
             if intersects(key, latched_key):
-                take(arrival)
-        self._subscribe(key, take)
+                handle(arrival)
+        self._subscribe(key, handle)
 
-    def on_query(self, key: str, take: Callable[[Query], None]) -> None:
+    def on_query(self, key: str, handle: Callable[[Query], None]) -> None:
         """Call `take` for every query, in the thread of the session that sends it."""
-        queryable = (key, take)
+        queryable = (key, handle)
         self._network.queryables.append(queryable)
         self._declare(lambda: self._network.queryables.remove(queryable))
 
     def declare_token(self, key: str) -> None:
-        self._network.show(key, True)
-        self._declare(lambda: self._network.show(key, False))
+        self._network.set_token(key, True)
+        self._declare(lambda: self._network.set_token(key, False))
 
-    def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+    def on_alive(self, handle: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
         """Call `take(key, present)` for every token that exists, appears or vanishes, in the declaring thread."""
-        watcher = (key, take)
+        watcher = (key, handle)
         self._network.watchers.append(watcher)
         self._declare(lambda: self._network.watchers.remove(watcher))
         for token in self._network.tokens:
             if intersects(key, token):
-                take(token, True)
+                handle(token, True)
 
     def close(self) -> None:
         """Undeclare everything."""
@@ -211,8 +203,8 @@ class LocalSession(Session):
             declared.undeclare()
         self._declared.clear()
 
-    def _subscribe(self, key: str, take: Take) -> Declared:
-        return self._declare(self._network.subscribe(key, take))
+    def _subscribe(self, key: str, handle: Take) -> Declared:
+        return self._declare(self._network.subscribe(key, handle))
 
     def _declare(self, undeclare: Callable[[], None]) -> Declared:
         declared = Declared(undeclare)
@@ -221,10 +213,10 @@ class LocalSession(Session):
 
     def send_query(self, pattern: str, request: Message) -> LocalQuery:
         """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
-        matching = [(key, take) for key, take in self._network.queryables if intersects(pattern, key)]
+        matching = [(key, handle) for key, handle in self._network.queryables if intersects(pattern, key)]
         query = LocalQuery(len(matching))
-        for key, take in matching:
-            take(Query(key, encode(request), format_encoding(type(request)), query))
+        for key, handle in matching:
+            handle(Query(key, encode(request), format_encoding(type(request)), query))
         return query
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
@@ -232,7 +224,7 @@ class LocalSession(Session):
         query = self.send_query(pattern, request)
         self._network.answer()
         deadline = time.monotonic() + timeout_s
-        for _ in range(query.asked):
+        for _ in range(query.queryable_count):
             try:
                 key, payload, encoding = query.answers.get(deadline - time.monotonic())
             except Empty:

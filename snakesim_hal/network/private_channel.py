@@ -52,7 +52,7 @@ class HostEnd:
             with contextlib.suppress(OSError):
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
-    def serve(self, take: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
+    def serve(self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
         """Call `take(request, reply)` for each request, from a separate thread."""
         opened = self._socket
         if opened is None:
@@ -67,7 +67,7 @@ class HostEnd:
                     return
                 if not request:
                     return
-                take(decoder.decode(request), lambda answer: self.send(HostMessage(answer=answer)))
+                handle(decoder.decode(request), lambda answer: self.send(HostMessage(answer=answer)))
 
         start_worker("private channel", receive_requests)
 

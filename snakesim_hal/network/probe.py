@@ -14,7 +14,7 @@ import zenoh
 
 from snakesim_hal.base.errors import NotConnectedError
 
-UNUSED_KEY = "nobody/is/here"
+UNUSED_KEY = "unused/key"
 ROUND_TRIPS = 9  # of which the median counts
 
 

@@ -14,7 +14,8 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import shared_settings
-from snakesim_hal.network.session import Arrival, Publisher, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival, Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import VERSIONS, Process

@@ -74,13 +74,13 @@ def find_mismatch(message: Message, robot: Description) -> WireError | None:
             return None
 
 
-def _check_lengths(message: Message, fields: Sequence[str], wanted: int, why: str) -> WireError | None:
-    """Return the error of the first field that has not the wanted length."""
+def _check_lengths(message: Message, fields: Sequence[str], expected_length: int, why: str) -> WireError | None:
+    """Return the error of the first field that has another length than expected."""
     for field in fields:
         length = len(getattr(message, field))
-        if length != wanted:
+        if length != expected_length:
             where = f"{type(message).__name__}.{field}"
-            return WireError("wrong_length", f"{where} has length {length}, must have {wanted}: {why}")
+            return WireError("wrong_length", f"{where} has length {length}, must have {expected_length}: {why}")
     return None
 
 

@@ -35,7 +35,7 @@ REPORT_INTERVAL_S = 60.0  # between two reports of repeated lines
 MAX_BURST_LINES = 10000  # at once
 LINES_PER_INTERVAL = 100  # in each REPORT_INTERVAL_S
 MAX_LINE_CHARACTERS = 300
-MAX_SESSIONS = 4000  # whose names are kept, as many as a host accepts
+MAX_SESSIONS = 4000  # whose names are stored, as many as a host accepts
 
 COLOR = re.compile(r"\x1b\[[0-9;]*m")
 HEAD = re.compile(r"\S+Z +(?P<level>[A-Z]+) +(?:\S+ )?ThreadId\((?P<thread>\d+)\) (?P<module>[\w:]+): (?P<text>.*)")
@@ -142,12 +142,12 @@ class RouterLog:
             self._write(line)
 
 
-def _keep(kept: dict[str, str], key: str, value: str) -> None:
+def _keep(entries: dict[str, str], key: str, value: str) -> None:
     """Store a value as the newest, and drop the oldest of too many."""
-    kept.pop(key, None)
-    kept[key] = value
-    while len(kept) > MAX_SESSIONS:
-        del kept[next(iter(kept))]
+    entries.pop(key, None)
+    entries[key] = value
+    while len(entries) > MAX_SESSIONS:
+        del entries[next(iter(entries))]
 
 
 @contextlib.contextmanager

@@ -14,11 +14,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic
+from typing import Any
 
-import msgspec
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
@@ -31,123 +29,15 @@ from snakesim_hal.network.connection import (
     limit_receiving_threads,
     open_zenoh,
 )
-from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT  # programs import it with `Link`
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.image_connection import configure_for_images
+from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, reader_depth
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message, Preview
 
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
-READER_DEPTH = 256  # samples; a burst of noise on a key must not displace the valid sample
-IMAGES_DEPTH = 32  # samples; images take much memory, and in lockstep a reader may lag by that many
 POLL_S = 0.01  # between two looks for a latched value
-
-
-class Arrival(msgspec.Struct, frozen=True):
-    """A received sample, not decoded yet."""
-
-    key: str
-    payload: bytes
-    encoding: str
-    monotonic_ns: int
-
-
-class Publisher(Generic[MessageT]):
-    """Publishes messages of one type on one key."""
-
-    def __init__(
-        self, message: type[MessageT], send: Callable[[bytes], None], has_subscriber: Callable[[], bool]
-    ) -> None:
-        """Wrap the two functions of a network's publisher.
-
-        Args:
-            message: the type of its messages.
-            send: sends bytes as they are, bypassing any reroute.
-            has_subscriber: returns whether the key has a subscriber now.
-        """
-        self.message = message
-        self.send = send
-        self.has_subscriber = has_subscriber
-        self._put = send
-
-    def put(self, message: MessageT, encoded: bytes | None = None) -> None:
-        """Send a message. Only a publisher that was declared lossless waits for slow subscribers.
-
-        Args:
-            message: what to send.
-            encoded: its bytes, if the caller has encoded it already.
-        """
-        if encoded is None:
-            encoded = encode(message)
-        self._put(encoded)
-
-    def reroute(self, put: Callable[[bytes], None] | None) -> None:
-        """Pass payloads to `put` instead of sending them; None: send directly again."""
-        self._put = self.send if put is None else put
-
-
-class Reader(Generic[MessageT]):
-    """Keeps the newest samples of one key. It decodes them when it is called, in the caller's thread."""
-
-    def __init__(self, subscriber: Any, message: type[MessageT], rejected: Counter[str]) -> None:
-        """Read from a subscriber; count samples that cannot be decoded into `rejected`, by reason."""
-        self.subscriber = subscriber
-        self._decoder = Decoder(message)
-        self._rejected = rejected
-
-    def drain(self) -> list[MessageT]:
-        """Return all samples since the last call, oldest first. Samples that cannot be decoded are dropped."""
-        messages: list[MessageT] = []
-        for sample in self._take_samples():
-            message = self._decode(sample)
-            if message is not None:
-                messages.append(message)
-        return messages
-
-    def newest(self, wanted: Callable[[MessageT], bool]) -> MessageT | None:
-        """Return the newest sample since the last call for which `wanted` is true.
-
-        Earlier samples are dropped without decoding, so that a flood costs little.
-        """
-        for sample in reversed(self._take_samples()):
-            message = self._decode(sample)
-            if message is not None and wanted(message):
-                return message
-        return None
-
-    def _take_samples(self) -> list[Any]:
-        samples: list[Any] = []
-        while (sample := self.subscriber.try_recv()) is not None:
-            samples.append(sample)
-        return samples
-
-    def _decode(self, sample: Any) -> MessageT | None:
-        try:
-            payload, encoding = self._content(sample)
-            return self._decoder.decode(payload, encoding)
-        except WireError as error:
-            self._rejected[error.reason] += 1
-            return None
-
-    def _content(self, sample: Any) -> tuple[bytes, str]:
-        """Return the payload and the encoding of a sample."""
-        return sample.payload.to_bytes(), str(sample.encoding)
-
-
-@dataclass(frozen=True)
-class Query:
-    """A query that waits for its answer."""
-
-    key: str
-    payload: bytes
-    encoding: str
-    _query: Any
-
-    def reply(self, answer: Answer) -> None:
-        """Send the answer and close the query. May be called from any thread."""
-        self._query.reply(self.key, encode(answer), encoding=format_encoding(Answer))
-        self._query.drop()
 
 
 class Session:
@@ -255,7 +145,7 @@ class Session:
         Args:
             key: what to read; it may have wildcards.
             message: the type of its messages.
-            depth: how many of the newest samples are kept; None: the default for this type.
+            depth: how many of the newest samples the reader keeps; None: the default for this type.
         """
         subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or reader_depth(message)))
         self._declared.append(subscriber)
@@ -282,7 +172,7 @@ class Session:
         key: str,
         message: type[MessageT],
         timeout_s: float,
-        wanted: Callable[[MessageT], bool] = lambda _message: True,
+        is_acceptable: Callable[[MessageT], bool] = lambda _message: True,
     ) -> MessageT | None:
         """Wait for the value that is latched on a key, and return it.
 
@@ -290,50 +180,50 @@ class Session:
             key: where it is published.
             message: its type.
             timeout_s: how long to wait.
-            wanted: returns whether a value is acceptable; others are skipped.
+            is_acceptable: returns whether a value is acceptable; others are skipped.
 
         Returns:
             The value, or None if no acceptable one arrives in time.
         """
         reader = self.latched_reader(key, message)
         deadline = time.monotonic() + timeout_s
-        value = reader.newest(wanted)
+        value = reader.newest(is_acceptable)
         while value is None and time.monotonic() < deadline:
             time.sleep(POLL_S)
-            value = reader.newest(wanted)
+            value = reader.newest(is_acceptable)
         self.stop_reading(reader)
         return value
 
     # --- callbacks -------------------------------------------------------------------------------------------
 
-    def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
-        """Call `take` for every sample, in a thread of this subscriber. It must only store the sample."""
-        self._declared.append(self._zenoh.declare_subscriber(key, _arrival_handler(take)))
+    def on_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
+        """Call `handler` for every sample, in a thread of this subscriber. It must only store the sample."""
+        self._declared.append(self._zenoh.declare_subscriber(key, _arrival_handler(handler)))
 
-    def on_urgent_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
-        """Call `take` for every sample, in the thread that receives for the whole session.
+    def on_urgent_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
+        """Call `handler` for every sample, in the thread that receives for the whole session.
 
-        The control loop waits for one thread less than with `on_arrival`. While `take` runs, the session receives
+        The control loop waits for one thread less than with `on_arrival`. While `handler` runs, the session receives
         nothing else, so it must only store the sample.
         """
-        handler = handlers.Callback(_keep_thread_state(_arrival_handler(take)), indirect=False)
+        handler = handlers.Callback(_keep_thread_state(_arrival_handler(handler)), indirect=False)
         self._declared.append(self._zenoh.declare_subscriber(key, handler))
 
-    def on_latched_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
-        """Call `take` as `on_arrival` does, and also for the values that were latched before."""
+    def on_latched_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
+        """Call `handler` as `on_arrival` does, and also for the values that were latched before."""
         subscriber = ext.declare_advanced_subscriber(
-            self._zenoh, key, _arrival_handler(take), history=_last_value_history()
+            self._zenoh, key, _arrival_handler(handler), history=_last_value_history()
         )
         self._declared.append(subscriber)
 
-    def on_query(self, key: str, take: Callable[[Query], None]) -> None:
-        """Call `take` for every query, in Zenoh's thread. Reply from a thread of your own."""
+    def on_query(self, key: str, handler: Callable[[Query], None]) -> None:
+        """Call `handler` for every query, in Zenoh's thread. Reply from a thread of your own."""
 
         def handle(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
             encoding = str(query.encoding or "")
             # The query's own key may be a pattern, such as `hal/*`; the question is always for our key.
-            take(Query(key, payload, encoding, query))
+            handler(Query(key, payload, encoding, query))
 
         self._declared.append(self._zenoh.declare_queryable(key, handle))
 
@@ -409,11 +299,11 @@ class Session:
         """Declare a liveliness token for as long as the session lives."""
         self._declared.append(self._zenoh.liveliness().declare_token(key))
 
-    def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
-        """Call `take(key, present)` when a token appears or vanishes, in Zenoh's thread."""
+    def on_alive(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+        """Call `handler(key, present)` when a token appears or vanishes, in Zenoh's thread."""
 
         def handle(sample: zenoh.Sample) -> None:
-            take(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         self._declared.append(self._zenoh.liveliness().declare_subscriber(key, handle, history=True))
 
@@ -464,11 +354,6 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         yield session
 
 
-def reader_depth(message: type[Message]) -> int:
-    """Return how many samples of a stream a reader keeps."""
-    return IMAGES_DEPTH if message in IMAGES else READER_DEPTH
-
-
 def key_expression(text: str) -> str:
     """Return a key that may have wildcards in Zenoh's canonical form.
 
@@ -505,14 +390,14 @@ def _last_value_history() -> ext.HistoryConfig:
     return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
 
 
-def _arrival_handler(take: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
-    """Return a handler for Zenoh's thread that passes each sample to `take` as an `Arrival`."""
+def _arrival_handler(handler: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
+    """Return a handler for Zenoh's thread that passes each sample to `handler` as an `Arrival`."""
 
     def handle(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         payload = sample.payload.to_bytes()
         encoding = str(sample.encoding)
-        take(Arrival(key, payload, encoding, time.monotonic_ns()))
+        handler(Arrival(key, payload, encoding, time.monotonic_ns()))
 
     return handle
 

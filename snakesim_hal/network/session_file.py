@@ -33,20 +33,20 @@ class SessionFile:
     endpoints: tuple[str, ...]  # of routers: the first that answers is used
     namespace: str | None  # of the only robot that this session can see; None: the file names none
 
-    def namespace_for(self, wanted: str | None) -> str | None:
-        """Return the namespace of a session; wanted: by the user, None: any.
+    def namespace_for(self, requested: str | None) -> str | None:
+        """Return the namespace of a session; requested: by the user, None: any.
 
         Raises:
             ConfigError: the file names another one.
         """
-        if self.namespace is not None and wanted not in (None, self.namespace):
+        if self.namespace is not None and requested not in (None, self.namespace):
             raise ConfigError(
-                f"{self.path}: `namespace` is {shorten(self.namespace)!r}, not {wanted!r}; use the session "
+                f"{self.path}: `namespace` is {shorten(self.namespace)!r}, not {requested!r}; use the session "
                 "file of that "
                 "robot, or another --namespace",
                 code="network/session-file",
             )
-        return wanted or self.namespace
+        return requested or self.namespace
 
 
 def read_session(path: Path) -> SessionFile:
@@ -56,13 +56,13 @@ def read_session(path: Path) -> SessionFile:
         ConfigError: the file cannot be read, or is not a session file for SnakeSIM.
     """
     text, settings = read_zenoh_file(path)
-    for key, wanted in REQUIRED.items():
-        given = json.loads(settings.get_json(key))
-        if given != wanted and (given is not None or key == "mode"):
+    for key, expected in REQUIRED.items():
+        value = json.loads(settings.get_json(key))
+        if value != expected and (value is not None or key == "mode"):
             dotted_key = key.replace("/", ".")
-            present = "missing" if given is None else json.dumps(given)
+            present = "missing" if value is None else json.dumps(value)
             raise ConfigError(
-                f"{path}: `{dotted_key}` is {present}, must be {json.dumps(wanted)}", code="network/session-file"
+                f"{path}: `{dotted_key}` is {present}, must be {json.dumps(expected)}", code="network/session-file"
             )
     if endpoints_of_mode(settings, "listen/endpoints", "client"):
         raise ConfigError(
@@ -109,5 +109,5 @@ def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:
 
 def endpoints_of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:
     """Return a list of endpoints for a mode. The file has one list for all modes, or one for each."""
-    given = json.loads(settings.get_json(key))
-    return given if isinstance(given, list) else given.get(mode, [])
+    value = json.loads(settings.get_json(key))
+    return value if isinstance(value, list) else value.get(mode, [])

@@ -78,7 +78,7 @@ def open_stop_port(host: str, port: int) -> socket.socket:
     return opened
 
 
-def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], None]) -> None:
+def serve_stops(opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]) -> None:
     """Call `take(requester, reply)` for every request, from the thread `stop port`.
 
     Args:
@@ -98,7 +98,7 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
             nonce = datagram[len(REQUEST) :][:NONCE_BYTES]
             requester = datagram[len(REQUEST) + NONCE_BYTES :].decode(errors="replace")
             reply = _make_reply(opened, nonce + robot.encode() + b"\n", sender)
-            take(requester or "an unnamed client", reply)
+            handle(requester or "an unnamed client", reply)
             time.sleep(PAUSE_S)
 
     start_worker("stop port", serve)

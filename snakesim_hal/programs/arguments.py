@@ -235,9 +235,9 @@ def add_service(parser: argparse.ArgumentParser) -> None:
 
 def check_network(arguments: argparse.Namespace) -> None:
     """Raise ConfigError unless the arguments of `add_network` are valid and do not contradict each other."""
-    for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
-        if given is not None:
-            check_endpoint(given, flag)
+    for flag, address in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
+        if address is not None:
+            check_endpoint(address, flag)
             if arguments.session is not None:
                 raise ConfigError(
                     f"{flag} and --session: the session file names the endpoint; leave one out",
@@ -248,12 +248,12 @@ def check_network(arguments: argparse.Namespace) -> None:
 
 
 def read_session_option(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
-    """Read the session file, if one is given. Raises ConfigError.
+    """Read the session file that the arguments name, if any. Raises ConfigError.
 
     Args:
         arguments: those of `add_network`.
-        or_environment: whether SNAKESIM_SESSION counts too, unless an endpoint is given. This is for an operator's
-            tools: a process that moves or emulates a robot connects only as its command line specifies.
+        or_environment: whether SNAKESIM_SESSION counts too, if the arguments name no endpoint. This is for an
+            operator's tools: a process that moves or emulates a robot connects only as its command line specifies.
     """
     path: Path | None = arguments.session
     if path is None and or_environment and arguments.endpoint is None and arguments.router is None:

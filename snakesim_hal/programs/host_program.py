@@ -55,33 +55,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_tool("snakesim start host", lambda: host(process_options(arguments, hosts=True)))
 
 
-def host(given: ProcessOptions) -> int:
+def host(options: ProcessOptions) -> int:
     """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError.
 
     A simulator that is reset becomes another host, in the same process.
     """
-    if given.arguments.parent_socket is None:
-        check_without_run(given.config, given.loaded.table)
-    host = _run(given, check_backend(given.config, given.loaded.table))
+    if options.arguments.parent_socket is None:
+        check_without_run(options.config, options.loaded.table)
+    host = _run(options, check_backend(options.config, options.loaded.table))
     if host.ended == "reset":
         restart_process()
-    stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.kept)
+    stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.stored)
     return 1 if stopped or host.ended != "complete" else 0
 
 
-def _run(given: ProcessOptions, config: RunConfig) -> Host:
+def _run(options: ProcessOptions, config: RunConfig) -> Host:
     """Open stop port, backend and network, run the host to its end, and close everything."""
-    arguments = given.arguments
+    arguments = options.arguments
     with contextlib.ExitStack() as opened:
-        stop_port = _open_stop_port(given, config, opened)
+        stop_port = _open_stop_port(options, config, opened)
         backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
-        network = open_session(given.link) if given.link.listen else open_session_when_ready(given.link, "host")
+        network = open_session(options.link) if options.link.listen else open_session_when_ready(options.link, "host")
         session = opened.enter_context(network)
-        refuse_second_host(session, given.link)
+        refuse_second_host(session, options.link)
         host = _create_host(arguments, config, backend, session, realtime_warnings)
-        serve_stops(stop_port, given.link.namespace or host.description.robot, host.request_estop)
+        serve_stops(stop_port, options.link.namespace or host.description.robot, host.request_estop)
         on_stop_signal(host.stop)
         tune_garbage_collector()
         memory = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
@@ -96,14 +96,14 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
     return host
 
 
-def _open_stop_port(given: ProcessOptions, config: RunConfig, opened: contextlib.ExitStack) -> socket.socket:
+def _open_stop_port(options: ProcessOptions, config: RunConfig, opened: contextlib.ExitStack) -> socket.socket:
     """Use the stop port that the run has handed to this host, or open one and register the robot on this computer."""
-    inherited = given.arguments.stop_port
+    inherited = options.arguments.stop_port
     if inherited is not None:
         stop_port = socket.socket(fileno=os.dup(inherited))  # the original stays open for another host
     else:
-        stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
-        robot = LocalRobot.describe(given.link, config.robot.name, config.backend, stop_port)
+        stop_port = open_stop_port(*stop_address(options.link.endpoint, listens=options.link.listen))
+        robot = LocalRobot.describe(options.link, config.robot.name, config.backend, stop_port)
         opened.enter_context(registered(robot))
     opened.callback(stop_port.close)
     return stop_port
@@ -183,7 +183,7 @@ def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") ->
         tick_times=statistics.times.timings(),
         rejected_commands=dict(authority.rejected_counts),
         limited_commands=dict(authority.limited_counts),
-        faults=list(authority.faults_since_start.kept),
+        faults=list(authority.faults_since_start.stored),
         faults_left_out=authority.faults_since_start.left_out,
         lifecycle=authority.state,
         reason=authority.reason,

@@ -7,7 +7,8 @@ import msgspec
 
 from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.controller import Controller, decode_parameters, require_controller
+from snakesim_hal.controller import Controller, decode_parameters
+from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import (
@@ -20,7 +21,7 @@ from snakesim_hal.model.plugins import (
     require_base_class,
 )
 from snakesim_hal.model.robot import describe_joints
-from snakesim_hal.model.scenario import CONTROL, RunConfig, describe_run_robot
+from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.service import Service
 from snakesim_hal.wire.messages import JointDescription, Mode
 
@@ -49,7 +50,7 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
         config = with_backend_modes(config, backend)
     plugin = find(CONTROLLERS, config.controller)
     if plugin is not None:
-        controller = require_controller(plugin, config.controller)
+        controller = require_base_class(plugin, Controller, f"controller {shorten(config.controller)!r}")
         config = _check_controller(config, controller, source, table)
     for service in config.own_services:
         plugin_name = _service_plugin_name(config, service)
@@ -177,9 +178,9 @@ def describe_missing_capability(
 def _without_pose_services(config: RunConfig, controller: type[Controller[Any]]) -> RunConfig:
     """Leave guidance and navigation out for a controller of joints, if the robot has no pose sensor.
 
-    They stay if the scenario asks for dead reckoning itself, or has further services.
+    They stay if the scenario requires dead reckoning itself, or has further services.
     """
-    # A scenario that asks for dead reckoning names it as its localization.
+    # A scenario that requires dead reckoning names it as its localization.
     dead_reckons = config.dead_reckons(describe_run_robot(config))
     if not dead_reckons or config.mission.localization != "pose_sensor":
         return config

@@ -68,24 +68,24 @@ def run(arguments: argparse.Namespace) -> int:
 
     def act() -> int:
         with suppress(KeyboardInterrupt):
-            given = process_options(arguments)
-            serve(find_service(given.config, arguments.name), given)
+            options = process_options(arguments)
+            serve(find_service(options.config, arguments.name), options)
         return 0
 
     return run_tool(f"snakesim {arguments.name}", act)
 
 
-def serve(service_type: type[Service], given: ProcessOptions) -> None:
+def serve(service_type: type[Service], options: ProcessOptions) -> None:
     """Run a service, as long as this process lives. Raises SnakesimError when it cannot continue."""
-    config = given.config
+    config = options.config
     name = service_type.name
     accept_interrupts()
     threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
     if service_type.urgent and config.clock_mode == "realtime":
         enter_realtime(SERVICE_PRIORITY)
         drop_priority_after(config.lease_ns * 1e-9)
-    with open_session_when_ready(given.link, name) as session:
-        waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
+    with open_session_when_ready(options.link, name) as session:
+        waiting = StartupWait(name, f"a HAL host of {options.link.namespace} on {options.link.endpoint}")
         with closing(ServiceLoop(service_type, config, session, waiting.keeps_waiting)) as loop:
             loop.join()
             tune_garbage_collector()

@@ -74,7 +74,7 @@ class InProcessRun:
 
         Args:
             config: of the run.
-            pulse: shows another process whether the run goes on.
+            pulse: shows another process that the run continues.
             turn_limit_s: wall time that a part may take in one turn; None: as the configuration allows.
 
         Raises:
@@ -201,7 +201,7 @@ class InProcessRun:
     def take_errors(self) -> dict[str, SnakesimError]:
         """Return the error that ended each service, by name, and drop the errors here.
 
-        The traceback of an error refers to this run. If the run kept the error too, neither could be freed.
+        The traceback of an error refers to this run. If the run also held the error, neither could be freed.
         """
         errors = self._errors
         self._errors = {}

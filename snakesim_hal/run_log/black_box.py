@@ -1,7 +1,7 @@
 """The black box: every tick of a run, in a ring buffer of fixed size that `recorder` writes to disk.
 
 A tick costs one packed copy into memory that was allocated before the run. If it is not emptied, because the disk is
-full or hangs, the newest rows are kept.
+full or hangs, the newest rows stay.
 
 On disk it is one flat file: a line of JSON that names the columns, then the rows. `read_black_box` reads it, also with
 an incomplete last row, as after a SIGKILL.
@@ -162,7 +162,7 @@ class BlackBox:
         return self._digest.hexdigest()
 
     def read_rows(self, row: int) -> tuple[int, bytes]:
-        """Return some rows from number `row` on, or from the oldest row that is still kept.
+        """Return some rows from number `row` on, or from the oldest row that is still there.
 
         May be called from another thread: the rows are consistent, also while the host records.
 
@@ -184,7 +184,7 @@ def summarize_contacts(contacts: Contacts) -> tuple[float, int]:
     """Return the force of the strongest contact in N, and the number of touched obstacles.
 
     The force is the mean over 50 ms that the sensor measures, see `measured_force`; without one, it is the largest
-    contact force of this instant.
+    contact force of this tick.
     """
     touched = len({contact.obstacle for contact in contacts.contacts})
     if contacts.measured_force_n is not None:

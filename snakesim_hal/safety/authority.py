@@ -150,8 +150,8 @@ class Authority:
 
     @property
     def faults(self) -> list[Fault]:
-        """Faults since the last reset, as far as they are kept."""
-        return self.faults_since_reset.kept
+        """Faults since the last reset, as far as they are stored."""
+        return self.faults_since_reset.stored
 
     @property
     def isolated_joints(self) -> list[str]:
@@ -236,7 +236,7 @@ class Authority:
         """Stop now, for any requester."""
         latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.requester}")
         self._record(latch_fault, stops=self.state != "estop")
-        self._transition("estop", f"emergency stop by {request.requester}; reset it to go on")
+        self._transition("estop", f"emergency stop by {request.requester}; reset it to continue")
         return self._answer(None)
 
     # --- inputs: faults --------------------------------------------------------------------------------------
@@ -383,7 +383,7 @@ class Authority:
         unmet = self._find_unmet_conditions(now_ns)
         unmet += lifecycle.find_address_mismatches(request, self.description)
         if self.unchecked and not request.unchecked:
-            reason = f"{self.unchecked}; to arm it as it is, say --unchecked"
+            reason = f"{self.unchecked}; to arm it as it is, add --unchecked"
             unmet.append(UnmetCondition("not_checked", reason))
         if unmet:
             reasons = "; ".join(condition.reason for condition in unmet)

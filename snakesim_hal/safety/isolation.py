@@ -1,4 +1,4 @@
-"""Isolated joints: a failed joint is passive from then on, and the others go on, if the robot file allows it. Pure.
+"""Isolated joints: a failed joint is passive from then on, and the others continue, if the robot file allows it. Pure.
 
 Only a joint that fails while the robot is armed is isolated, and only as long as `max_isolated_joints` is not exceeded;
 one more is a fault of the whole robot. A reset ends all isolations.

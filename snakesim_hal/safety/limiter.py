@@ -260,7 +260,7 @@ def torque_bounds_at_ends(
 def stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: float) -> float:
     """Return the maximum speed in rad/s from which a joint can stop within a distance d.
 
-    The joint goes on at its speed v for a reaction time t of REACTION_PERIODS, and then brakes with its acceleration
+    The joint continues at its speed v for a reaction time t of REACTION_PERIODS, and then brakes with its acceleration
     limit a. Solves v t + v^2 / (2 a) = d, so v = a (sqrt(t^2 + 2 d / a) - t). For a joint that is past its end
     (d <= 0) the speed is 0.
     """

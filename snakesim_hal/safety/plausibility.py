@@ -94,21 +94,21 @@ class PlausibilityCheck:
         newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
         columns = np.array(newest)
         measured_s = _measurement_times_s(joints, now_ns)
-        sound = self._find_sound(joints, columns)
+        plausible = self._find_plausible(joints, columns)
 
         # Angles that are too far from the last good one.
         elapsed_s = (measured_s - self._good_s).max(axis=0)
-        jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
-        jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.max_turn_rad(elapsed_s))
+        jump_rad = np.where(plausible, columns[0], 0.0) - self._columns[0]
+        jumped = plausible & self._known & (np.abs(jump_rad) > self._jumps.max_turn_rad(elapsed_s))
         settled = self._jumps.find_settled(jumped, columns[0], measured_s)
         self._ordinary = None
-        if sound.all() and not jumped.any():
+        if plausible.all() and not jumped.any():
             self._ordinary = newest
         if applied is None:
             jumped = jumped & ~settled
 
         # Keep the good values.
-        good = sound & ~jumped
+        good = plausible & ~jumped
         self._columns = np.where(good, columns, self._columns)
         self._good_s = np.where(good, measured_s, self._good_s)
         self._known |= good
@@ -116,7 +116,7 @@ class PlausibilityCheck:
         frozen = self._frozen.find_frozen(columns, measured_s[0], applied)
         if not np.count_nonzero(~good | frozen):
             return None
-        unknown = ~sound & ~isolated
+        unknown = ~plausible & ~isolated
         if unknown.any():
             return self._make_unknown(joints.tick, unknown)
         jumped = jumped & ~isolated
@@ -153,7 +153,7 @@ class PlausibilityCheck:
                 return False
         return True
 
-    def _find_sound(self, joints: JointState, columns: Floats) -> Mask:
+    def _find_plausible(self, joints: JointState, columns: Floats) -> Mask:
         """Return which joints have a valid, finite and fresh state, (n_joints,)."""
         fresh = np.array(joints.age_ns, dtype=np.float64) <= self._limits.oldest_state_ns
         finite = np.isfinite(columns).all(axis=0)

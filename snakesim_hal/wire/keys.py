@@ -98,7 +98,7 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(
         PARAMETERS_IN_FORCE, m.ControlParameters, "control", "latched", "on a change", "the controller's parameters now"
     ),
-    KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "the wanted speed and direction"),
+    KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "the requested speed and direction"),
     KeyRow(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
     KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
     KeyRow(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),

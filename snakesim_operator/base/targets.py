@@ -5,7 +5,8 @@ import shlex
 from dataclasses import replace
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Session, open_session
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
+from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.robot_selection import RobotSelection

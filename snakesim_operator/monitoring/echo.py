@@ -15,7 +15,8 @@ import msgspec
 from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, Session, intersects, key_expression
+from snakesim_hal.network.session import Session, intersects, key_expression
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import CustomSample
 from snakesim_operator.base.targets import RobotSelection, sessions_on

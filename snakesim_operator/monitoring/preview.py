@@ -16,7 +16,8 @@ import numpy as np
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.session import Publisher, Reader, Session, open_session
+from snakesim_hal.network.session import Session, open_session
+from snakesim_hal.network.streams import Publisher, Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, Preview

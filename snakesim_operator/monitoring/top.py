@@ -10,7 +10,8 @@ import msgspec
 
 from snakesim_hal.base.terminal import PrintLine, overwrite_lines, print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
-from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import TICK_TIMES, Description, Timing
 from snakesim_operator.base.targets import RobotSelection, sessions_on

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (

@@ -21,7 +21,7 @@ from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.model.plugins import in_file
 from snakesim_hal.model.scenario import CHOSEN, Override, RunConfig, encode_config, load, write_config
 from snakesim_hal.network.local_network import LocalNetwork, LocalQuery
-from snakesim_hal.network.session import Arrival, Publisher, Query
+from snakesim_hal.network.streams import Arrival, Publisher, Query
 from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys

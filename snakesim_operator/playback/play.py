@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.terminal import PrintLine
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Publisher, Session, open_session
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, format_encoding
 from snakesim_operator.recording.message import RecordedMessage

@@ -19,8 +19,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.base.errors import SnakesimError
+from snakesim_hal.model.placement import place_scene
 from snakesim_hal.model.scenario import RunConfig, capsules_at_start
-from snakesim_hal.model.scene import place_scene
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE

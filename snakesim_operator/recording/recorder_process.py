@@ -25,7 +25,8 @@ from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
-from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import ProcessOptions, process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S

@@ -12,7 +12,8 @@ import threading
 import time
 from collections import Counter, deque
 
-from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 
 MAX_BYTES = 64 * 1024 * 1024

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.model.files import SCHEMAS
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages

@@ -12,7 +12,8 @@ from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.terminal import PrintLine, print_line
 from snakesim_hal.host.latch import find_latched_stops, remove_latched_stop
-from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, make_arm_request
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot

@@ -24,7 +24,8 @@ from snakesim_hal.base.errors import (
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.scenario import parse_set
-from snakesim_hal.network.session import Reader, Session, open_session
+from snakesim_hal.network.session import Session, open_session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, ControlState, ParametersRequest
 from snakesim_operator.base.robot_selection import RobotSelection

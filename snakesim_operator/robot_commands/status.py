@@ -14,7 +14,8 @@ from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.endpoint import is_exposed
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, find_differences
-from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description, Process, Status

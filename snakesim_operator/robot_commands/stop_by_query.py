@@ -5,8 +5,9 @@ import time
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import stop_address
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
 from snakesim_operator.base.targets import CONNECT_S, namespace_of, robots_on

@@ -24,8 +24,9 @@ from snakesim_hal.base.arithmetic import is_pinned
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError
 from snakesim_hal.base.step_limit import Pulse
 from snakesim_hal.base.terminal import print_line, print_stderr
+from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.plugins import anything_offered
-from snakesim_hal.model.scenario import CONTROL, RunConfig, write_config
+from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
 from snakesim_hal.programs.host_program import create_host_record

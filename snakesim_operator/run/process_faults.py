@@ -15,7 +15,8 @@ from snakesim_hal.base.process import step_wall_clock
 from snakesim_hal.model.fault_kinds import RUN, Injection, InjectionPlan, check_injection
 from snakesim_hal.model.fault_plan import parse_planned
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Query, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, Description, FaultRequest, LifecycleState

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from snakesim_hal.base.errors import SnakesimError
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.local_registry import local_robots
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, open_session
+from snakesim_hal.network.session import open_session
 from snakesim_operator.base.targets import CONNECT_S, RobotSelection, robots_on
 from snakesim_operator.this_computer.computer import Finding
 

@@ -7,9 +7,16 @@ import msgspec
 
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.controller import decode_parameters, require_controller
+from snakesim_hal.controller import Controller, decode_parameters
 from snakesim_hal.model.files import Table, leaves, list_shipped, read_part
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_installed, in_file, plugin_settings
+from snakesim_hal.model.plugins import (
+    BACKENDS,
+    CONTROLLERS,
+    find_installed,
+    in_file,
+    plugin_settings,
+    require_base_class,
+)
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.programs.preflight import check_plugins
 
@@ -87,7 +94,7 @@ def _check_plugin_sections(config: RunConfig, table: Table) -> Iterator[tuple[st
     """Yield the dotted key and the checked values of the controller's and the backend's section; files are left out."""
     plugin = find_installed(CONTROLLERS, config.controller)
     if plugin is not None:
-        controller = require_controller(plugin, config.controller)
+        controller = require_base_class(plugin, Controller, f"controller {shorten(config.controller)!r}")
         section = config.control_section
         yield (
             section,

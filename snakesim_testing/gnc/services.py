@@ -11,7 +11,8 @@ from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.controller import ControllerCommand, Observation
 from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Link, Reader, open_session
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys

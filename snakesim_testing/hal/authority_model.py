@@ -7,7 +7,7 @@ import pytest
 from hypothesis.stateful import RuleBasedStateMachine
 
 from snakesim_hal.safety.authority import Authority, TickDecision
-from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire.messages import Answer, JointCommand, LifecycleState, Mode
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
 
@@ -174,7 +174,7 @@ class Model(RuleBasedStateMachine):
         if self.state != "estop":
             self.leave_for("fault")
         self.drop_lease()
-        self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
+        self.faults = min(self.faults + 1, MAX_FAULTS)
 
     def lose(self, joints: set[int]) -> bool:
         """Whether the robot goes on without these joints, too."""
@@ -183,7 +183,7 @@ class Model(RuleBasedStateMachine):
         if self.state != "armed" or len(self.aside | joints) > self.max_isolated:
             return False
         self.aside |= joints
-        self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
+        self.faults = min(self.faults + 1, MAX_FAULTS)
         return True
 
     def lose_or_fail(self, joints: set[int] | None) -> None:

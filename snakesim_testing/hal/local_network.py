@@ -18,7 +18,8 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.network.client import Client, Commander
-from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import (

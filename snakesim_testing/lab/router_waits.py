@@ -18,5 +18,5 @@ def eventually(what: Callable[[], Any], wanted: Any) -> None:
 def settle(*sessions: zenoh.Session) -> None:
     """Until the router has handled what these have sent, and they what it lets pass."""
     for session in (*sessions, *sessions):
-        list(session.liveliness().get("nobody/is/here", timeout=1.0))  # there and back
+        list(session.liveliness().get("unused/key", timeout=1.0))  # there and back
         time.sleep(0.02)

@@ -9,7 +9,8 @@ import time
 from pathlib import Path
 
 from snakesim_hal.base.process import die_with_parent
-from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 
 SLEEP_S = 0.5

@@ -10,7 +10,8 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from snakesim_hal.base.errors import NotConnectedError, WireError
-from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (

@@ -18,7 +18,8 @@ from msgspec import inspect
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder
 from snakesim_hal.wire.messages import Answer, JointCommand, Message

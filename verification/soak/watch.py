@@ -5,7 +5,8 @@ from collections import Counter
 from typing import Any
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Clock, Description, Mode, Status
 from verification.faults.observer import Observer

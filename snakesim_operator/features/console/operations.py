@@ -11,7 +11,8 @@ from collections.abc import Callable
 from datetime import datetime
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
-from snakesim_hal.network.session import Link, Publisher, Session
+from snakesim_hal.network.session import Link, Session
+from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Intent, Message, ParametersRequest
 from snakesim_operator.base.targets import RobotSelection

@@ -5,7 +5,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic
 
-from snakesim_hal.network.session import Reader, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Message
 

@@ -26,7 +26,7 @@ from snakesim_operator.features.ros2.messages import Marker, Rgba, Triple
 ARROW_M_PER_N = 0.01  # length of a force arrow
 ARROW_SIZE_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of the head
 CONTACT_COLOR: Rgba = (0.85, 0.2, 0.1, 1.0)
-FELT_COLOR: Rgba = (0.9, 0.55, 0.1, 1.0)  # obstacles that the robot has touched
+TOUCHED_COLOR: Rgba = (0.9, 0.55, 0.1, 1.0)  # obstacles that the robot has touched
 SEEN_COLOR: Rgba = (0.3, 0.5, 0.75, 1.0)  # obstacles that its sensors have measured
 MIN_OPACITY = 0.2  # an obstacle of no confidence is still visible
 OPACITY_RANGE = 0.8
@@ -99,8 +99,8 @@ def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
     half_yaw_rad = obstacle.yaw_rad / 2
     orientation_wxyz = (float(np.cos(half_yaw_rad)), 0.0, 0.0, float(np.sin(half_yaw_rad)))
     color = SEEN_COLOR
-    if obstacle.felt:
-        color = FELT_COLOR
+    if obstacle.touched:
+        color = TOUCHED_COLOR
     red, green, blue, _ = color
     opacity = MIN_OPACITY + OPACITY_RANGE * obstacle.confidence
     rgba = (red, green, blue, opacity)

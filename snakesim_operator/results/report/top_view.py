@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.scene import Placed
+from snakesim_hal.model.placement import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.page.svg import (
     arrow,

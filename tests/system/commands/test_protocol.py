@@ -11,7 +11,8 @@ import zenoh
 
 from snakesim_gnc.control.state_reports import TELEMETRY_S
 from snakesim_hal.host.status_reporter import STATUS_PERIOD_NS
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode

@@ -20,7 +20,8 @@ import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.network.session import Link, Reader, open_session
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent, Trajectory
 from snakesim_testing.harness.endpoint import free_endpoint

@@ -6,7 +6,8 @@ import threading
 
 import pytest
 
-from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Clock, JointState, Message

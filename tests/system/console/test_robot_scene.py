@@ -32,9 +32,9 @@ def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
 
 def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
     found = [
-        Obstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, felt=True),
-        Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, felt=True),
-        Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), felt=True),
+        Obstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True),
+        Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),
+        Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), touched=True),
     ]
     with serve_pages(open_port(None)) as (server, _):
         scene = RobotScene(server.scene, description(), None)

@@ -32,7 +32,7 @@ def test_an_error_anywhere_is_a_latched_fault_and_the_joints_are_told_to_be_safe
         run.backend.fails_in, run.backend.fails_with = where, error
         wait_until(run.ended, "the end of the host")
         assert run.host.ended == "failed" and run.host.authority.state == "fault"
-        causes = {fault.what: fault.cause for fault in run.host.authority.faults_since_start.kept}
+        causes = {fault.what: fault.cause for fault in run.host.authority.faults_since_start.stored}
         assert causes["backend_failed"] == cause.format(where)
         if where != "enact":
             assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
@@ -76,6 +76,6 @@ def test_a_sample_that_no_reader_would_accept_is_a_latched_fault_that_names_it(
         wait_until(run.ended, "the end of the host")
         assert run.host.ended == "failed" and run.host.authority.state == "fault"
         cause = next(
-            fault.cause for fault in run.host.authority.faults_since_start.kept if fault.what == "backend_failed"
+            fault.cause for fault in run.host.authority.faults_since_start.stored if fault.what == "backend_failed"
         )
         assert cause.startswith(f"Wrong.sample: {key} cannot be published: {why}"), cause

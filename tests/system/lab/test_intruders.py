@@ -150,7 +150,7 @@ def test_the_routers_log_tells_who_came_and_what_was_refused_and_nothing_else(la
     assert_told(lab, f"let in: {who.common_name} from 127.0.0.1")
     for what in (f"Put (ingress) on {COMMAND}", f"Query (ingress) on {OWN}/hal/lifecycle"):
         assert_told(lab, f"refused: {who.common_name}: {what}")
-    own = [line for line in lab.said() if who.common_name in line and " on nobody/is/here" not in line]
+    own = [line for line in lab.said() if who.common_name in line and " on unused/key" not in line]
     assert len([line for line in own if "Put (ingress)" in line]) < 5
     assert not [line for line in own if "Reply" in line or "Delete" in line]
 

@@ -14,7 +14,8 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES, CommandArrival
 from snakesim_hal.network.client import Client
-from snakesim_hal.network.session import Arrival, open_session
+from snakesim_hal.network.session import open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import (

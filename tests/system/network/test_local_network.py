@@ -2,7 +2,7 @@
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.network.session import Query
+from snakesim_hal.network.streams import Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Done, LeaseRequest
 from snakesim_testing.messages import raises_error

@@ -11,7 +11,8 @@ import zenoh
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
-from snakesim_hal.network.session import Arrival, Link, Publisher, Query, open_session
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.streams import Arrival, Publisher, Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest

@@ -17,7 +17,8 @@ from mcap.reader import make_reader
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.custom_sample import make_message_schema

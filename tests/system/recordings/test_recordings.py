@@ -12,7 +12,7 @@ from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING

@@ -6,8 +6,9 @@ from collections import Counter
 
 import pytest
 
-from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.session_file import read_session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState

@@ -76,8 +76,8 @@ WRONG = {
         "classes in it are MotionCapture, Another, Bare, Empty",
     ),
     "another name": ("Another", "calls itself 'another'", "[services.another]"),
-    "no service": ("Bare", "is not derived from `Service`", "snakesim_hal/service.py"),
-    "no outputs": ("Empty", "has no outputs", "snakesim_hal/service.py"),
+    "no service": ("Bare", "does not derive from Service", "snakesim_hal.service"),
+    "no outputs": ("Empty", "has no `outputs`", "snakesim_hal.service"),
 }
 
 

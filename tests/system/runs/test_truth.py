@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import ControlState

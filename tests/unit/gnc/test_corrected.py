@@ -5,7 +5,8 @@ import pytest
 from snakesim_gnc.control.hold import Hold
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
 from snakesim_gnc.control.policy import Policy
-from snakesim_hal.controller import Controller, NoParameters, require_controller
+from snakesim_hal.controller import Controller, NoParameters
+from snakesim_hal.model.plugins import require_base_class
 from snakesim_hal.wire.messages import Mode
 from snakesim_testing.gnc.stage import make_stage
 
@@ -17,7 +18,7 @@ MEMBERS = [name for name in vars(Controller) if not name.startswith("_") and nam
 
 @pytest.mark.parametrize("controller", [Hold, ObstacleTriplet, Policy])
 def test_it_has_every_declaration_of_the_other_controller(controller: type[Controller]) -> None:
-    corrected = require_controller(_make_corrected(controller, []), "corrected")
+    corrected = require_base_class(_make_corrected(controller, []), Controller, "controller 'corrected'")
     for name in MEMBERS:
         own, other = (getattr(cls, name) for cls in (corrected, controller))
         assert getattr(own, "__func__", own) is getattr(other, "__func__", other), name

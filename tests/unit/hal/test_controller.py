@@ -17,10 +17,9 @@ from snakesim_hal.controller import (
     decode_parameters,
     load_controller,
     positions,
-    require_controller,
 )
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.plugins import CONTROLLERS, list_installed
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed, require_base_class
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.programs.preflight import check_plugins
 from snakesim_testing.hal.small_robots import description, state
@@ -117,10 +116,10 @@ class Wave(snakesim.Controller):
 WRONG = {
     "without the base class": (
         BARE,
-        "class Wave in {file} does not derive from Controller, the base class of all controllers. "
-        "Write `class Wave(snakesim.Controller):`",
+        "class Wave in {file} does not derive from Controller. Write `class Wave(Controller):`, after "
+        "`from snakesim_hal.controller import Controller`",
     ),
-    "without update": (NO_UPDATE, "class Wave in {file} has no method `update`"),
+    "without update": (NO_UPDATE, "class Wave in {file} has no `update`"),
     "a function": ("def Wave(robot, parameters): ...\n", "the object <function Wave at "),
 }
 
@@ -133,7 +132,7 @@ def test_preflight_refuses_what_is_no_controller_and_says_how_to_write_one(wrong
     config = load("triplet", [parse_set(f"controller={file}:Wave")]).config
     with pytest.raises(ConfigError, match=re.escape(words.format(file=file))) as caught:
         check_plugins(config)
-    assert str(caught.value).startswith("controller '") and "snakesim.Controller" in str(caught.value)
+    assert str(caught.value).startswith("controller '") and "snakesim_hal.controller" in str(caught.value)
 
 
 def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:
@@ -152,4 +151,4 @@ def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:
 
 def test_a_class_without_a_file_is_named_by_its_module() -> None:
     with pytest.raises(ConfigError, match="class int in module builtins does not derive from Controller"):
-        require_controller(int, "program:int")
+        require_base_class(int, Controller, "controller 'program:int'")

@@ -11,7 +11,8 @@ from typing import Any
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.custom_sample import find_custom_messages

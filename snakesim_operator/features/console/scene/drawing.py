@@ -196,7 +196,7 @@ def _list_perceived(world: World | None) -> tuple[Obstacle, ...]:
     """
     if world is None:
         return ()
-    return tuple(obstacle for obstacle in world.obstacles if obstacle.last_seen_ns is not None or obstacle.felt)
+    return tuple(obstacle for obstacle in world.obstacles if obstacle.last_seen_ns is not None or obstacle.touched)
 
 
 def _list_contacts(snapshot: RobotSnapshot) -> list[WorldContact]:

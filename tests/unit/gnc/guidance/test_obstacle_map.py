@@ -39,7 +39,7 @@ def test_what_is_seen_again_and_again_is_believed_more():
     once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
     reported = only(often)
     assert only(once).confidence < 0.65
-    assert reported.confidence > 0.9 and reported.last_seen_ns == 5 * S // 20 and not reported.felt
+    assert reported.confidence > 0.9 and reported.last_seen_ns == 5 * S // 20 and not reported.touched
     assert only(often, now_ns=120 * S).confidence < reported.confidence  # belief fades
 
 
@@ -50,7 +50,7 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     for angle in angles:
         touch(map_, (0.5, 0.2), radius, angle)
     reported = only(map_)
-    assert reported.felt and reported.name.startswith("felt") and reported.shape == "cylinder"
+    assert reported.touched and reported.name.startswith("touched") and reported.shape == "cylinder"
     off = math.dist(reported.position_w[:2], (0.5, 0.2))
     assert off < 3 * reported.position_sd_m + 0.005
 
@@ -60,7 +60,7 @@ def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
     reported = only(map_)
-    assert reported.felt and reported.name == name
+    assert reported.touched and reported.name == name
     assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0] and map_.find_track(np.array([0.5, 0.5])) is None
     touch(map_, (0.8, 0.4), 0.05, 3.0)
     assert len(map_.obstacles(0, 0.0)) == 2

@@ -105,7 +105,7 @@ def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():
     world = drive.world.make_world(9, 9 * STEP_NS)
     assert world is not None and world.contacts
     assert {c.obstacle for c in world.contacts} <= {o.name for o in world.obstacles}
-    assert all(o.felt for o in world.obstacles) and "simulator" not in repr(world)
+    assert all(o.touched for o in world.obstacles) and "simulator" not in repr(world)
 
 
 def test_a_lidar_maps_as_a_camera_does():

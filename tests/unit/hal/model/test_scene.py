@@ -12,15 +12,9 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
-from snakesim_hal.model.outlines import Outlines, outline_distance_m
-from snakesim_hal.model.scene import (
-    Capsule,
-    Placed,
-    SceneFile,
-    check_clear,
-    make_route,
-    place_scene,
-)
+from snakesim_hal.model.outlines import Capsule, Outlines, outline_distance_m
+from snakesim_hal.model.placement import Placed, check_clear, place_scene
+from snakesim_hal.model.scene import SceneFile, make_route
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_testing.hal.small_robots import SCENE
 from snakesim_testing.messages import raises_error

@@ -15,7 +15,7 @@ from hypothesis.stateful import initialize, invariant, precondition, rule, run_s
 
 from snakesim_hal.safety import authority as under_test
 from snakesim_hal.safety.authority import Authority
-from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
@@ -190,7 +190,7 @@ class Everything(Model):
                 self.silent.add(i)
         fresh = self.silent - quiet_before
         if fresh and not (len(fresh) == 1 and fresh <= self.aside):
-            self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
+            self.faults = min(self.faults + 1, MAX_FAULTS)
         self.shares = [health.share(self.now_ns) for health in self.healths]
 
     @rule(
@@ -351,7 +351,7 @@ class Everything(Model):
     def estop(self, who: str) -> None:
         answer = self.authority.on_estop(EstopRequest(requester=who), self.tick)
         self.leave_for("estop")
-        self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
+        self.faults = min(self.faults + 1, MAX_FAULTS)
         self.check(answer, True)
 
     @rule(

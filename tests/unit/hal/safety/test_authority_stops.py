@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
-from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, Mode, SensorDescription
 from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, modes, receive
@@ -88,12 +88,11 @@ def test_faults_are_kept_up_to_a_limit_the_first_and_the_newest() -> None:
         rig.authority.fault(Fault(tick=i, what="hot", cause="hot"))
     assert [fault.tick for fault in rig.authority.faults] == [*range(16), *range(84, 100)]
     assert rig.authority.faults_since_reset.left_out == rig.authority.faults_since_start.left_out == 68
-    assert (MAX_FAULTS_KEPT, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
+    assert (MAX_FAULTS, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
     rig.authority.on_lifecycle(CLEAR, 0)
     assert rig.authority.faults == [] and rig.authority.faults_since_reset.left_out == 0
     assert (
-        len(rig.authority.faults_since_start.kept) == MAX_FAULTS_KEPT
-        and rig.authority.faults_since_start.left_out == 68
+        len(rig.authority.faults_since_start.stored) == MAX_FAULTS and rig.authority.faults_since_start.left_out == 68
     )
 
 
@@ -112,7 +111,7 @@ def test_what_stopped_the_robot_is_kept_however_much_comes_after_it(by: str) -> 
     assert [fault.tick for fault in rig.authority.faults] == [*range(17), *range(85, 100)]
     for i in range(100):  # of one that was never stopped
         (rig := rig if i else Rig()).authority.record_fault(Fault(tick=i, what="late", cause="late"))
-    assert len(rig.authority.faults) == MAX_FAULTS_KEPT
+    assert len(rig.authority.faults) == MAX_FAULTS
 
 
 def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:

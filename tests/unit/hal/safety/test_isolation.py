@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire.messages import Fault, Mode
 from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
 
@@ -196,6 +196,6 @@ def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None
     log = getattr(rig.authority, kept)
     for tick in range(2000, 2100):
         rig.authority.fault(Fault(tick=tick, what="follows", cause=""))
-        assert 1000 in [fault.tick for fault in log.kept] and log.kept[-1].tick == tick
-        assert len(log.kept) <= MAX_FAULTS_KEPT and len(log.kept) + log.left_out == before + 1 + tick - 1999
-    assert [fault.tick for fault in log.kept] == sorted(fault.tick for fault in log.kept)
+        assert 1000 in [fault.tick for fault in log.stored] and log.stored[-1].tick == tick
+        assert len(log.stored) <= MAX_FAULTS and len(log.stored) + log.left_out == before + 1 + tick - 1999
+    assert [fault.tick for fault in log.stored] == sorted(fault.tick for fault in log.stored)

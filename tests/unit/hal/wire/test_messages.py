@@ -22,7 +22,7 @@ def declared() -> set[type[Message]]:
         for thing in found
         if isinstance(thing, type)
         and issubclass(thing, Message)
-        and not any(one.__module__ == messages.__name__ for one in thing.__subclasses__())
+        and not any(one.__module__.startswith(messages.__name__) for one in thing.__subclasses__())
     }
 
 

@@ -83,7 +83,7 @@ def test_the_force_polygon_names_every_force_and_their_resultant():
 def test_what_a_map_tells_is_not_drawn_as_perceived():
     mapped = Obstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
     found = Obstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
-    felt = Obstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), felt=True)
+    felt = Obstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
     assert drawing is not None and [o.name for o in drawing.perceived] == ["b", "c"]
 

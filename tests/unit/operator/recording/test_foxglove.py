@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from snakesim_hal.model.scenario import write_config
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.streams import Arrival
 from snakesim_hal.run_log.black_box import Layout
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys

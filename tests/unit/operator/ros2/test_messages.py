@@ -94,7 +94,7 @@ def test_obstacles_have_their_shapes() -> None:
     known = [
         m.Obstacle(name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5),
         m.Obstacle(name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=np.pi / 2, half_size_m=(0.1, 0.2, 0.3)),
-        m.Obstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, felt=True),
+        m.Obstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True),
     ]
     world = m.World(
         tick=1,

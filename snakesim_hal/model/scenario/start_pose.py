@@ -1,0 +1,131 @@
+"""Where the robot and the obstacles are at tick 0."""
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.outlines import Capsule
+from snakesim_hal.model.placement import Placed, check_clear, place_scene
+from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
+from snakesim_hal.model.scenario.run_config import RunConfig
+from snakesim_hal.model.scene import make_route
+from snakesim_hal.wire.messages import Obstacle
+
+# Second part of the seed of the survey errors, so that they differ from other random numbers of the run's seed.
+SURVEY_SEED = 0x5EED
+
+
+def check(config: RunConfig) -> None:
+    """Check what more than one field decides: the start pose, and that no obstacle overlaps it.
+
+    Raises:
+        ConfigError: The robot cannot lie at the start pose, or an obstacle is in its place.
+    """
+    if config.start.on_route and config.scene.route is None:
+        raise ConfigError(
+            f"scenario {config.name!r}: `start.on_route` is true but scene {config.scene.name!r} has no route; "
+            f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene",
+            code="scene/no-route",
+        )
+    angles_rad = find_start_pose(config).angles_rad.tolist()
+    for joint, angle_rad in zip(config.robot.joint_table, angles_rad, strict=True):
+        if not joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad:
+            raise _start_angle_error(config, joint, angle_rad)
+    place_obstacles(config)
+
+
+def _start_angle_error(config: RunConfig, joint: Joint, angle_rad: float) -> ConfigError:
+    """Return the error for a start angle outside of a joint's limits."""
+    limits = joint.limits
+    if not config.start.on_route:
+        return ConfigError(
+            f"robot {config.robot.name!r}: {joint.name} may turn from {limits.lower_rad:g} to "
+            f"{limits.upper_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
+            f"start it on a route that suits them",
+            code="config/out-of-range",
+        )
+    return ConfigError(
+        f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
+        f"{config.robot.name!r} allows {limits.lower_rad:g} to {limits.upper_rad:g} rad. Choose a "
+        f"smoother route",
+        code="config/out-of-range",
+    )
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """Pose of the snake at tick 0."""
+
+    position_w: tuple[float, float]  # of the tail end, on the ground
+    yaw_rad: float
+    angles_rad: NDArray[np.float64]  # (n_joints,), tail to head
+
+
+def find_start_pose(config: RunConfig) -> StartPose:
+    """Return the pose of the snake at tick 0: on the scene's route, or straight."""
+    robot = config.robot
+    start = config.start
+    route = make_route(config.scene)
+    if not start.on_route or route is None:
+        straight_rad = np.zeros(robot.chain.modules)
+        return StartPose(start.position_m, start.yaw_rad, straight_rad)
+    segments_m = yaw_segments_m(robot.axes, robot.link_lengths_m)
+    chain = lay_chain(route, start.tail_s_m, segments_m)
+    return StartPose(chain.tail_w, chain.heading_rad, chain_angles(robot.axes, chain.angles_rad))
+
+
+def capsules_at_start(config: RunConfig) -> list[Capsule]:
+    """Return the outlines of the links at tick 0 as seen from above, tail to head."""
+    robot = config.robot
+    pose = find_start_pose(config)
+    radius_m = robot.module.radius_m
+    base_w = (*pose.position_w, radius_m)
+    base_rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
+    origins, rotations = link_frames(base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m)
+    capsules: list[Capsule] = []
+    for i, length_m in enumerate(robot.link_lengths_m):
+        front_w = origins[i] + length_m * rotations[i][:, 0]
+        rear_x, rear_y, _ = origins[i].tolist()
+        front_x, front_y, _ = front_w.tolist()
+        capsules.append(
+            Capsule(name=f"link_{i}", rear_m=(rear_x, rear_y), front_m=(front_x, front_y), radius_m=radius_m)
+        )
+    return capsules
+
+
+def place_obstacles(config: RunConfig) -> list[Placed]:
+    """Return all obstacles of the scene, placed.
+
+    Raises:
+        ConfigError: An obstacle cannot be placed, or overlaps the snake's start pose.
+    """
+    snake = capsules_at_start(config)
+    placed = place_scene(config.scene, snake)
+    check_clear(config.scene, placed, snake)
+    return placed
+
+
+def survey_obstacles(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
+    """Return the obstacles at the positions that the survey gives, which differ from the true ones by its error.
+
+    Args:
+        config: of the run; its seed decides the errors.
+        walkable: true: the platforms that the snake may lie on; false: the obstacles that it pushes against.
+    """
+    obstacles = [placed.obstacle for placed in place_obstacles(config) if placed.walkable == walkable]
+    error_m = config.mission.map_error_m
+    if error_m == 0.0:
+        return obstacles
+    random = np.random.default_rng((config.seed, SURVEY_SEED + walkable))
+    errors_m = random.normal(0.0, error_m, (len(obstacles), 2))
+    displaced: list[Obstacle] = []
+    for obstacle, (error_x, error_y) in zip(obstacles, errors_m.tolist(), strict=True):
+        x, y, z = obstacle.position_w
+        position_w = (x + error_x, y + error_y, z)
+        displaced.append(msgspec.structs.replace(obstacle, position_w=position_w))
+    return displaced

@@ -1,0 +1,48 @@
+"""What messages of several topics have in common: their base class, states, modes, and texts about fields."""
+
+from enum import IntEnum
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from snakesim_hal.wire import quantities as q
+from snakesim_hal.wire.quantities import about
+
+ClockMode = Literal["realtime", "lockstep", "free"]
+LifecycleState = Literal["disarmed", "armed", "fault", "estop"]
+LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
+StopMode = Literal["passive", "damp", "hold"]
+Reach = Literal["robot", "joint", "none"]
+Axis = Literal["yaw", "pitch"]
+Measurement = Literal["torque", "temperature", "voltage"]
+
+# Meanings of fields that several messages have.
+ONE_PER_JOINT = "one entry a joint"
+ABOUT_CLOCK_MODE = about(
+    "realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting"
+)
+ABOUT_LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a reset")
+ABOUT_HOST = about("random id of the host process, new at each start; null: unknown")
+
+
+class Mode(IntEnum):
+    """How a joint uses its target.
+
+    0 passive: motor off, the target is ignored
+    1 position: target in rad
+    2 velocity: target in rad/s
+    3 torque: target in N·m
+    """
+
+    PASSIVE = 0
+    POSITION = 1
+    VELOCITY = 2
+    TORQUE = 3
+
+
+Modes = Annotated[list[Mode], Meta(max_length=q.MAX_JOINTS), about(ONE_PER_JOINT)]
+
+
+class Message(msgspec.Struct, frozen=True):
+    """Base of everything on the wire. Unknown fields are ignored, so that fields can be added."""
