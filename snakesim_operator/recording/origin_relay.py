@@ -4,12 +4,12 @@ Data flow: viewer -> relay on loopback (checks the request's head) -> Foxglove's
 """
 
 import asyncio
-import contextlib
 import secrets
 import threading
 from collections.abc import Callable, Collection
 
 from snakesim_hal.base.errors import NotConnectedError
+from snakesim_operator.base.byte_relay import relay_bytes
 from snakesim_operator.base.page_origin import explain_head_refusal
 
 HOST = "127.0.0.1"
@@ -17,7 +17,6 @@ MAX_HEAD_BYTES = 16 * 1024
 HEAD_TIMEOUT_S = 5.0
 MAX_CONNECTIONS = 64
 MAX_REASONS_REPORTED = 64  # a page could otherwise fill the terminal
-CHUNK_BYTES = 64 * 1024
 END_OF_HEAD = b"\r\n\r\n"
 FORBIDDEN = b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
@@ -107,26 +106,13 @@ class OriginRelay:
             self._report(f"Foxglove: refused a viewer: {reason}; if you trust it: --foxglove-origin ORIGIN")
 
     async def _relay(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Copy bytes in both directions until one of the sides closes its connection."""
+        """Pass a viewer's request on, and copy bytes in both directions until one of the sides closes its connection.
+
+        For a slow viewer the server drops whole messages; this relay does not know where a message ends.
+        """
         from_server, to_server = await asyncio.open_connection(*self._server_address)
         try:
             to_server.write(head)
-            upstream = asyncio.ensure_future(_copy(reader, to_server))
-            downstream = asyncio.ensure_future(_copy(from_server, writer))
-            await asyncio.wait([upstream, downstream], return_when=asyncio.FIRST_COMPLETED)
-            upstream.cancel()
-            downstream.cancel()
-            await asyncio.gather(upstream, downstream, return_exceptions=True)
+            await relay_bytes((reader, writer), (from_server, to_server))
         finally:
             to_server.close()
-
-
-async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Copy bytes as fast as the receiver takes them.
-
-    For a slow viewer the server drops whole messages; this relay does not know where a message ends.
-    """
-    with contextlib.suppress(OSError):
-        while data := await reader.read(CHUNK_BYTES):
-            writer.write(data)
-            await writer.drain()

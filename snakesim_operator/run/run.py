@@ -104,7 +104,7 @@ def run(request: RunRequest) -> int:
             with contextlib.ExitStack() as opened:
                 registry_failure = opened.enter_context(registered(robot))
                 if request.console:  # before the robot, because the operator waits for it
-                    opened.enter_context(console_beside(processes.common_arguments, files, print_line))
+                    opened.enter_context(console_beside(processes.common_arguments, link, files, print_line))
                 if registry_failure is not None:
                     print_line(registry_failure)
                 _run_processes(processes, ending)

@@ -6,6 +6,7 @@ import threading
 import time
 from importlib.metadata import version
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec.msgpack
 import zstandard
@@ -108,11 +109,18 @@ class Page:
             self.say({"type": "LocalStorageGetItemResponseMessage", **answer})
 
 
+def origin_of(address: str) -> str:
+    """The origin of a page at this address, as its browser sends it."""
+    parts = urlsplit(address)
+    return f"{parts.scheme}://{parts.netloc}"
+
+
 def ask(address: str, method: str, path: str = "/stop", **headers: str) -> tuple[int, str]:
-    """Status and text of an HTTP request."""
-    connection = http.client.HTTPConnection(address.removeprefix("http://"), timeout=20.0)
+    """Status and text of an HTTP request. path: behind the token that ends the address."""
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(parts.netloc, timeout=20.0)
     with contextlib.closing(connection):
-        connection.request(method, path, headers=headers)
+        connection.request(method, parts.path.rstrip("/") + path, headers=headers)
         answer = connection.getresponse()
         return answer.status, answer.read().decode()
 

@@ -1,5 +1,7 @@
-"""C1 to C8: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
+"""C1 to C10: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
 
+import os
+import signal
 import socket
 import threading
 import time
@@ -11,8 +13,8 @@ import psutil
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from snakesim_testing.harness.page import CAMERA, STOP, Page, ask, flood
-from snakesim_testing.harness.processes import processes_of
+from snakesim_testing.harness.page import CAMERA, STOP, Page, ask, flood, origin_of
+from snakesim_testing.harness.processes import processes_of, processes_with
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import address
 from verification.attack.effort import Record, effort
@@ -181,12 +183,16 @@ def test_c5_a_flood_costs_nobody_the_stop(robot: Robot, at: str, kind: str, reco
 
 def console_mb(robot: Robot) -> float:
     """Resident memory of the console."""
-    pid = next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.features.console" in line)
-    return psutil.Process(pid).memory_info().rss / 1e6
+    return psutil.Process(pages_pid(robot)).memory_info().rss / 1e6
+
+
+def pages_pid(robot: Robot) -> int:
+    """Process id of the console's page server, where viser is."""
+    return next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.features.console\0" in line)
 
 
 def test_c6_pages_of_other_origins_are_refused(robot: Robot, at: str) -> None:
-    for origin in (*REFUSED, at.replace("127.0.0.1", "localhost")):  # another name: another origin
+    for origin in (*REFUSED, origin_of(at).replace("127.0.0.1", "localhost")):  # another name: another origin
         with pytest.raises(InvalidStatus) as refused:
             Page(at, origin)
         assert refused.value.response.status_code == 403
@@ -195,7 +201,7 @@ def test_c6_pages_of_other_origins_are_refused(robot: Robot, at: str) -> None:
             assert status == 403 and "may connect" in why
     assert ask(at, "GET", "/", Host="evil.example")[0] == 403  # a name of theirs that points here
     assert ask(at, "POST", Host="evil.example", Origin="http://evil.example")[0] == 403
-    with Page(at, at) as own:
+    with Page(at, origin_of(at)) as own:
         own.find(STOP)
     robot.stays("armed", 0.3)
 
@@ -204,10 +210,10 @@ def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, rec
     health = robot.health()
     with ExitStack() as stack:
         for said in (b"", b"POST /stop HTTP/1.1\r\nHost: ", b"GET / HTTP/1.1\r\n") * effort(40, 100):
-            half = stack.enter_context(socket.create_connection(address(at.replace("http://", "tcp/"))))
+            half = stack.enter_context(socket.create_connection(address(origin_of(at).replace("http://", "tcp/"))))
             half.sendall(said)
         answers: list[tuple[int, str]] = []
-        took_s = stops(robot, lambda: answers.append(ask(at, "POST", Origin=at)))
+        took_s = stops(robot, lambda: answers.append(ask(at, "POST", Origin=origin_of(at))))
         assert answers[0][0] == 200 and "planar13: stopped" in answers[0][1]
     record_property("stopped after", f"{1000 * took_s:.0f} ms from POST /stop")
     assert 'id = "second-stop"' in ask(at, "GET", "/")[1] and ask(at, "GET", "/")[0] == 200
@@ -223,7 +229,7 @@ def test_c8_half_sent_requests_of_several_processes_cost_nobody_the_stop(
         ways: dict[str, Callable[[], object]] = {
             "the page's button": lambda: page.click(STOP),
             "the button of a page without WebGL": lambda: without_scene.click(STOP),
-            "POST /stop": lambda: ask(at, "POST", Origin=at),
+            "POST /stop": lambda: ask(at, "POST", Origin=origin_of(at)),
         }
         page.find(STOP)
         without_scene.find(STOP)
@@ -239,4 +245,60 @@ def test_c8_half_sent_requests_of_several_processes_cost_nobody_the_stop(
             robot.operator.recover()
         with Page(at) as late:
             late.find(STOP)
+    robot.unharmed(health)
+
+
+WRONG_TOKENS = ("", "wrong", "stop", "..", "%2e%2e", "index.html")
+
+
+def test_c9_without_the_token_nothing_is_answered(robot: Robot, at: str) -> None:
+    """Neither by the address without it, nor with a wrong one, nor at the port of viser itself."""
+    health = robot.health()
+    token = at.rstrip("/").rpartition("/")[2]
+    for wrong in (*WRONG_TOKENS, token[:-1], token + "x", token.swapcase()):
+        address_without = f"{origin_of(at)}/{wrong}"
+        for method, path in (("POST", "/stop"), ("GET", "/stop"), ("GET", "/"), ("GET", "/signals")):
+            status, why = ask(address_without, method, path, Origin=origin_of(at))
+            assert status == 403 and "the address that the console printed" in why
+        with pytest.raises(InvalidStatus):
+            Page(address_without, origin_of(at))
+    with Page(at) as viewer:
+        button = viewer.find(STOP)
+        for port in listening_ports(pages_pid(robot)):
+            with Page(f"http://127.0.0.1:{port}") as intruder:
+                intruder.change(button, {"value": True})
+                intruder.change(button, {"visible": False})
+                assert intruder.ended() is None and not intruder.controls, "closed without a word"
+        robot.stays("armed", 0.5)
+        assert viewer.controls[button].get("visible", True)
+        stops(robot, lambda: viewer.click(STOP))
+    robot.unharmed(health)
+    command_lines = [line for _, line in processes_with("cmdline", "snakesim_operator.features.console")]
+    assert command_lines and not any(token in line for line in command_lines), "every user reads command lines"
+
+
+def listening_ports(pid: int) -> list[int]:
+    """The TCP ports on which a process listens."""
+    connections = psutil.Process(pid).net_connections("tcp")
+    ports = [one.laddr.port for one in connections if one.status == psutil.CONN_LISTEN]
+    assert ports
+    return ports
+
+
+def test_c10_the_second_stop_works_while_the_process_of_the_pages_is_stopped(
+    robot: Robot, at: str, record_property: Record
+) -> None:
+    health = robot.health()
+    pid = pages_pid(robot)
+    wait_until(lambda: ask(at, "GET") == (200, "ready"), "a second stop that has tested itself", 10.0)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        answers: list[tuple[int, str]] = []
+        with half_sent(at, count=2000, processes=1):
+            took_s = stops(robot, lambda: answers.append(ask(at, "POST", Origin=origin_of(at))))
+        assert answers[0][0] == 200 and "planar13: stopped" in answers[0][1]
+        assert took_s < FLOODED_STOP_S
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    record_property("stopped without the pages' process", f"after {1000 * took_s:.0f} ms")
     robot.unharmed(health)

@@ -1,13 +1,17 @@
 """`snakesim console`, and the process that `snakesim run --console` starts."""
 
 import argparse
+import contextlib
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
-from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.process import on_stop_signal, raise_open_files
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.base.workers import start_worker
 from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read_config
@@ -16,10 +20,12 @@ from snakesim_hal.network.session import Link
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import process_options
 from snakesim_operator.base import extras
-from snakesim_operator.base.console_port import open_port
+from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
 from snakesim_operator.base.targets import RobotSelection, only_robot
+from snakesim_operator.run import children
+from snakesim_operator.run.console_front import start_front
 
-MAX_OPEN_FILES = 4096  # far more than connections of browsers may use; see `connection_limits.ConnectionLimits`
+MAX_OPEN_FILES = 4096  # far more than connections of browsers may use
 
 
 def console(where: RobotSelection, port: int | None, commission: Path | None = None) -> int:
@@ -45,7 +51,9 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
     from snakesim_operator.features.console.display_loop import show_live
 
     link = only_robot(where, "console")
-    show_live(link, _find_surroundings(link), open_port(port), _stop_on_signal(), commission=commission)
+    stop = _stop_on_signal()
+    with _front_server(port, link, stop) as ports:
+        show_live(link, _find_surroundings(link), ports.pages, stop, commission=commission)
     return 0
 
 
@@ -66,11 +74,16 @@ def show_record(folder: Path, at_s: float, port: int | None) -> int:
     _prepare_process()
     from snakesim_operator.features.console.display_loop import show_recorded
 
-    return show_recorded(folder, at_s, open_port(port), _stop_on_signal())
+    stop = _stop_on_signal()
+    with _front_server(port, None, stop) as ports:
+        return show_recorded(folder, at_s, ports.pages, stop)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Show the run that started this process, on a port that the run has opened. The process ends with the run."""
+    """Serve the pages of the run that started this process, at a socket that the run has opened.
+
+    The process ends with the run.
+    """
     parser = argparse.ArgumentParser(
         prog="snakesim_operator.features.console", description="Show a run in the browser."
     )
@@ -97,6 +110,38 @@ def _prepare_process() -> None:
     """
     extras.require("console", "the console")
     raise_open_files(MAX_OPEN_FILES)
+
+
+@contextlib.contextmanager
+def _front_server(port: int | None, link: Link | None, stop: threading.Event) -> Iterator[ConsolePorts]:
+    """Run the front server in a process of its own, and print the address of the page.
+
+    Args:
+        port: Port of the page; None: the default port, or any free one.
+        link: How to reach the robot; None for a recording.
+        stop: Set when the front server ends, because the pages cannot be reached then.
+
+    Raises:
+        NotConnectedError: The port is in use, or the front server has ended.
+    """
+    with open_console_ports(port) as ports:
+        front = start_front(ports, link, lambda output: print_line(output.decode(errors="replace").rstrip()))
+        ports.browsers.close()  # the front server has its own copy
+        print_line(f"console: {ports.address}")
+        start_worker("console front watch", partial(_set_after_end, front, stop))
+        try:
+            yield ports
+            end = front.describe_end()
+        finally:
+            children.stop_all([front])
+    if end is not None:
+        raise NotConnectedError(f"no browser can connect any more: {end}")
+
+
+def _set_after_end(child: children.Child, event: threading.Event) -> None:
+    """Set an event once a child has ended."""
+    child.process.wait()
+    event.set()
 
 
 def _find_surroundings(link: Link):

@@ -20,7 +20,8 @@ from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.features.console.robot_data.signals import LiveSignals
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import Surroundings
-from snakesim_operator.features.console.web.server import SECOND_STOP, serve_pages
+from snakesim_operator.features.console.web.added_html import SECOND_STOP
+from snakesim_operator.features.console.web.serve import serve_pages
 
 FRAMES_PER_S = 30.0
 
@@ -38,7 +39,7 @@ def show_live(
     Args:
         link: How to connect to the robot.
         surroundings: The true surroundings of the robot, if they are known.
-        listening: Where browsers connect.
+        listening: The Unix socket at which the front server connects.
         stop: Set to end the console.
         expected: Shown until a robot describes itself.
         commission: The robot file that pages may write into; None: none.
@@ -57,9 +58,8 @@ def show_live(
     signals_page = SignalsPage(signals, SECOND_STOP)
     signals_page.now_s = signals.now_s
 
-    with serve_pages(listening, report, operations.stop, signals_page.answer) as (server, address):
+    with serve_pages(listening, report, signals_page.answer, has_stop=True) as server:
         page = Page(server, surroundings, operations, log, commission=commission)
-        print_line(f"console: {address}")
         page.show_snapshot(expected)
         link_with_images = replace(link, max_bytes=MAX_IMAGE_BYTES)
         with open_session(link_with_images, SERVICE_START_LIMIT_S) as session:
@@ -82,7 +82,7 @@ def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: 
     Args:
         folder: The folder of the run.
         start_s: Where to begin, in seconds after the first instant.
-        listening: Where browsers connect.
+        listening: The Unix socket at which the front server connects.
         stop: Set to end the console.
 
     Returns:
@@ -104,12 +104,11 @@ def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: 
         log.write(f"of {run.history.image_decimation} camera images one is kept")
     code = exit_code(folder, run.record.missing)
     signals_page = SignalsPage(PlaybackSignals(run))
-    with serve_pages(listening, print_line, answer_first=signals_page.answer) as (server, address):
+    with serve_pages(listening, print_line, signals_page.answer, has_stop=False) as server:
         page = Page(server, Surroundings(run.record.config), None, log, recorded=folder.name)
         player = Player(server, run.span_s, start_s)
         signals_page.now_s = lambda: player.since_begin_s
         signals_page.jump_to = player.jump_to
-        print_line(f"console: {address}")
         shown_s = None
         for _ in wait_for_frames(stop):
             time_s, has_jumped = player.advance()

@@ -12,16 +12,15 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, JointState, Status
-from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.operations import Operations, PageLog
 from snakesim_operator.features.console.page.page import Page
 from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
-from snakesim_operator.features.console.web.server import serve_pages
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.processes import nothing_left, processes_of
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.browser import CHROMIUM, MISSING, Tab, chromium
 from snakesim_testing.operator.ready_stop import ReadyStop
+from snakesim_testing.operator.served_console import served_console
 from snakesim_testing.runs.command import Running, running
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
@@ -81,7 +80,7 @@ TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab
 
 def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
-    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
+    with served_console(ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, None, PageLog(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
@@ -102,7 +101,7 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
 def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_all_else() -> None:
     """And a wide screen shows the tabs in one line."""
     config, log = load("triplet").config, PageLog()
-    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
+    with served_console(ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, Operations(Link(free_endpoint(), "planar13"), log), log).show_snapshot(
             make_expected_snapshot(config)
         )

@@ -8,13 +8,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, MessageAge, PageAction
-from snakesim_operator.features.console.web.server import serve_pages
 from snakesim_testing.harness.page import Page
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
+from snakesim_testing.operator.served_console import served_console
 
 HZ = 10.0
 VIEWER = 3
@@ -99,7 +98,7 @@ def test_answers_that_nobody_asked_for_make_nothing_younger() -> None:
 def test_what_may_move_a_robot_is_not_done_late_and_what_stops_it_is() -> None:
     done: list[str] = []
     late: list[float] = []
-    with serve_pages(open_port(None), stop=ReadyStop()) as (server, _):
+    with served_console(ReadyStop()) as (server, _):
         admission = Admission()
         group = server.gui.add_button_group("Robot", ("Arm", "Disarm"))
         hold = server.gui.add_button("Hold")
@@ -142,7 +141,7 @@ def _update(handle: Any, value: object) -> dict[str, Any]:
 
 def test_a_page_without_a_scene_is_a_viewer_and_may_stop() -> None:
     stopped: list[int] = []
-    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address):
+    with served_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")
         server.admission.admit(button, handler=lambda viewer, _action: stopped.append(viewer))
         with Page(address, draws=False) as page:
@@ -160,7 +159,7 @@ def test_a_real_page_answers_what_it_is_asked(capfd: pytest.CaptureFixture[str])
         if len(ages) == 1:
             raise RuntimeError(f"unexpected, of viewer {viewer}")
 
-    with serve_pages(open_port(None), stop=ReadyStop()) as (server, address):
+    with served_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("Go")
         server.admission.admit(button, handler=act)
         with Page(address) as page:

@@ -5,8 +5,7 @@ from typing import Any
 
 import viser
 
-from snakesim_operator.base.console_port import open_port
-from snakesim_operator.features.console.web.server import serve_pages
+from snakesim_testing.operator.served_console import served_console
 from snakesim_testing.operator.viewer import ASKED, Viewer, viewing
 
 CHANGES = 200
@@ -14,7 +13,7 @@ LIMIT_S = 20.0
 
 
 def test_a_slow_page_gets_the_newest_state_only() -> None:
-    with serve_pages(open_port(None)) as (server, address):
+    with served_console() as (server, address):
         text = server.gui.add_text("Tick", "0")
 
         async def slow() -> list[str]:
@@ -36,7 +35,7 @@ def test_a_slow_page_gets_the_newest_state_only() -> None:
 
 
 def test_a_page_that_keeps_up_gets_every_change() -> None:
-    with serve_pages(open_port(None)) as (server, address):
+    with served_console() as (server, address):
         text = server.gui.add_text("Tick", "")
 
         async def quick() -> list[str]:

@@ -10,17 +10,18 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import capsules_at_start, load
-from snakesim_operator.base.console_port import open_port, page_address
+from snakesim_operator.base.console_port import open_console_ports, open_port
 from snakesim_operator.base.page_origin import explain_refusal
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.page import page_html
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, make_expected_snapshot
 from snakesim_operator.features.console.scene.drawing import draw
 from snakesim_operator.features.console.scene.scene_colors import LEGEND
-from snakesim_operator.features.console.web.server import serve_pages
+from snakesim_operator.features.console.web.serve import serve_pages
 from snakesim_testing.hal.small_robots import description, status
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
+from snakesim_testing.operator.served_console import fronted, served_console
 from snakesim_testing.operator.viewer import watch
 
 
@@ -43,15 +44,15 @@ def test_a_port_that_is_taken_is_an_error_and_no_other_port():
 
 
 def test_a_browser_that_comes_before_the_page_gets_it():
-    listening = open_port(None)
-    with socket.create_connection(listening.getsockname(), timeout=10.0) as early:
-        early.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        viewers = [threading.Thread(target=come, args=(page_address(listening),)) for _ in range(3)]
-        for viewer in viewers:
-            viewer.start()
-        with serve_pages(listening) as (server, _):
-            assert early.recv(15) == b"HTTP/1.1 200 OK"
-            wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
+    with open_console_ports(None) as ports:
+        with socket.create_connection(ports.browsers.getsockname(), timeout=10.0) as early:
+            early.sendall(f"GET /{ports.token}/ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+            viewers = [threading.Thread(target=come, args=(ports.address,)) for _ in range(3)]
+            for viewer in viewers:
+                viewer.start()
+            with fronted(ports, None), serve_pages(ports.pages, has_stop=False) as server:
+                assert early.recv(15) == b"HTTP/1.1 200 OK"
+                wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
         for viewer in viewers:
             viewer.join(10.0)
 
@@ -61,7 +62,7 @@ def come(address: str) -> None:
 
 
 def test_nobody_can_open_a_tunnel_to_the_internet():
-    with serve_pages(open_port(None)) as (server, _):
+    with served_console() as (server, _):
         assert server.request_share_url() is None
 
 

@@ -3,19 +3,18 @@
 import pytest
 
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_operator.base.console_port import open_port
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
-from snakesim_operator.features.console.web.server import serve_pages
 from snakesim_testing.hal.small_robots import description
 from snakesim_testing.operator.drawn_samples import contact, joints, pushing, world
+from snakesim_testing.operator.served_console import served_console
 
 
 def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
     point = contact((0.0, 10.0, 0.0))
     control = pushing([point], [10.0])
-    with serve_pages(open_port(None)) as (server, _):
+    with served_console() as (server, _):
         scene = RobotScene(server.scene, description(), None)
         for felt in ([], [point], []):
             snapshot = RobotSnapshot(robot=description(), body=joints(), world=world(felt, []), control=control)
@@ -36,7 +35,7 @@ def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
         Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),
         Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), touched=True),
     ]
-    with serve_pages(open_port(None)) as (server, _):
+    with served_console() as (server, _):
         scene = RobotScene(server.scene, description(), None)
         for obstacles in (found, []):
             drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world([], obstacles)), None)

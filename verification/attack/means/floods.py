@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from snakesim_testing.harness.page import origin_of
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import address
 
@@ -43,7 +44,7 @@ def flood(
 @contextmanager
 def half_sent(console: str, count: int, processes: int) -> Iterator[None]:
     """Half-sent HTTP requests at a console, so many of each process, held open for as long as the context lives."""
-    host, port = address(console.replace("http://", "tcp/"))
+    host, port = address(origin_of(console).replace("http://", "tcp/"))
     command = [sys.executable, "-m", "verification.attack.means.half_sent", host, str(port), str(count)]
     with contextlib.ExitStack() as stack:
         started: list[subprocess.Popen[bytes]] = []

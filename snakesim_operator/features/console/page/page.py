@@ -41,7 +41,7 @@ from snakesim_operator.features.console.scene.drawing import Surroundings, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
 from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.message_age import PageAction
-from snakesim_operator.features.console.web.server import PageServer
+from snakesim_operator.features.console.web.viser_server import PageServer
 
 # Decimation: every how many frames each part of the page is renewed, at 30 frames a second.
 TEXT_DECIMATION = 6

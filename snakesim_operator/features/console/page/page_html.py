@@ -26,8 +26,8 @@ REAL_COLOR = "#b3261e"
 RECORDED_COLOR = "#59626d"  # also while nothing moves
 
 SIGNALS = (
-    "<iframe src='/signals?within' title='Signals' loading='lazy' style='border:0;width:100%;height:60vh'></iframe>"
-    "<a href='/signals' target='_blank' style='padding:0 .6em;font-size:.85em'>Signals in a page of their own</a>"
+    "<iframe src='signals?within' title='Signals' loading='lazy' style='border:0;width:100%;height:60vh'></iframe>"
+    "<a href='signals' target='_blank' style='padding:0 .6em;font-size:.85em'>Signals in a page of their own</a>"
 )
 
 

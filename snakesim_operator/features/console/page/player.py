@@ -4,7 +4,7 @@ import time
 
 import viser
 
-from snakesim_operator.features.console.web.server import PageServer
+from snakesim_operator.features.console.web.viser_server import PageServer
 
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
 SLIDER_PERIOD_S = 0.1  # between two updates of the slider while the recording plays

@@ -12,7 +12,7 @@
   };
   const say = (words, bad = false) => { at("said").textContent = words; at("said").className = bad ? "bad" : ""; };
   const ask = async (path, given = [], headers = {}) => {
-    const answer = await fetch(`/signals/${path}?${new URLSearchParams(given)}`, { cache: "no-store", headers });
+    const answer = await fetch(`signals/${path}?${new URLSearchParams(given)}`, { cache: "no-store", headers });
     if (!answer.ok) throw new Error(await answer.text());
     return answer;
   };

@@ -83,6 +83,7 @@ class SignalsPage:
                 "Content-Length": str(len(body)),
                 "Cache-Control": "no-store",
                 "Content-Security-Policy": self._policy,
+                "Referrer-Policy": "no-referrer",
                 "X-Content-Type-Options": "nosniff",
             }
         )

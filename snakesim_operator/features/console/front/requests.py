@@ -1,0 +1,74 @@
+"""Reads the head of an HTTP request, and decides whether it is answered. Pure, except for `read_head`."""
+
+import asyncio
+import secrets
+from dataclasses import dataclass
+
+from snakesim_operator.base.page_origin import explain_head_refusal
+
+MAX_HEAD_BYTES = 16 * 1024  # far above what a browser sends
+END_OF_HEAD = b"\r\n\r\n"
+WRONG_TOKEN = (
+    "this address has not the token of this console; open the address that the console printed. It changes with each "
+    "start"
+)
+
+
+@dataclass(frozen=True)
+class BadRequest:
+    """A request that is not answered, and why."""
+
+    status: int
+    kind: str  # by which refusals are counted
+    reason: str
+
+
+@dataclass(frozen=True)
+class FrontRequest:
+    """A request with the right token, for the stop or for a page."""
+
+    method: str
+    path: str  # without token and query; empty if the address ends with the token
+    head: bytes  # as the page server gets it: without the token
+    is_websocket: bool
+
+
+async def read_head(reader: asyncio.StreamReader, limit_s: float) -> bytes:
+    """Return the head of the next request, with the empty line at its end.
+
+    Raises:
+        TimeoutError: It did not arrive in time.
+        IncompleteReadError: The client closed its connection.
+        LimitOverrunError: It is too long.
+    """
+    async with asyncio.timeout(limit_s):
+        return await reader.readuntil(END_OF_HEAD)
+
+
+def check_head(head: bytes, token: str) -> FrontRequest | BadRequest:
+    """Check origin and token of a request.
+
+    Pages of other origins do not know the token. They are refused by their origin all the same, so that a token which
+    became known, from a picture of a screen for example, does not help them.
+    """
+    first_line, _, header_lines = head.removesuffix(END_OF_HEAD).partition(b"\r\n")
+    parts = first_line.decode("latin-1").split(" ")
+    if len(parts) != 3:
+        return BadRequest(400, "no HTTP", "the first line of the request is not one of HTTP")
+    refusal = explain_head_refusal(head.removesuffix(END_OF_HEAD))
+    if refusal is not None:
+        return BadRequest(403, "another origin", refusal)
+    method, target, version = parts
+    _, _, after_slash = target.partition("/")
+    end_of_token = min((after_slash + "/").index("/"), (after_slash + "?").index("?"))
+    given_token = after_slash[:end_of_token]
+    if not secrets.compare_digest(given_token.encode(), token.encode()):
+        return BadRequest(403, "wrong token", WRONG_TOKEN)
+    rest = after_slash[end_of_token:]
+    stripped_target = rest if rest.startswith("/") else f"/{rest}"
+    return FrontRequest(
+        method=method,
+        path=rest.partition("?")[0],
+        head=b"\r\n".join((f"{method} {stripped_target} {version}".encode("latin-1"), header_lines)) + END_OF_HEAD,
+        is_websocket=b"\r\nupgrade:" in head.lower(),
+    )

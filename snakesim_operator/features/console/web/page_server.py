@@ -1,0 +1,177 @@
+"""Answers the requests that the front server passes on, and relays messages between each browser and viser."""
+
+import asyncio
+import contextlib
+import http
+import logging
+import socket
+import threading
+from collections.abc import Callable
+
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.server import ServerConnection, unix_serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from snakesim_operator.features.console.web.browser import Browser
+from snakesim_operator.features.console.web.viser_server import PageServer
+
+MAX_VIEWERS = 64
+MAX_MESSAGE_BYTES = 64 * 1024  # of a browser; far above any message of a page
+PAGE_PATHS = ("/", "/index.html")
+VISER_PROTOCOL = "viser-v"  # how the name of viser's protocol begins; a version follows
+
+# Codes with which a websocket is closed.
+MESSAGE_TOO_BIG = 1009
+TRY_AGAIN_LATER = 1013
+UNSENT_CODES = (None, 1005, 1006)  # no code: the connection is open, or was lost
+
+AnswerRequest = Callable[[Request], Response | None]
+
+
+class BrowserRelay:
+    """Serves browsers in a thread of its own, for as long as its context lasts."""
+
+    def __init__(self, listening: socket.socket, viser: PageServer, page: bytes, answer_first: AnswerRequest) -> None:
+        """Accept nothing yet.
+
+        Args:
+            listening: The Unix socket at which the front server connects.
+            viser: Gets the messages of browsers.
+            page: The console's page, as HTML.
+            answer_first: Answers requests for pages beside the console's; returns None for a page that it has not.
+        """
+        self._listening = listening
+        self._viser = viser
+        self._page = page
+        self._answer_first = answer_first
+        self._open_browsers: set[Browser] = set()
+        # Bytes that are no websocket are no errors of the console.
+        self._quiet_logger = logging.getLogger(f"{__name__}.websockets")
+        self._quiet_logger.addHandler(logging.NullHandler())
+        self._quiet_logger.propagate = False
+        # The thread.
+        self._loop = asyncio.new_event_loop()
+        self._ended = asyncio.Event()
+        self._thread = threading.Thread(
+            target=self._loop.run_until_complete, args=(self._serve(),), name="page server", daemon=True
+        )
+
+    def __enter__(self) -> "BrowserRelay":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._ended.set)
+        self._thread.join()
+        self._loop.close()
+
+    async def _serve(self) -> None:
+        """Serve until the context ends."""
+        server = unix_serve(
+            self._serve_browser,
+            sock=self._listening,
+            process_request=self._answer_request,
+            select_subprotocol=_select_viser_protocol,
+            max_size=MAX_MESSAGE_BYTES,
+            compression=None,
+            logger=self._quiet_logger,
+        )
+        async with server:
+            await self._ended.wait()
+
+    # --- pages -----------------------------------------------------------------------------------------------
+
+    def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request for a page; None lets a websocket connect."""
+        if "Upgrade" in request.headers:
+            return None
+        response = self._answer_first(request)
+        if response is not None:
+            return response
+        if request.path.partition("?")[0] not in PAGE_PATHS:
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "there is no such page\n")
+        headers = Headers(
+            {
+                "Content-Type": "text/html; charset=utf-8",
+                "Content-Length": str(len(self._page)),
+                "Content-Security-Policy": "frame-ancestors 'none'",
+                "Referrer-Policy": "no-referrer",
+            }
+        )
+        return Response(http.HTTPStatus.OK.value, http.HTTPStatus.OK.phrase, headers, self._page)
+
+    # --- messages --------------------------------------------------------------------------------------------
+
+    async def _serve_browser(self, connection: ServerConnection) -> None:
+        """Relay the messages of one browser until it leaves."""
+        assert connection.request is not None
+        browser = Browser(connection.request, self._viser.admission)
+        if len(self._open_browsers) >= MAX_VIEWERS:
+            reason = f"more than {MAX_VIEWERS} pages are open"
+            browser.drop("too many viewers", reason)
+            await connection.close(TRY_AGAIN_LATER, reason)
+            return
+        self._open_browsers.add(browser)
+        try:
+            await self._connect_to_viser(connection, browser)
+        except (OSError, TimeoutError, WebSocketException) as error:
+            browser.drop("no answer of viser", str(error))
+            await connection.close(TRY_AGAIN_LATER, "the console does not answer; load the page again")
+        finally:
+            self._open_browsers.discard(browser)
+
+    async def _connect_to_viser(self, connection: ServerConnection, browser: Browser) -> None:
+        """Open a connection to viser for a browser, and relay messages in both directions until either side ends."""
+        protocols = None if connection.subprotocol is None else [connection.subprotocol]
+        options = {"compression": None, "max_size": None, "ping_interval": None, "proxy": None}
+        with self._viser.expect_browser(browser) as address:
+            async with connect(address, subprotocols=protocols, **options) as to_viser:
+                await _relay_messages(browser, connection, to_viser)
+        if to_viser.close_code not in UNSENT_CODES:  # such as that the page is of another version
+            await connection.close(to_viser.close_code, to_viser.close_reason or "")
+
+
+async def _relay_messages(browser: Browser, connection: ServerConnection, to_viser: ClientConnection) -> None:
+    """Relay messages in both directions until either side ends."""
+    directions = [
+        asyncio.ensure_future(_relay_to_viser(browser, connection, to_viser)),
+        asyncio.ensure_future(_relay_to_browser(to_viser, connection)),
+    ]
+    try:
+        await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for direction in directions:
+            direction.cancel()
+        await asyncio.gather(*directions, return_exceptions=True)
+
+
+async def _relay_to_viser(browser: Browser, connection: ServerConnection, to_viser: ClientConnection) -> None:
+    """Pass each message of a browser that is admitted on to viser, until a connection is closed."""
+    await browser.wait_for_number()
+    try:
+        async for data in connection:
+            await browser.wait_for_allowance()
+            checked = browser.check_message(data)
+            if checked is not None:
+                await to_viser.send(checked)
+    except ConnectionClosed as closed:
+        if closed.sent is not None and closed.sent.code == MESSAGE_TOO_BIG:
+            browser.drop("too long", f"more than {MAX_MESSAGE_BYTES} bytes; its connection was closed")
+
+
+async def _relay_to_browser(to_viser: ClientConnection, connection: ServerConnection) -> None:
+    """Pass each message of viser on to a browser, until a connection is closed."""
+    with contextlib.suppress(ConnectionClosed):
+        async for data in to_viser:
+            await connection.send(data)
+
+
+def _select_viser_protocol(_connection: ServerConnection, offered: list[Subprotocol]) -> Subprotocol | None:
+    """Return the protocol of viser's page. viser itself compares its version."""
+    for protocol in offered:
+        if protocol.startswith(VISER_PROTOCOL):
+            return protocol
+    return None

@@ -1,0 +1,49 @@
+"""The servers of a console within the test's own process: the front server in a thread, and pages behind it."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from queue import Queue
+
+from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
+from snakesim_operator.features.console.front.front_server import FrontServer, StopPath
+from snakesim_operator.features.console.web.page_server import AnswerRequest
+from snakesim_operator.features.console.web.serve import serve_pages
+from snakesim_operator.features.console.web.viser_server import PageServer
+
+
+@contextmanager
+def fronted(ports: ConsolePorts, stop: StopPath | None) -> Iterator[FrontServer]:
+    """Run a front server without pages behind it."""
+    server = FrontServer(ports.browsers, ports.pages_path, ports.token, stop)
+    ended = asyncio.Event()
+    loops: Queue[asyncio.AbstractEventLoop] = Queue()
+
+    async def serve() -> None:
+        loops.put(asyncio.get_running_loop())
+        await server.run(ended)
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),))
+    thread.start()
+    loop = loops.get()
+    try:
+        yield server
+    finally:
+        loop.call_soon_threadsafe(ended.set)
+        thread.join()
+
+
+@contextmanager
+def served_console(
+    stop: StopPath | None = None,
+    report: Callable[[str], None] = lambda _: None,
+    answer_first: AnswerRequest = lambda _: None,
+) -> Iterator[tuple[PageServer, str]]:
+    """Run both servers, and yield the pages' server and the address."""
+    with (
+        open_console_ports(None) as ports,
+        fronted(ports, stop),
+        serve_pages(ports.pages, report, answer_first, has_stop=stop is not None) as server,
+    ):
+        yield server, ports.address
