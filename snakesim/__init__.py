@@ -5,9 +5,10 @@
     result = snakesim.run("triplet", duration=8, set={"control.propulsion_n": 35})
     result["angle_rad"], result.metrics["path_distance_m"], result.plot("torque_nm")
 
-`run` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running.
+`run`, `load` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running.
 `Controller` is the base class of controllers; `Observation`, `ControllerCommand`, `Telemetry`, `Parameters` and
-`positions` go with it. `docs/how-to/python.md` is the reference. Nothing of SnakeSIM imports this package.
+`positions` go with it, and `find_nodes_w` computes where joints, head and tail are. `docs/how-to/python.md` is the
+reference. Nothing of SnakeSIM imports this package.
 
 Names are loaded when they are first used, and importing this package changes nothing in the process. A run gives the
 digest of `snakesim run`, because it is computed in a child process where this process would round otherwise. Only a run
@@ -32,9 +33,10 @@ from snakesim_hal.base.errors import (
 if TYPE_CHECKING:
     from snakesim.result import Result
     from snakesim.robot import Robot
-    from snakesim.runs import run
+    from snakesim.runs import load, run
     from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
     from snakesim_hal.model.files import FileStruct as Parameters
+    from snakesim_hal.model.kinematics import find_nodes_w
 
 __all__ = [
     "ConfigError",
@@ -50,6 +52,8 @@ __all__ = [
     "SnakesimError",
     "StalledError",
     "Telemetry",
+    "find_nodes_w",
+    "load",
     "positions",
     "run",
     "use_common_arithmetic",
@@ -63,6 +67,8 @@ LAZY = {
     "Result": ("snakesim.result", "Result"),
     "Robot": ("snakesim.robot", "Robot"),
     "Telemetry": (CONTROLLER, "Telemetry"),
+    "find_nodes_w": ("snakesim_hal.model.kinematics", "find_nodes_w"),
+    "load": ("snakesim.runs", "load"),
     "positions": (CONTROLLER, "positions"),
     "run": ("snakesim.runs", "run"),
 }

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from snakesim.chart import Chart, framed
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
+from snakesim_operator.playback.export import arrays, name_parts, table, unit_of
 from snakesim_operator.results.page.charts import Line, lines
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_log import RunRecord
@@ -32,7 +32,7 @@ class Result:
     """The signals and the summary of a run that is over.
 
     Every signal has a row for each tick since the first arming; NaN is unknown. `result["angle_rad"]` is
-    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `names` lists all signals.
+    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `signal_names` lists all signals.
     """
 
     record: RunRecord
@@ -96,7 +96,7 @@ class Result:
         """Return a signal.
 
         Args:
-            name: A name in `names`, such as "angle_rad" or "angle_rad.joint_3".
+            name: A name in `signal_names`, such as "angle_rad" or "angle_rad.joint_3".
 
         Raises:
             ConfigError: There is no such signal.
@@ -104,7 +104,7 @@ class Result:
         if name not in self.signal_names:
             raise ConfigError(
                 f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
-                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`",
+                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `signal_names`",
                 code="recording/unknown-signal",
             )
         return self.arrays[name] if name in self.arrays else self.columns[name]
@@ -229,11 +229,5 @@ class Result:
         """Return a line for each column of a signal."""
         if values.ndim == 1:
             return [Line(name, self.time_s, values, "--measured")]
-        labels: Sequence[str]
-        if name in OF_JOINTS:
-            labels = self.joints
-        elif name == "position_w":
-            labels = "xyz"
-        else:
-            labels = "wxyz"
+        labels = name_parts(name, self.joints)
         return [Line(label, self.time_s, values[:, i], f"--joint-{i}") for i, label in enumerate(labels)]

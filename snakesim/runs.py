@@ -1,4 +1,4 @@
-"""Runs scenarios in this process, or in several processes as `snakesim run` does."""
+"""Runs scenarios in this process, or in several processes as `snakesim run` does, and loads runs from the disk."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
 from snakesim_hal.model.scenario import Override, RunConfig
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import SUMMARY
-from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.results.summary import RunSummary, summarise
 from snakesim_operator.run.conclusion import INTERRUPTED
 from snakesim_operator.run.in_process import simulate
 from snakesim_operator.run.run import RunRequest
@@ -80,6 +80,22 @@ def run(
         if processes:
             return _run_in_processes(config, folder)
         return _run_here(config, folder)
+
+
+def load(path: str | os.PathLike[str]) -> Result:
+    """Load the result of a run from the disk.
+
+    Args:
+        path: The folder that `snakesim run` wrote, or a recording (MCAP).
+
+    Returns:
+        The result. Its summary is computed again, as `snakesim recording report` does.
+
+    Raises:
+        ConfigError: It is neither of both, or damaged.
+    """
+    record = RunRecord.load(Path(path))
+    return Result(record, summarise(record, record.ending))
 
 
 def _run_here(config: RunConfig, out: Path | None) -> Result:

@@ -87,6 +87,12 @@ class Telemetry:
     saturated: bool = False  # the push is at its torque limit
     jammed: bool = False  # the body is stuck although a joint pushes
 
+    custom: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Up to 32 numbers of your own, by names that end in their unit, such as `amplitude_rad`.
+
+    Results, exports and plots have them as `amplitude_rad.controller`.
+    """
+
 
 @dataclass(frozen=True)
 class ControllerCommand:

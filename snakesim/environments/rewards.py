@@ -35,6 +35,13 @@ def complete_weights(given: Mapping[str, float] | None) -> dict[str, float]:
     Raises:
         ConfigError: There is no such term, or its weight is no number.
     """
+    if given is not None and not isinstance(given, Mapping):
+        raise ConfigError(
+            f"reward={shorten(repr(given))}: give a dict of weights, such as {{'energy': 0}}, of {', '.join(TERMS)}; "
+            "for a reward that you compute yourself, wrap the environment in a gymnasium.Wrapper, see "
+            "docs/how-to/environments.md",
+            code="python/invalid-argument",
+        )
     weights = {name: float(term.weight) for name, term in TERMS.items()}
     for name, weight in (given or {}).items():
         if name not in TERMS:

@@ -135,6 +135,7 @@ class StateReports:
             torque_headroom_nm=telemetry.torque_headroom_nm,
             saturated=telemetry.saturated,
             jammed=telemetry.jammed,
+            custom=dict(telemetry.custom),
             too_slow=self.too_slow,
         )
         try:

@@ -23,11 +23,26 @@ from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.results.missing_data import exit_code
+from snakesim_operator.results.recording_contents import CONTROLLER
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import find_recording
 
 MISSING = b"snakesim.missing"  # metadata of a Parquet file: JSON
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
+# The longer of two endings comes first.
+UNIT_OF_SUFFIX = {
+    "_rad_s": "rad/s",
+    "_m_s": "m/s",
+    "_rad": "rad",
+    "_nm": "N·m",
+    "_n": "N",
+    "_m": "m",
+    "_s": "s",
+    "_w": "W",
+    "_j": "J",
+    "_hz": "Hz",
+}
+SIGNAL_NAMES = {"position_w": "position_w_m"}  # field of the record -> signal, where they differ
 UNITS = {
     "time_s": "s",
     "age_s": "s",
@@ -37,7 +52,6 @@ UNITS = {
     "mode": "1",
     "target": "rad, rad/s or N·m, by mode",
     "torque_limit_nm": "N·m",
-    "position_w": "m",
     "position_w_m": "m",
     "orientation_wxyz": "1",
     "contact_peak_n": "N",
@@ -148,18 +162,40 @@ def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
     for column in fields(record):  # `vars` would include what the record has computed and cached
         value = getattr(record, column.name)
         if isinstance(value, np.ndarray):
-            signals[column.name] = value
+            signals[SIGNAL_NAMES.get(column.name, column.name)] = value
     return signals | record.custom
 
 
 def unit_of(name: str, record: RunRecord) -> str:
-    """Return the unit of a column, or of a whole signal."""
+    """Return the unit of a column, or of a whole signal.
+
+    A number that a controller defined has the unit in which its name ends.
+    """
     signal = name.partition(".")[0]
+    if name.endswith(f".{CONTROLLER}"):
+        return _unit_in_name(signal)
     units: dict[str, str] = {}
     for kind in find_custom_messages(record.description).values():
         units |= kind.units
     units |= UNITS  # the robot's own signals win
     return units[signal]
+
+
+def _unit_in_name(name: str) -> str:
+    """Return the unit in which a name ends, such as rad/s for `turn_rad_s`; "1" if there is none."""
+    for suffix, unit in UNIT_OF_SUFFIX.items():
+        if name.endswith(suffix):
+            return unit
+    return "1"
+
+
+def name_parts(signal: str, joints: Sequence[str]) -> Sequence[str]:
+    """Return the names of the columns of a signal that is wider than one, such as the joints of `angle_rad`."""
+    if signal in OF_JOINTS:
+        return joints
+    if signal == "position_w_m":
+        return "xyz"
+    return "wxyz"
 
 
 def table(record: RunRecord) -> dict[str, NDArray[Any]]:
@@ -170,16 +206,8 @@ def table(record: RunRecord) -> dict[str, NDArray[Any]]:
         if values.ndim == 1:
             columns[name] = values
             continue
-        column_name = name
-        if name in OF_JOINTS:
-            parts: Sequence[str] = joints
-        elif name == "position_w":
-            column_name = "position_w_m"
-            parts = "xyz"
-        else:
-            parts = "wxyz"
-        for i, part in enumerate(parts):
-            columns[f"{column_name}.{part}"] = values[:, i]
+        for i, part in enumerate(name_parts(name, joints)):
+            columns[f"{name}.{part}"] = values[:, i]
     return columns
 
 

@@ -32,6 +32,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     propulsion_n: OptionalNumber = msgspec.UNSET
     propulsion_torque_nm: OptionalNumber = msgspec.UNSET
     torque_headroom_nm: OptionalNumber = msgspec.UNSET
+    custom: dict[str, float] = {}
 
 
 class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,6 +75,7 @@ class _ControlFields(msgspec.Struct, frozen=True):
     propulsion_torque_nm: q.Torque | None = None
     torque_headroom_nm: q.Torque | None = None
     reference_rad: q.Angles = []
+    custom: Annotated[dict[q.Name, q.Scalar], msgspec.Meta(max_length=32)] = {}
     jammed: bool = False
     saturated: bool = False
 
@@ -119,6 +121,7 @@ class StateMessages:
             propulsion_n=_unset_if_none(control_state.propulsion_n),
             propulsion_torque_nm=_unset_if_none(control_state.propulsion_torque_nm),
             torque_headroom_nm=_unset_if_none(control_state.torque_headroom_nm),
+            custom=control_state.custom,
         )
         return StateUpdate(state, self._make_logs(state, time_ns), control_state.reference_rad)
 

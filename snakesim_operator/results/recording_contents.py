@@ -42,6 +42,7 @@ SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 """What guidance, navigation and control publish."""
 OUTPUTS = (*SERVICE_STREAMS, keys.CUSTOM_ALL)
 """What the host's black box does not have."""
+CONTROLLER = "controller"  # ends the names of columns with numbers that a controller defined
 MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
 _TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
 _JOINT_COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm")  # of the messages at keys.JOINTS
@@ -60,7 +61,7 @@ class RunOutputs:
     worlds: list[World] = field(default_factory=list[World])  # in time order, at most MAX_WORLDS_PER_S
     trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
-    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns of custom sensors, (n,)
+    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns that sensors and controllers define
     replay_of: str = ""  # the recording whose sensors the services were given; empty: a run
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
     unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
@@ -159,7 +160,7 @@ class RecordingContents:
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
         refused_before = self.refused.copy()
-        custom = self.make_custom_columns(robot, time_s)
+        custom = self.make_custom_columns(robot, time_s) | make_telemetry_columns(control, time_s)
         undecodable = describe_undecodable(self.refused - refused_before)
         return RunOutputs(
             control=control,
@@ -304,6 +305,24 @@ class _Row:
     pose: list[float]  # position in m, then orientation wxyz
     contact_peak_n: float
     contact_count: int
+
+
+def make_telemetry_columns(states: Sequence[ControlState], time_s: Floats) -> dict[str, Floats]:
+    """Return columns of the numbers that a controller defined: at each row the newest one, such as `gain.controller`.
+
+    NaN: the newest message does not have the number, or none came yet.
+
+    Args:
+        states: The controller's messages, in time order.
+        time_s: (n,) robot time of each row.
+    """
+    sent_s = np.array([state.timestamp_ns * 1e-9 for state in states])
+    newest = np.searchsorted(sent_s, time_s + 1e-9, side="right") - 1
+    names = dict.fromkeys(name for state in states for name in state.custom)
+    return {
+        f"{name}.{CONTROLLER}": _values_at([state.custom.get(name, np.nan) for state in states], newest)
+        for name in names
+    }
 
 
 def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.float64]:

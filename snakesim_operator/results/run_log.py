@@ -56,7 +56,7 @@ class RunRecord:
 
     # More of the recording.
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
-    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns of custom sensors, (n,)
+    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # (n,) columns of custom sensors and telemetry
     replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
 
     # How much of the run is known.

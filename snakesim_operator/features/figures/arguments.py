@@ -12,7 +12,9 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "signals", nargs="*", metavar="SIGNAL", help="a pair of axes each (default: angle_rad torque_nm)"
     )
-    parser.add_argument(
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument("--path", action="store_true", help="instead: the paths of head and tail, from above")
+    instead.add_argument(
         "--paper", action="store_true", help="instead: the paper's Figures 8 to 13, of this run, one file each"
     )
     add_out(parser, "FILE.pdf, .svg or .png; with --paper a folder (default: in RUN)")
@@ -41,6 +43,7 @@ def _plot(arguments: argparse.Namespace) -> int:
         arguments.signals,
         arguments.out,
         paper=arguments.paper,
+        path=arguments.path,
         width_in=arguments.width_in,
         span_s=(arguments.from_s, arguments.to_s),
         dark=arguments.dark,
@@ -50,14 +53,14 @@ def _plot(arguments: argparse.Namespace) -> int:
 COMMANDS: Commands = (
     Command(
         name="recording plot",
-        help="Draw figures of a run for a paper: signals over time, or those of the SnakeSIM paper.",
+        help="Draw figures of a run for a paper: signals over time, the path, or those of the SnakeSIM paper.",
         add=_add_plot,
         run=_plot,
         details="Signals are named as in `snakesim recording export`. A comma puts several of one unit on one pair of "
         "axes: angle_rad.joint_7,target.joint_7. Exit code: 0; 2 wrong input; 3 made, but something is missing in the "
         "recording.",
         examples=(
-            "recording plot runs/demo --out demo.pdf",
+            "recording plot runs/demo --path --out demo.png",
             "recording plot runs/demo angle_rad.joint_7,target.joint_7 torque_nm --from 2 --to 6",
         ),
     ),

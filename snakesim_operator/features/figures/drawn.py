@@ -15,6 +15,7 @@ from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.textfiles import exported
 from snakesim_hal.wire.messages import Mode
+from snakesim_operator.features.figures.from_above import draw_paths
 from snakesim_operator.features.figures.lines import STYLE, Floats, plot_over_time
 from snakesim_operator.features.figures.paper import draw_paper_figures
 from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
@@ -35,17 +36,19 @@ def plot(
     out: Path | None,
     *,
     paper: bool,
+    path: bool,
     width_in: float,
     span_s: tuple[float, float],
     dark: bool,
 ) -> int:
-    """Draw signals of a run, or the figures of the paper, and write them to files.
+    """Draw signals of a run, its path, or the figures of the paper, and write them to files.
 
     Args:
         run: Folder or file of the run.
         names: Signals, as `draw_signals` takes them.
         out: File to write, or with `paper` the folder; None writes into the run's folder.
         paper: Draw the figures of the paper instead of signals.
+        path: Draw the paths of head and tail from above instead of signals.
         width_in: Width of a figure in inches.
         span_s: Begin and end of the part of the run to draw, in s on the time axis.
         dark: Draw on a dark background.
@@ -65,12 +68,13 @@ def plot(
         if paper:
             _write_paper_figures(record, out or folder, width_in, span_s)
         else:
-            path = out or folder / "plot.pdf"
-            if path.suffix not in FORMATS:
+            file = out or folder / ("path.pdf" if path else "plot.pdf")
+            if file.suffix not in FORMATS:
                 raise ConfigError(
-                    f"--out {path}: give a file that ends in {', '.join(FORMATS)}", code="command/invalid-option"
+                    f"--out {file}: give a file that ends in {', '.join(FORMATS)}", code="command/invalid-option"
                 )
-            write_figure(draw_signals(record, names, width_in, span_s), path)
+            figure = draw_paths(record, width_in, span_s) if path else draw_signals(record, names, width_in, span_s)
+            write_figure(figure, file)
     return exit_code(run, record.missing)
 
 

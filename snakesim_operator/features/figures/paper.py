@@ -14,14 +14,13 @@ import numpy as np
 from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.figures.from_above import OBSTACLE, plot_body, plot_obstacles
 from snakesim_operator.features.figures.lines import Floats, plot_over_time
 from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
 from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
 from snakesim_operator.results.report.timeline import commanded_torque_nm, most_used_joints, reference_rad
-from snakesim_operator.results.report.top_view import outline_w
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import end_s
@@ -33,8 +32,6 @@ LABEL_OFFSET_PT = (3, 3)
 FORCE_FONT_SIZE = 6.5
 TITLE_FONT_SIZE = 8.0
 
-BODY = "#9aa5b1"
-OBSTACLE = "#d9dde2"
 SOLVED = "#c0392b"
 COMMANDED = "#2c6fbb"
 MEASURED = "#2c6fbb"
@@ -192,31 +189,12 @@ def _plot_torque(axes: Axes, record: RunRecord, joint: int) -> None:
 def _plot_scene(axes: Axes, record: RunRecord, instant: Instant) -> None:
     """Plot obstacles and body to scale, and limit the axes to the surroundings of the body."""
     nodes_w = nodes_xy_w(record, instant.row)
-    for placed in record.placed:
-        obstacle = placed.obstacle
-        if obstacle.shape == "box":
-            axes.add_patch(Polygon(outline_w(obstacle), closed=True, color=OBSTACLE))
-        else:
-            axes.add_patch(Circle(obstacle.position_w[:2], obstacle.radius_m, color=OBSTACLE))
-    _plot_body(axes, record, nodes_w)
+    plot_obstacles(axes, record)
+    plot_body(axes, record, nodes_w)
     axes.set_aspect("equal")
     low = nodes_w.min(axis=0) - ARROW_M
     high = nodes_w.max(axis=0) + ARROW_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
-
-
-def _plot_body(axes: Axes, record: RunRecord, nodes_w: Floats) -> None:
-    """Plot links and joints. nodes_w: (joints + 2, 2), the tail, the joints and the head."""
-    joints_w = nodes_w[1:-1]
-    for rear, front, link in zip(nodes_w[:-1], nodes_w[1:], record.description.links, strict=True):
-        length_m = max(float(np.hypot(*(front - rear))), 1e-9)
-        along = (front - rear) / length_m
-        side = link.radius_m * np.array([-along[1], along[0]])
-        corners = [rear + side, front + side, front - side, rear - side]
-        axes.add_patch(Polygon(corners, closed=True, color=BODY, linewidth=0))
-    for joint_w in joints_w:
-        axes.add_patch(Circle(tuple(joint_w), record.description.links[0].radius_m, color=BODY, linewidth=0))
-    axes.plot(*joints_w.T, ".", color="white", markersize=2.0)
 
 
 def _plot_forces(axes: Axes, balance: Balance) -> None:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_operator.playback.export import arrays
+from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -50,6 +52,24 @@ def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Pa
 
 
 @pytest.mark.slow
+def test_every_signal_of_a_run_is_drawn(run: Path) -> None:
+    from snakesim_operator.features.figures.drawn import draw_signals
+
+    record = RunRecord.load(run)
+    signals = [name for name in arrays(record) if name != "time_s"]
+    axes = draw_signals(record, signals, 3.5, (0.0, 3.0)).axes
+    empty = [name for name, ax in zip(signals, axes, strict=True) if not ax.lines]
+    assert empty == []
+
+
+@pytest.mark.slow
+def test_path_option_draws_head_and_tail_from_above(run: Path) -> None:
+    ended = snakesim("recording", "plot", str(run), "--path", "--out", str(run / "path.svg"), cwd=run)
+    assert ended.code == 0, ended.err
+    assert {"head", "tail", "x [m]", "y [m]"} <= set(words(run / "path.svg"))
+
+
+@pytest.mark.slow
 def test_the_papers_figures_come_from_one_command(run: Path) -> None:
     ended = snakesim("recording", "plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run)
     assert ended.code == 0, ended.err
@@ -68,6 +88,7 @@ def test_the_papers_figures_come_from_one_command(run: Path) -> None:
         (["--out", "plot.docx"], "give a file that ends in .pdf, .svg, .png"),
         (["--paper", "--out", "one.pdf"], "several files; give a folder"),
         (["--paper", "--from", "2.98"], "at no time within it"),
+        (["--path", "--from", "9"], "the pose is unknown in this part of the run"),
     ],
 )
 def test_what_cannot_be_drawn_is_told(run: Path, words: list[str], why: str) -> None:

@@ -315,6 +315,8 @@ WRONG = [
     ({"observe": ["angle_rd"]}, "policy/invalid"),
     ({"observe": "angle_rad"}, "policy/invalid"),
     ({"reward": {"advence": 1}}, "python/invalid-argument"),
+    ({"reward": lambda info: 0.0}, "python/invalid-argument"),
+    ({"reward": 0.5}, "python/invalid-argument"),
     ({"reward": {"advance": "much"}}, "python/invalid-argument"),
     ({"frame_skip": 0}, "python/invalid-argument"),
     ({"duration": -1}, "config/out-of-range"),

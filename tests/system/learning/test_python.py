@@ -86,6 +86,50 @@ def test_a_class_is_a_controller_and_takes_parameters() -> None:
         snakesim.run("triplet", controller=Nod, set={"control.by_rd": 1})
 
 
+class Growing(Nod):
+    def update(self, observation):
+        command = super().update(observation)
+        telemetry = snakesim.Telemetry(custom={"amplitude_rad": observation.time_s})
+        return snakesim.ControllerCommand(command.setpoints, telemetry)
+
+
+class Boundless(Nod):
+    def update(self, observation):
+        command = super().update(observation)
+        telemetry = snakesim.Telemetry(custom={f"value_{i}": 0.0 for i in range(33)})
+        return snakesim.ControllerCommand(command.setpoints, telemetry)
+
+
+def test_custom_telemetry_of_a_controller_is_a_signal() -> None:
+    found = snakesim.run("triplet", controller=Growing, duration=1)
+    amplitude_rad = found["amplitude_rad.controller"]
+    assert found.units["amplitude_rad.controller"] == "rad"
+    assert np.all(np.diff(amplitude_rad[np.isfinite(amplitude_rad)]) >= 0)
+    assert amplitude_rad[-1] == pytest.approx(found.time_s[-1] - found.time_s[0], abs=0.06)  # sent 20 times a second
+
+
+def test_custom_telemetry_beyond_its_bound_is_an_error_of_the_controller() -> None:
+    with pytest.raises(snakesim.ControllerError, match="custom"):
+        snakesim.run("triplet", controller=Boundless, duration=1)
+
+
+def test_load_returns_the_run_of_a_folder(tmp_path: Path) -> None:
+    ran = snakesim.run("triplet", controller="hold", duration=0.5, out=tmp_path / "run")
+    loaded = snakesim.load(tmp_path / "run")
+    assert loaded.digest == ran.digest
+    assert np.array_equal(loaded["angle_rad"], ran["angle_rad"])
+    with raises_error(snakesim.ConfigError, code="recording/not-a-run"):
+        snakesim.load(tmp_path / "nothing")
+
+
+def test_find_nodes_w_ends_at_the_head(result: snakesim.Result) -> None:
+    nodes_w = snakesim.find_nodes_w(
+        result.record.description, result["position_w_m"][0], result["orientation_wxyz"][0], result["angle_rad"][0]
+    )
+    assert nodes_w.shape == (len(result.joints) + 2, 3)
+    assert np.allclose(nodes_w[0], result["position_w_m"][0])
+
+
 def test_a_path_and_a_shipped_name_are_controllers_too(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("from snakesim_gnc.control.hold import Hold\n\n\nclass Mine(Hold):\n    pass\n")
     mine = snakesim.run("triplet", controller=f"{tmp_path}/mine.py:Mine", duration=0.5)
