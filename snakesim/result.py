@@ -32,11 +32,11 @@ class Result:
     """The signals and the summary of a run that is over.
 
     Every signal has a row for each tick since the first arming; NaN is unknown. `result["angle_rad"]` is
-    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `names` lists all signals.
+    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `signal_names` lists all signals.
     """
 
-    record: RunRecord
-    summary: RunSummary
+    record: RunRecord  # every tick, and the telemetry of control and guidance
+    summary: RunSummary  # the content of `summary.json`
 
     @cached_property
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -96,7 +96,7 @@ class Result:
         """Return a signal.
 
         Args:
-            name: A name in `names`, such as "angle_rad" or "angle_rad.joint_3".
+            name: A name in `signal_names`, such as "angle_rad" or "angle_rad.joint_3".
 
         Raises:
             ConfigError: There is no such signal.
@@ -104,7 +104,7 @@ class Result:
         if name not in self.signal_names:
             raise ConfigError(
                 f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
-                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `names`",
+                f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `signal_names`",
                 code="recording/unknown-signal",
             )
         return self.arrays[name] if name in self.arrays else self.columns[name]
