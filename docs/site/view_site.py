@@ -11,6 +11,7 @@ import argparse
 import io
 import json
 import re
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from snakesim_testing.operator.browser import Tab, chromium
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = ROOT / "build" / "docs"
+COPY = ROOT / "build" / "viewed"  # so that a build meanwhile changes nothing
 SHEETS = ROOT / "build" / "view"
 WIDTHS_PX = {1400: 1000, 400: 1800}  # width: how much of the page's height a sheet shows
 SCHEMES = ("light", "dark")
@@ -82,6 +84,8 @@ def main() -> int:
     parser.add_argument("under", nargs="*", default=[""], help="only pages whose path begins like this")
     parser.add_argument("--no-sheets", action="store_true", help="check only")
     arguments = parser.parse_args()
+    shutil.rmtree(COPY, ignore_errors=True)
+    shutil.copytree(SITE, COPY)
     pages = [page for page in list_pages() if str(page).startswith(tuple(arguments.under))]
     if not pages:
         sys.exit("view: build/docs has no such page; run `make docs`")
@@ -98,19 +102,19 @@ def main() -> int:
 
 def list_pages() -> list[Path]:
     """Return the pages of the site, relative to it."""
-    return sorted(page.relative_to(SITE) for page in SITE.rglob("*.html"))
+    return sorted(page.relative_to(COPY) for page in COPY.rglob("*.html"))
 
 
 def find_broken_links(page: Path) -> Iterator[str]:
     """Yield every link of a page to a file or an anchor that the site does not have."""
-    text = (SITE / page).read_text(encoding="utf-8")
+    text = (COPY / page).read_text(encoding="utf-8")
     if page.name == "404.html":
         return  # its links begin at the address of a published site
     for link in dict.fromkeys(re.findall(r"""<(?:a|img|link|script)\b[^>]*?\b(?:href|src)=["']?([^"'\s>]+)""", text)):
         address = urlparse(link)
         if address.scheme or address.netloc:
             continue
-        target = (SITE / page.parent / unquote(address.path)).resolve() if address.path else (SITE / page).resolve()
+        target = (COPY / page.parent / unquote(address.path)).resolve() if address.path else COPY / page
         if not target.exists():
             yield f"broken link: {link}"
         elif address.fragment and target.suffix == ".html":
@@ -141,7 +145,7 @@ def view(pages: list[Path], width: int, scheme: str, *, with_sheets: bool) -> It
 
 def open_page(tab: Tab, page: Path) -> None:
     """Show a page, with the pictures that a reader would have to scroll to."""
-    tab.send("Page.navigate", url=f"file://{SITE / page}")
+    tab.send("Page.navigate", url=f"file://{COPY / page}")
     deadline = time.monotonic() + LOAD_LIMIT_S
     name = json.dumps(page.name)
     while tab.value(f"document.readyState === 'complete' && location.pathname.endsWith({name})") is not True:

@@ -1,6 +1,5 @@
 """The examples of the Python API that run a scenario, and the one in the docstring of `Controller`."""
 
-import math
 import subprocess
 import sys
 import textwrap
@@ -22,9 +21,10 @@ def test_the_example_runs(page: Page, tmp_path: Path) -> None:
     assert ended.returncode == 0, ended.stderr
 
 
-def test_the_controller_of_the_docstring_runs() -> None:
+def test_the_controller_of_the_docstring_runs(tmp_path: Path) -> None:
     _, _, rest = (snakesim.Controller.__doc__ or "").partition("with one parameter:\n")
-    names: dict[str, object] = {"snakesim": snakesim, "math": math}
-    exec(textwrap.dedent(rest.partition("Run it with")[0]), names)
-    result = snakesim.run("triplet", controller=names["Swing"], duration=0.5, set={"control.amplitude_rad": 0.1})  # pyright: ignore[reportArgumentType]
+    program = tmp_path / "swing.py"
+    code = textwrap.dedent(rest.partition("Run it with")[0])
+    program.write_text(f"import math\n\nimport snakesim\n{code}", encoding="utf-8")
+    result = snakesim.run("triplet", controller=f"{program}:Swing", duration=0.5, set={"control.amplitude_rad": 0.1})
     assert result.complete
