@@ -126,6 +126,7 @@ schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key sp
 	$(bin)/python -m docs.site.error_pages
 	$(bin)/python -m docs.site.configuration_page
 	$(bin)/python -m docs.site.commands_page
+	$(bin)/python -m docs.site.api_pages
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py

@@ -19,9 +19,9 @@ PADDING_PX = 160  # of the page
 class Chart:
     """Figures of signals over time. A notebook shows them."""
 
-    title: str
-    figures: Sequence[Figure]
-    joints: int
+    title: str  # of the page
+    figures: Sequence[Figure]  # in the form of Plotly, from top to bottom
+    joints: int  # number of joints, each of which has its own color
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write one page of HTML that needs no network and no other file.

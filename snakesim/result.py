@@ -35,8 +35,8 @@ class Result:
     (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `signal_names` lists all signals.
     """
 
-    record: RunRecord
-    summary: RunSummary
+    record: RunRecord  # every tick, and the telemetry of control and guidance
+    summary: RunSummary  # the content of `summary.json`
 
     @cached_property
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -66,7 +66,7 @@ class Robot:
             robot.arm()
             start_s = robot.wait()
             while (elapsed_s := robot.wait() - start_s) < 3:
-                robot.command([0.2 * math.sin(elapsed_s)] * len(robot.names))
+                robot.command([0.2 * math.sin(elapsed_s)] * len(robot.joint_names))
 
     There is no thread: an armed robot needs a command in every tick. Without one its lease ends, and the robot stops
     with a fault.

@@ -51,9 +51,9 @@ class SafeSetpoints:
     Controllers return `snakesim_hal.wire.setpoints.RequestedSetpoints` instead.
     """
 
-    mode: list[Mode]
+    mode: list[Mode]  # of each joint
     target: list[float]  # rad, rad/s or N·m, depending on the mode
-    torque_limit_nm: list[float]
+    torque_limit_nm: list[float]  # maximum torque of each joint's motor
     isolated: frozenset[int] = frozenset()  # indices of isolated joints, which are passive here and to be switched off
 
 
@@ -61,8 +61,8 @@ class SafeSetpoints:
 class Samples:
     """Sensor samples of one tick. `others` holds only those that were due: key -> message."""
 
-    joints: JointState
-    others: Mapping[str, Message] = field(default_factory=dict[str, Message])
+    joints: JointState  # in every tick
+    others: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
     encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # `others`; filled in by the host
 
 

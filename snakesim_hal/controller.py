@@ -51,7 +51,7 @@ class SensorSamples:
 
     newest: Mapping[str, Message]  # newest sample of `sensor/pose` and `sensor/contacts`, by key; absent: none yet
     late: Mapping[str, str]  # key -> why its newest sample is too old to be used; fresh ones are left out
-    task: Task
+    task: Task  # where the robot started, and its goal
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class Telemetry:
     path_s_m: float | None = None  # arc length of the tail end on the path
     propulsion_joint: int | None = None  # index of the joint that pushes, from the tail
     propulsion_n: float | None = None  # desired force along the path
-    push_points: Sequence[WorldContact] = ()
+    push_points: Sequence[WorldContact] = ()  # the contacts that it pushes off
     desired_force_n: Sequence[float] = ()  # at each push-point
-    propulsion_torque_nm: float | None = None
+    propulsion_torque_nm: float | None = None  # of the joint that pushes
     bending_torque_nm: Sequence[float] = ()  # (n_joints,)
     reference_rad: Sequence[float] = ()  # (n_joints,) angles that the controller wants
     condition: float | None = None  # condition number of the equations that it solved
@@ -99,7 +99,7 @@ class ControllerCommand:
     """What a controller returns for one tick."""
 
     setpoints: RequestedSetpoints  # in the order of `robot.joints`, tail to head
-    telemetry: Telemetry = field(default_factory=Telemetry)
+    telemetry: Telemetry = field(default_factory=Telemetry)  # for `control/state` and the report
 
 
 class NoParameters(FileStruct, frozen=True):

@@ -1,9 +1,8 @@
 """Builds the documentation site into build/docs: `make docs`. Pages are taken as they stand, in the repository's tree.
 
-So a link that works in the repository works on the site. The Python API is written from the code.
+So a link that works in the repository works on the site.
 """
 
-import os
 import re
 import shutil
 import subprocess
@@ -11,9 +10,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pdoc
-
-import snakesim
 from snakesim_hal.base.process import child_environment, python_command
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -35,7 +31,6 @@ SHOWN = (
 )
 FENCE = re.compile(r"^(```\w+) +(\S.*)$", re.MULTILINE)  # a block, and a file's name or where it is typed
 TITLES = {"background": "in a terminal of its own", "of root": "as root", "by hand": ""}
-PACKAGES = [path.name for path in sorted(ROOT.glob("snakesim*")) if (path / "__init__.py").exists()]
 
 
 def main() -> None:
@@ -47,8 +42,8 @@ def main() -> None:
         if file.suffix == ".md":
             (PAGES / file).write_text(FENCE.sub(titled, (ROOT / file).read_text(encoding="utf-8")), encoding="utf-8")
     (PAGES / "assets").mkdir()
-    shutil.copy(ROOT / "docs" / "site" / "iframe-worker.js", PAGES / "assets")
-    write_api(PAGES / "api")
+    for asset in ("iframe-worker.js", "site.css"):
+        shutil.copy(ROOT / "docs" / "site" / asset, PAGES / "assets")
     config = str(ROOT / "docs" / "site" / "mkdocs.yml")
     run("mkdocs", "build", "--strict", "--quiet", "--clean", "--config-file", config, NO_MKDOCS_2_WARNING="1")
     print(f"open {SITE.relative_to(ROOT)}/index.html")
@@ -58,14 +53,6 @@ def titled(fence: re.Match[str]) -> str:
     """The first line of a block, as the site's Markdown names blocks."""
     words = TITLES.get(fence[2], fence[2].replace("background on", "another terminal on"))
     return f'{fence[1]} title="{words}"' if words else fence[1]
-
-
-def write_api(folder: Path) -> None:
-    """The pages of the Python API, with the names that `snakesim` loads only when they are used."""
-    os.environ["PDOC_ALLOW_EXEC"] = "1"
-    for name in snakesim.__all__:
-        setattr(snakesim, name, getattr(snakesim, name))
-    pdoc.pdoc(*PACKAGES, output_directory=folder)
 
 
 def shown_files() -> Iterator[Path]:

@@ -85,6 +85,10 @@ class DriveEmulator(ABC, Generic[BusEndT]):
     def inject(self, injection: Injection, *, begins: bool) -> None:
         """Begin or end an injected fault of a drive.
 
+        Args:
+            injection: The fault.
+            begins: True to begin it, False to end it.
+
         Raises:
             ConfigError: There is no such fault, or no such joint.
         """

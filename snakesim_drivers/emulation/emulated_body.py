@@ -150,6 +150,10 @@ class EmulatedBody:
     def inject(self, injection: Injection, *, begins: bool) -> int | None:
         """Begin or end an injected fault of a drive.
 
+        Args:
+            injection: The fault.
+            begins: True to begin it, False to end it.
+
         Returns:
             The index of the drive if it restarts now; otherwise None.
 

@@ -52,7 +52,13 @@ class DriveStates:
         self._clock_ns = clock_ns
 
     def note_report(self, i: int, *, enabled: bool, state: str) -> None:
-        """Store whether a drive reports that it is on, and its state in words."""
+        """Store whether a drive reports that it is on, and its state in words.
+
+        Args:
+            i: Index of the drive.
+            enabled: Whether it is on.
+            state: Its state in the driver type's words, for messages.
+        """
         drive = self.drives[i]
         drive.enabled = enabled
         drive.state = state

@@ -51,10 +51,10 @@ class DriverTypePart:
 class DriverTypeContext:
     """What a driver type gets to plan and open its buses in a robot."""
 
-    config: RunConfig
+    config: RunConfig  # the run
     settings: Any  # an instance of the driver type's own `Settings`
     joints: Mapping[int, Joint]  # those that it drives, by their indices in the robot
-    clock: DriverClock
+    clock: DriverClock  # the time of the robot
     body: EmulatedBody | None  # moved by these joints' drives if they are emulated here; None: they are on a bus
 
 
@@ -162,6 +162,11 @@ class DriverTypeBackend(BusesBackend):
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
         """Check that drives of this type suit the joints, and that the buses can carry their messages.
 
+        Args:
+            config: The run.
+            settings: An instance of `Settings`.
+            joints: The joints that drives of this type move.
+
         Raises:
             ConfigError: A joint, or the load of a bus, does not suit this driver type.
         """
@@ -177,6 +182,10 @@ class DriverTypeBackend(BusesBackend):
     @classmethod
     def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
         """Return all joints as those of this driver type.
+
+        Args:
+            config: The run.
+            settings: An instance of `Settings`.
 
         Raises:
             ConfigError: The robot file names another driver type for a joint.

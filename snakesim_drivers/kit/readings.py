@@ -59,7 +59,13 @@ class DriveReadings:
     # --- called by the driver when it sends and receives ------------------------------------------------------
 
     def set_identity(self, i: int, *, serial: str = "", firmware: str = "") -> None:
-        """Store the serial number and the firmware version of a drive; empty values change nothing."""
+        """Store the serial number and the firmware version of a drive; empty values change nothing.
+
+        Args:
+            i: Index of the drive.
+            serial: Serial number, as the drive reports it.
+            firmware: Version of its firmware.
+        """
         self.serials[i] = serial or self.serials[i]
         self.firmware[i] = firmware or self.firmware[i]
 
@@ -73,7 +79,13 @@ class DriveReadings:
         self._torque_request[i] += 1
 
     def set_motion(self, i: int, angle_rad: float, velocity_rad_s: float) -> None:
-        """Store the angle and the velocity of a drive's shaft."""
+        """Store the angle and the velocity of a drive's shaft.
+
+        Args:
+            i: Index of the drive.
+            angle_rad: Angle of the shaft.
+            velocity_rad_s: Velocity of the shaft.
+        """
         if not (math.isfinite(angle_rad) and math.isfinite(velocity_rad_s)):
             return
         self.angle_rad[i] = angle_rad
@@ -82,7 +94,12 @@ class DriveReadings:
         self._motion_request[i] = self._request
 
     def set_torque(self, i: int, torque_nm: float) -> None:
-        """Store the torque at a drive's shaft."""
+        """Store the torque at a drive's shaft.
+
+        Args:
+            i: Index of the drive.
+            torque_nm: Torque of the motor at the shaft.
+        """
         if not math.isfinite(torque_nm):
             return
         self.torque_nm[i] = torque_nm
@@ -90,13 +107,25 @@ class DriveReadings:
         self._torque_request[i] = self._request
 
     def set_supply(self, i: int, voltage_v: float, current_a: float) -> None:
-        """Store the supply of a drive."""
+        """Store the supply of a drive.
+
+        Args:
+            i: Index of the drive.
+            voltage_v: Voltage at the drive.
+            current_a: Current that the drive draws.
+        """
         if math.isfinite(voltage_v) and math.isfinite(current_a):
             self._voltage_v[i] = voltage_v
             self._current_a[i] = current_a
 
     def set_temperatures(self, i: int, motor_c: float, board_c: float) -> None:
-        """Store the temperatures of a drive. They complete its health, so drivers call `set_supply` before."""
+        """Store the temperatures of a drive. They complete its health, so drivers call `set_supply` before.
+
+        Args:
+            i: Index of the drive.
+            motor_c: Temperature of the motor in °C.
+            board_c: Temperature of the electronics in °C.
+        """
         if math.isfinite(motor_c) and math.isfinite(board_c):
             self._motor_c[i] = motor_c
             self._board_c[i] = board_c
@@ -175,7 +204,13 @@ class DriveReadings:
         return max(self._clock_ns() - read_ns, 0)
 
     def joint_state(self, tick: int, timestamp_ns: int, lease_ns: int) -> JointState:
-        """Return the joint state. Values older than the lease are invalid, and a torque that is not measured is 0."""
+        """Return the joint state. Values older than the lease are invalid, and a torque that is not measured is 0.
+
+        Args:
+            tick: Number of the control cycle.
+            timestamp_ns: The robot's time.
+            lease_ns: The age from which values are invalid.
+        """
         ages_ns = [self.age_ns(i) for i in range(len(self._measures_torque))]
         return JointState(
             tick=tick,
@@ -188,7 +223,13 @@ class DriveReadings:
         )
 
     def power(self, tick: int, timestamp_ns: int, max_age_ns: int) -> Power:
-        """Return supply and temperatures; values older than `max_age_ns` are invalid."""
+        """Return supply and temperatures; values older than `max_age_ns` are invalid.
+
+        Args:
+            tick: Number of the control cycle.
+            timestamp_ns: The robot's time.
+            max_age_ns: The age from which values are invalid.
+        """
         now_ns = self._clock_ns()
         valid = [read_ns != NEVER and now_ns - read_ns <= max_age_ns for read_ns in self._health_ns]
         return Power(

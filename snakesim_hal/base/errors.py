@@ -41,6 +41,12 @@ class WireError(SnakesimError, ValueError):
     code = "message/rejected"
 
     def __init__(self, reason: str, detail: str) -> None:
+        """Make an error.
+
+        Args:
+            reason: The short word.
+            detail: The values, and what is allowed.
+        """
         super().__init__(f"{reason}: {detail}")
         self.reason = reason
         self.detail = detail

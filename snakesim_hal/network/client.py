@@ -225,7 +225,15 @@ class Client:
     # --- inputs ----------------------------------------------------------------------------------------------
 
     def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
-        """Subscribe to a key. Do this for all keys before `announce`."""
+        """Subscribe to a key. Do this for all keys before `announce`.
+
+        Args:
+            key: The key, without the namespace.
+            message: The class of its messages.
+
+        Returns:
+            What `read` takes.
+        """
         feed = Feed(self.session.reader(key, message), key, self._filter.accepts)
         self._feeds[key] = feed
         return feed
@@ -277,6 +285,10 @@ class Client:
 
     def publish(self, key: str, message: Message) -> None:
         """Publish an output of this service.
+
+        Args:
+            key: The key, without the namespace.
+            message: A message of this key's class.
 
         Raises:
             WireError: no reader would accept the message; nothing is sent.

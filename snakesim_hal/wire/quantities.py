@@ -24,17 +24,33 @@ MAX_TARGET = 1e5  # of a setpoint or a torque limit, in the unit of its mode
 
 
 def bounded(low: float, high: float, unit: str) -> Meta:
-    """Return the bounds of a number with a unit: from `low` to `high`."""
+    """Return the bounds of a number with a unit: from `low` to `high`.
+
+    Args:
+        low: The smallest number that is allowed.
+        high: The largest number that is allowed.
+        unit: Unit, such as "rad"; "1" for a plain number.
+    """
     return Meta(ge=_normalize(low), le=_normalize(high), extra_json_schema={"unit": unit})
 
 
 def above(high: float, unit: str) -> Meta:
-    """Return the bounds of a setting with a unit: more than zero, at most `high`."""
+    """Return the bounds of a setting with a unit: more than zero, at most `high`.
+
+    Args:
+        high: The largest number that is allowed.
+        unit: Unit, such as "rad"; "1" for a plain number.
+    """
     return Meta(gt=0, le=_normalize(high), extra_json_schema={"unit": unit})
 
 
 def from_zero(high: float, unit: str) -> Meta:
-    """Return the bounds of a setting with a unit: from zero to `high`."""
+    """Return the bounds of a setting with a unit: from zero to `high`.
+
+    Args:
+        high: The largest number that is allowed.
+        unit: Unit, such as "rad"; "1" for a plain number.
+    """
     return Meta(ge=0, le=_normalize(high), extra_json_schema={"unit": unit})
 
 

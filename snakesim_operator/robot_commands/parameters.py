@@ -46,14 +46,14 @@ LOOK_S = 0.01
 class Parameter:
     """One parameter, with its unit and range from the JSON Schema."""
 
-    name: str
-    value: Any
-    unit: str = ""
-    description: str = ""
-    choices: tuple[str, ...] = ()
-    minimum: float | None = None
-    maximum: float | None = None
-    excludes_minimum: bool = False  # `least` itself is not allowed
+    name: str  # without "control."
+    value: Any  # the value in force
+    unit: str = ""  # empty: it has none
+    description: str = ""  # the meaning
+    choices: tuple[str, ...] = ()  # the values that are allowed; empty: any within the range
+    minimum: float | None = None  # None: there is none
+    maximum: float | None = None  # None: there is none
+    excludes_minimum: bool = False  # True: `minimum` itself is not allowed
 
     @property
     def range(self) -> str:

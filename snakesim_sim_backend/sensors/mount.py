@@ -13,6 +13,12 @@ class Mount:
     """The fixed place of a sensor on a link, and its place in the world as the link moves."""
 
     def __init__(self, sensor: Mounted, scope: Scope) -> None:
+        """Find the place of a sensor.
+
+        Args:
+            sensor: The entry of the robot file.
+            scope: The model and its state.
+        """
         robot = scope.config.robot
         self.link = robot.link_index(sensor.link)
         self.body = scope.sim.first_link_body + self.link

@@ -22,8 +22,8 @@ Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
 class Scope:
     """The model and the state that a sensor that looks around may use."""
 
-    config: RunConfig
-    sim: SimModel
+    config: RunConfig  # the run
+    sim: SimModel  # the MuJoCo model, with the indices of the robot's bodies in it
     data: mujoco.MjData  # a copy of the state, in which only the places of bodies are computed
     noise: np.random.Generator  # of this sensor alone
 

@@ -1,0 +1,174 @@
+"""Opens every page of the built site in Chromium, checks how it looks, and makes contact sheets to look at.
+
+    make docs
+    python -m docs.site.view_site                     # every page, at 1400 and 400 pixels, light and dark
+    python -m docs.site.view_site docs/tutorials      # only pages below this folder
+
+It writes sheets of nine pages each to build/view and prints one line a problem. It ends with 1 if there is a problem.
+"""
+
+import argparse
+import io
+import json
+import re
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import unquote, urlparse
+
+from PIL import Image, ImageDraw
+
+from snakesim_testing.operator.browser import Tab, chromium
+
+ROOT = Path(__file__).resolve().parents[2]
+SITE = ROOT / "build" / "docs"
+COPY = ROOT / "build" / "viewed"  # so that a build meanwhile changes nothing
+SHEETS = ROOT / "build" / "view"
+WIDTHS_PX = {1400: 1000, 400: 1800}  # width: how much of the page's height a sheet shows
+SCHEMES = ("light", "dark")
+COLUMNS, ROWS = 3, 3
+TILE_PX = {1400: 700, 400: 400}  # width of a page on a sheet
+MIN_CONTRAST = 3.0  # WCAG for large text; the theme's small gray text is near 4
+LOAD_LIMIT_S = 60.0
+
+# What the browser finds wrong on the page that it shows. Code and tables may scroll inside a box of their own.
+CHECK = r"""
+(() => {
+  const found = [];
+  const width = document.documentElement.clientWidth;
+  if (document.documentElement.scrollWidth > width + 1)
+    found.push(`the page is ${document.documentElement.scrollWidth} pixels wide`);
+  const article = document.querySelector('article') || document.body;
+  const scrolls = e => { for (let p = e; p && p !== document.body; p = p.parentElement) {
+    const x = getComputedStyle(p).overflowX; if (x !== 'visible') return true; } return false; };
+  for (const e of article.querySelectorAll('table, pre, img, p, li, h1, h2, h3, code')) {
+    const r = e.getBoundingClientRect();
+    if (r.width && r.right > width + 1 && !scrolls(e))
+      found.push(`<${e.tagName.toLowerCase()}> ends at ${Math.round(r.right)}: ${e.innerText.slice(0, 60)}`);
+  }
+  for (const e of article.querySelectorAll('img')) {
+    if (e.complete && e.naturalWidth === 0) found.push(`picture not loaded: ${e.getAttribute('src')}`);
+    if (!(e.getAttribute('alt') || '').trim()) found.push(`picture without a text: ${e.getAttribute('src')}`);
+  }
+  for (const e of article.querySelectorAll('th')) if (!e.innerText.trim()) found.push('empty header cell');
+  const channels = c => (c.match(/[\d.]+/g) || []).map(Number);
+  const luminance = c => { const [r, g, b] = c.slice(0, 3).map(v => { v /= 255;
+    return v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4; }); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const backdrop = e => { for (let p = e; p; p = p.parentElement) {
+    const c = channels(getComputedStyle(p).backgroundColor); if (c.length === 3 || c[3] > 0.9) return c; }
+    return [255, 255, 255]; };
+  const seen = new Set();
+  for (const e of article.querySelectorAll('p, li, td, th, code, code span, h1, h2, h3, a, summary')) {
+    if (![...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()) || e.closest('.headerlink')) continue;
+    const style = getComputedStyle(e);
+    let front = channels(style.color), back = backdrop(e);
+    if (front.length === 4) front = front.slice(0, 3).map((v, i) => v * front[3] + back[i] * (1 - front[3]));
+    const [a, b] = [luminance(front), luminance(back)];
+    const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    const key = style.color + back;
+    if (contrast < MIN_CONTRAST && !seen.has(key)) {
+      seen.add(key);
+      found.push(`contrast ${contrast.toFixed(1)}: ${e.innerText.slice(0, 40)}`);
+    }
+  }
+  return JSON.stringify(found);
+})()
+""".replace("MIN_CONTRAST", str(MIN_CONTRAST))
+
+
+def main() -> int:
+    """Check the pages and make the sheets."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("under", nargs="*", default=[""], help="only pages whose path begins like this")
+    parser.add_argument("--no-sheets", action="store_true", help="check only")
+    arguments = parser.parse_args()
+    shutil.rmtree(COPY, ignore_errors=True)
+    shutil.copytree(SITE, COPY)
+    pages = [page for page in list_pages() if str(page).startswith(tuple(arguments.under))]
+    if not pages:
+        sys.exit("view: build/docs has no such page; run `make docs`")
+    problems = [f"{page}: {problem}" for page in pages for problem in find_broken_links(page)]
+    SHEETS.mkdir(parents=True, exist_ok=True)
+    for width in WIDTHS_PX:
+        for scheme in SCHEMES:
+            problems += view(pages, width, scheme, with_sheets=not arguments.no_sheets)
+    for problem in problems:
+        print(problem)
+    print(f"{len(pages)} pages, {len(problems)} problems; sheets in {SHEETS.relative_to(ROOT)}")
+    return 1 if problems else 0
+
+
+def list_pages() -> list[Path]:
+    """Return the pages of the site, relative to it."""
+    return sorted(page.relative_to(COPY) for page in COPY.rglob("*.html"))
+
+
+def find_broken_links(page: Path) -> Iterator[str]:
+    """Yield every link of a page to a file or an anchor that the site does not have."""
+    text = (COPY / page).read_text(encoding="utf-8")
+    if page.name == "404.html":
+        return  # its links begin at the address of a published site
+    for link in dict.fromkeys(re.findall(r"""<(?:a|img|link|script)\b[^>]*?\b(?:href|src)=["']?([^"'\s>]+)""", text)):
+        address = urlparse(link)
+        if address.scheme or address.netloc:
+            continue
+        target = (COPY / page.parent / unquote(address.path)).resolve() if address.path else COPY / page
+        if not target.exists():
+            yield f"broken link: {link}"
+        elif address.fragment and target.suffix == ".html":
+            anchor = re.escape(unquote(address.fragment))
+            if not re.search(rf"""\bid=["']?{anchor}["'\s>]""", target.read_text(encoding="utf-8")):
+                yield f"broken anchor: {link}"
+
+
+def view(pages: list[Path], width: int, scheme: str, *, with_sheets: bool) -> Iterator[str]:
+    """Yield the problems of all pages at one width and color scheme, and write their contact sheets."""
+    tiles: list[tuple[Path, bytes]] = []
+    with chromium() as browser:
+        tab = browser.open("about:blank", width, WIDTHS_PX[width])
+        tab.size(width, WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
+        tab.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        for page in pages:
+            open_page(tab, page)
+            for problem in json.loads(tab.value(CHECK) or "[]"):
+                yield f"{page} ({width}, {scheme}): {problem}"
+            yield from (f"{page} ({width}, {scheme}): {error}" for error in tab.errors)
+            tab.errors.clear()
+            if with_sheets:
+                tiles.append((page, tab.picture()))
+    for number in range(0, len(tiles), COLUMNS * ROWS):
+        name = f"{width}-{scheme}-{number // (COLUMNS * ROWS):02}.png"
+        make_sheet(tiles[number : number + COLUMNS * ROWS], width).save(SHEETS / name)
+
+
+def open_page(tab: Tab, page: Path) -> None:
+    """Show a page, with the pictures that a reader would have to scroll to."""
+    tab.send("Page.navigate", url=f"file://{COPY / page}")
+    deadline = time.monotonic() + LOAD_LIMIT_S
+    name = json.dumps(page.name)
+    while tab.value(f"document.readyState === 'complete' && location.pathname.endsWith({name})") is not True:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{page} does not load")
+        time.sleep(0.02)
+    time.sleep(0.15)  # the theme wraps tables and colors code
+
+
+def make_sheet(tiles: list[tuple[Path, bytes]], width: int) -> Image.Image:
+    """Return pictures side by side, each under its page's path."""
+    tile_width = TILE_PX[width]
+    tile_height = WIDTHS_PX[width] * tile_width // width
+    sheet = Image.new("RGB", (COLUMNS * (tile_width + 8), ROWS * (tile_height + 24)), "gray")
+    draw = ImageDraw.Draw(sheet)
+    for number, (page, picture) in enumerate(tiles):
+        left = number % COLUMNS * (tile_width + 8)
+        top = number // COLUMNS * (tile_height + 24)
+        draw.text((left + 4, top + 4), str(page), fill="white", font_size=14)
+        with Image.open(io.BytesIO(picture)) as opened:
+            sheet.paste(opened.convert("RGB").crop((0, 0, tile_width, tile_height)), (left, top + 24))
+    return sheet
+
+
+if __name__ == "__main__":
+    sys.exit(main())
