@@ -170,11 +170,15 @@ class Model(RuleBasedStateMachine):
         self.holder = self.heard = None
         self.last_sequence = -1
 
+    def note_fault(self) -> None:
+        """One fault more is kept, up to the limit."""
+        self.faults = min(self.faults + 1, MAX_FAULTS)
+
     def fail(self) -> None:
         if self.state != "estop":
             self.leave_for("fault")
         self.drop_lease()
-        self.faults = min(self.faults + 1, MAX_FAULTS)
+        self.note_fault()
 
     def lose(self, joints: set[int]) -> bool:
         """Whether the robot goes on without these joints, too."""
@@ -183,7 +187,7 @@ class Model(RuleBasedStateMachine):
         if self.state != "armed" or len(self.aside | joints) > self.max_isolated:
             return False
         self.aside |= joints
-        self.faults = min(self.faults + 1, MAX_FAULTS)
+        self.note_fault()
         return True
 
     def lose_or_fail(self, joints: set[int] | None) -> None:

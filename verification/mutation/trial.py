@@ -13,15 +13,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = Path("tests/unit/hal")
 # The tests of a file first, quick ones before thorough ones: most mutants die in the first second.
-AUTHORITY = ("test_authority_lease.py", "test_authority_arming.py", "test_authority_stops.py")
 TRIED_BY = {
-    "limiter.py": ("test_limiter.py", "test_gate_limits.py", *AUTHORITY, "test_authority_machine.py"),
+    "limiter.py": ("test_limiter.py", "test_gate_limits.py", "test_authority.py", "test_authority_machine.py"),
     "limit_names.py": ("test_limiter.py", "test_gate_limits.py", "test_authority_machine.py"),
-    "joint_limits.py": ("test_limiter.py", "test_gate_limits.py", *AUTHORITY, "test_authority_machine.py"),
-    "lease.py": ("test_lease.py", *AUTHORITY, "test_authority_machine.py"),
-    "lifecycle.py": ("test_lifecycle.py", "test_arm_session.py", *AUTHORITY, "test_authority_machine.py"),
-    "authority.py": (*AUTHORITY, "test_isolation.py", "test_authority_machine.py"),
-    "fault_log.py": ("test_authority_stops.py", "test_authority_machine.py"),
+    "joint_limits.py": ("test_limiter.py", "test_gate_limits.py", "test_authority.py", "test_authority_machine.py"),
+    "lease.py": ("test_lease.py", "test_authority.py", "test_authority_machine.py"),
+    "lifecycle.py": ("test_lifecycle.py", "test_arm_session.py", "test_authority.py", "test_authority_machine.py"),
+    "authority.py": ("test_authority.py", "test_isolation.py", "test_authority_machine.py"),
+    "fault_log.py": ("test_fault_log.py", "test_authority.py", "test_authority_machine.py"),
     "isolation.py": ("test_isolation.py", "test_authority_machine.py"),
     "plausibility.py": ("test_plausibility.py", "test_isolation.py", "test_authority_machine.py"),
     "stop_ramp.py": ("test_stop_ramp.py", "test_authority_machine.py"),

@@ -15,7 +15,6 @@ from hypothesis.stateful import initialize, invariant, precondition, rule, run_s
 
 from snakesim_hal.safety import authority as under_test
 from snakesim_hal.safety.authority import Authority
-from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
@@ -68,6 +67,19 @@ def often(usual: Any, *others: Any) -> st.SearchStrategy[Any]:
     return st.sampled_from([usual] * (3 * len(others)) + list(others))
 
 
+def spoil(values: list[float], joint: int, failure: str | None) -> None:
+    """Put a failure into one column of a joint state."""
+    match failure:
+        case "nan" | "inf":
+            values[joint] = float(failure)
+        case "short":
+            values.pop()
+        case "long":
+            values.append(0.0)
+        case _:
+            pass
+
+
 class Everything(Model):
     """Every input of the authority as a rule. What the rules know of it by themselves is the model."""
 
@@ -96,8 +108,9 @@ class Everything(Model):
         angle=per_joint(st.floats(-1.7, 1.7)),
         velocity=per_joint(st.floats(-6, 6)),
         torque=per_joint(st.floats(-5, 5)),
-        failure=often(None, "valid", "age", "nan", "inf", "short", "no_valid", "no_age"),
+        failure=often(None, "valid", "age", "nan", "inf", "short", "long", "no_valid", "no_age"),
         joint=st.integers(0, JOINTS - 1),
+        column=st.sampled_from([0, 0, 1, 2]),
         later_ns=often(LONG_NS, PERIOD_NS, 0),
     )
     def observe(
@@ -107,38 +120,36 @@ class Everything(Model):
         torque: list[float],
         failure: str | None,
         joint: int,
+        column: int,
         later_ns: int,
     ) -> None:
+        """A joint state, perhaps with a failure. `column`: of the angles, velocities or torques."""
         valid, age_ns = [True] * JOINTS, [FRESH_NS] * JOINTS
-        shown = list(angle)
+        columns = [list(angle), list(velocity), list(torque)]
         self.timestamp_ns += later_ns
         match failure:
             case "valid":
                 valid[joint] = False
             case "age":
                 age_ns[joint] += 1
-            case "nan" | "inf":
-                shown[joint] = float(failure)
-            case "short":
-                shown.pop()
             case "no_valid":
                 valid = []
             case "no_age":
                 age_ns = []
             case _:
-                pass
+                spoil(columns[column], joint, failure)
         when = {"tick": self.tick, "timestamp_ns": self.timestamp_ns}
-        seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, **when)
+        seen = state(self.robot, *columns, valid=valid, age_ns=age_ns, **when)
         self.authority.observe(seen)
         self.seen_tick = self.tick
-        if failure in ("short", "no_valid", "no_age"):
+        if failure in ("short", "long", "no_valid", "no_age"):
             self.doubt = None
             return
         measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
         unknown, strayed, stuck = set[int](), set[int](), set[int]()
         for i in range(JOINTS):
             taken_s = (self.timestamp_ns - age_ns[i]) * 1e-9
-            frozen = self.is_frozen(i, (shown[i], velocity[i], torque[i]), taken_s)
+            frozen = self.is_frozen(i, (columns[0][i], columns[1][i], columns[2][i]), taken_s)
             sound = failure is None or i != joint
             believed = sound and self.believe(i, angle[i], taken_s)
             if believed or not sound:
@@ -190,7 +201,7 @@ class Everything(Model):
                 self.silent.add(i)
         fresh = self.silent - quiet_before
         if fresh and not (len(fresh) == 1 and fresh <= self.aside):
-            self.faults = min(self.faults + 1, MAX_FAULTS)
+            self.note_fault()
         self.shares = [health.share(self.now_ns) for health in self.healths]
 
     @rule(
@@ -215,6 +226,8 @@ class Everything(Model):
                 self.holder, self.priority, self.expires_ns = who, priority, self.now_ns + LEASE_NS
                 self.epoch += 1
         self.check(answer, ok)
+        if not ok:
+            assert answer.refusal == ("lease_held" if action == "acquire" else "not_holder")
 
     @rule(
         wanted=per_joint(NUMBERS),
@@ -351,18 +364,29 @@ class Everything(Model):
     def estop(self, who: str) -> None:
         answer = self.authority.on_estop(EstopRequest(requester=who), self.tick)
         self.leave_for("estop")
-        self.faults = min(self.faults + 1, MAX_FAULTS)
+        self.note_fault()
         self.check(answer, True)
 
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
-        reach=st.sampled_from(["robot", "joint"]),
+        reach=often("robot", "joint", "none"),
         joint=st.none() | st.integers(0, JOINTS),
     )
     def backend_fault(self, cause: str, reach: Any, joint: int | None) -> None:
         name = None if joint is None else f"joint_{joint + 1}"
         self.authority.fault(Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach))
+        if reach == "none":
+            self.note_fault()
+            return
         self.lose_or_fail({joint} if reach == "joint" and joint in ALL else None)
+
+    @rule(precedes_stop=st.booleans())
+    def record_fault(self, precedes_stop: bool) -> None:
+        """A fault that is only recorded, so that it is not taken for the reason of a stop."""
+        fault = Fault(tick=self.tick, what="service_lost", cause="guidance is gone", reach="robot")
+        self.authority.record_fault(fault, precedes_stop=precedes_stop)
+        self.note_fault()
+        assert self.authority.faults[-1].reach == ("robot" if precedes_stop else "none")
 
     @rule()
     def holder_gone(self) -> None:
@@ -380,7 +404,7 @@ class Everything(Model):
     @precondition(lambda self: self.state != "armed")
     @rule(angle=st.floats(-1.6, 1.6))
     def set_up_and_arm(self, angle: float) -> None:
-        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, LONG_NS)
+        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, 0, LONG_NS)
         if self.state in ("fault", "estop"):
             self.ask_for_less("reset")
         if not self.live:
@@ -411,7 +435,7 @@ class Everything(Model):
     ) -> None:
         for _ in range(ticks):
             angle = [before + moved for before, moved in zip(self.measured[0], moves, strict=True)]
-            self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0, later_ns)
+            self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0, 0, later_ns)
             self.send_commands(wanted, mode, torque_limit, False, set(), False, 0, 0, 1)
             self.end_a_tick(PERIOD_NS)
 

@@ -1,0 +1,321 @@
+"""Named regressions of the authority. The specification is the model: test_authority_machine.py tries every order."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority
+from snakesim_hal.safety.cables import Cables
+from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Fault, Mode, SensorDescription
+from snakesim_testing.hal.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, commanded, modes, receive
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, state
+
+MAX_REASON_LENGTH = 500  # characters that the reason of an answer may have on the wire
+ARM_UNCHECKED = msgspec.structs.replace(ARM, unchecked=True)
+HOT = Fault(tick=1, what="hot", cause="joint_2 is hot")
+
+# --- arming ----------------------------------------------------------------------------------------------------
+
+
+def test_arming_unmet_conditions_are_named_until_met() -> None:
+    rig = Rig()
+    assert rig.arm().reason == "no joint state yet; nothing commands the robot: the lease is free"
+    rig.observe(0.1)
+    assert rig.arm().reason == "nothing commands the robot: the lease is free"
+    rig.acquire()
+    assert rig.arm().reason == "no commands from control yet"
+    rig.send(0.7)
+    assert "joint_1 has a target +0.60 rad" in rig.arm().reason
+    rig.send(0.1, Mode.TORQUE)
+    assert "joint_1 is commanded in mode torque; it must hold its position at arming" in rig.arm().reason
+    rig.send(0.1)
+    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
+    answer = rig.arm()
+    assert answer.ok
+    assert answer.lifecycle == "armed"
+
+
+def test_arming_stopped_robot_asks_for_reset() -> None:
+    rig = armed()
+    rig.authority.fault(HOT)
+    assert "state is fault, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
+    rig.authority.on_estop(ESTOP, rig.tick)
+    assert "state is estop, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
+
+
+@pytest.mark.parametrize(
+    ("request_fields", "refusal", "explanation"),
+    [
+        pytest.param({"robot": None, "backend": None}, "wrong_robot", "names None", id="no-robot"),
+        pytest.param({"robot": "other"}, "wrong_robot", "this robot is 'worm'", id="other-robot"),
+        pytest.param({"backend": None}, "wrong_backend", "the request names None", id="no-backend"),
+        pytest.param({"backend": "can"}, "wrong_backend", "this backend is 'lag'", id="other-backend"),
+        pytest.param({"config_hash": None}, "wrong_config", "arm with its config_hash", id="no-configuration"),
+        pytest.param({"config_hash": "1" * 16}, "wrong_config", "1" * 16, id="other-configuration"),
+    ],
+)
+def test_arming_request_for_another_robot_is_explained(
+    request_fields: dict[str, Any], refusal: str, explanation: str
+) -> None:
+    rig = commanded()
+    answer = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, **request_fields), rig.now_ns)
+    assert answer.refusal == refusal
+    assert explanation in answer.reason
+
+
+def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> None:
+    rig = Rig(chain__modules=100)
+    rig.observe(0.1, valid=[False] * 100)
+    assert len(rig.authority.list_unmet_conditions(0)[0]) == 400
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(9.0)
+    assert len(rig.arm().reason) == MAX_REASON_LENGTH
+
+
+@pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])
+def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
+    """Reset and armed again within one period, the backend would never receive the stop."""
+    rig = armed()
+    rig.tick_with(0.1)
+    match stop:
+        case "estop":
+            rig.authority.on_estop(ESTOP, rig.tick)
+        case "fault":
+            rig.authority.fault(HOT)
+        case _:
+            rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    if stop != "disarm":
+        rig.pass_tick()  # the motors receive the stop, but not yet its reset
+        rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.acquire()
+    rig.send(0.1)
+    answer = rig.arm()
+    assert answer.refusal == "not_ready"
+    assert "have not received the stop" in answer.reason
+    rig.authority.decide()
+    assert rig.arm().ok
+
+
+def test_arming_unchecked_robot_needs_explicit_request() -> None:
+    rig = commanded(unchecked="nobody has checked it")
+    answer = rig.arm()
+    assert answer.refusal == "not_checked"
+    assert "nobody has checked it; to arm it" in answer.reason
+    assert rig.authority.on_lifecycle(ARM_UNCHECKED, rig.now_ns).ok
+    assert ", unchecked" in rig.authority.reason
+
+
+def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
+    rig = commanded(unchecked="nobody has checked it", cables=Cables((), {}, {"joint_2": "unknown"}))
+    answer = rig.authority.on_lifecycle(ARM_UNCHECKED, rig.now_ns)
+    assert answer.refusal == "cable"
+    assert answer.reason == "joint_2: unknown"
+
+
+def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
+    """Time may stand still until the robot is armed, so that no report can arrive."""
+    power_sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
+    rig = Rig()
+    rig.authority = Authority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power_sensor]))
+    rig.observe(0.1)
+    rig.acquire()
+    rig.tick_with(0.1)
+    rig.send(0.1)
+    assert rig.arm().ok
+
+
+# --- commands and the lease ------------------------------------------------------------------------------------
+
+
+def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
+    rig = armed()
+    rig.tick_with(0.1, arm_session=1)
+    for other_session in (0, 2, 0, 2):
+        assert rig.send(0.2, arm_session=other_session) == "before_arming"
+        assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINTS)
+    rig.tick_with(0.2, arm_session=0)
+    assert rig.authority.state == "fault"
+    assert rig.authority.faults[0].what == "lease_expired"
+    assert rig.authority.rejected_counts == {"before_arming": 5}
+
+
+def test_lease_without_commands_expires_with_a_fault() -> None:
+    rig = armed()
+    for _ in range(20):
+        rig.tick_with(0.1)
+    for _ in range(LEASE_NS // PERIOD_NS - 1):  # the last command remains in force for one term
+        assert rig.pass_tick().sequence == rig.sequence
+    decision = rig.pass_tick()
+    assert rig.authority.state == "fault"
+    assert decision.sequence is None
+    assert modes(decision) == {Mode.VELOCITY}
+    assert decision.setpoints.target == [0.0] * JOINTS
+    (fault,) = rig.authority.faults
+    assert fault.what == "lease_expired"
+    assert fault.tick == rig.tick
+    assert fault.cause == "lease of control expired: no accepted command for 50 ms"
+    assert rig.authority.lease.holder is None
+
+
+def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None:
+    rig = armed()
+    rig.tick_with(0.1)
+    assert not rig.acquire("teleop").ok
+    assert rig.authority.state == "armed"
+    answer = rig.acquire("teleop", priority=200)
+    assert answer.epoch == 2
+    assert answer.lifecycle == "disarmed"
+    assert modes(rig.pass_tick()) == {Mode.PASSIVE}
+    assert rig.send(0.1, lease_epoch=1) == "wrong_epoch"
+    assert rig.arm().reason == "no commands from teleop yet"
+    rig.send(0.1, sequence=1)  # the sequence numbers of a new holder start anew
+    assert rig.arm().ok
+
+
+def test_holder_gone_while_armed_keeps_the_lease() -> None:
+    rig = armed()
+    rig.authority.on_holder_gone("control is gone")
+    assert rig.authority.state == "armed"
+    assert rig.authority.lease.holder == "control"
+
+
+def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
+    rig = armed()
+    rig.authority.on_estop(ESTOP, rig.tick)
+    rig.authority.on_holder_gone("control is gone")
+    assert rig.authority.lease.holder is None
+    assert "emergency stop by a person" in rig.authority.reason
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.authority.on_holder_gone("control is gone")
+    assert rig.authority.reason == "control is gone"
+
+
+def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
+    """The pose at arming would be a jump that no limiter has limited."""
+    rig = armed()
+    for tick in range(5):
+        rig.tick = tick
+        rig.send(0.3)
+        before = rig.authority.decide(tick)
+    rig.tick = 5
+    for _ in range(COMMANDS_KEPT + 1):
+        rig.send(0.1)
+    after = rig.authority.decide(4)
+    assert after.sequence == before.sequence
+    assert after.setpoints.target == pytest.approx([0.3] * JOINTS)
+
+
+# --- stops -----------------------------------------------------------------------------------------------------
+
+
+def test_estop_stays_until_reset_and_arming() -> None:
+    rig = armed()
+    rig.tick_with(0.2)
+    assert rig.authority.on_estop(ESTOP, rig.tick).ok
+    for _ in range(3):
+        assert modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
+    assert not rig.arm().ok
+    assert not rig.authority.on_lifecycle(DISARM, rig.now_ns).ok
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    assert modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
+    assert rig.arm().ok
+    assert rig.pass_tick().setpoints.target == [0.1] * JOINTS  # resumes from the measured pose
+
+
+@pytest.mark.parametrize(
+    ("stop_mode", "mode", "target"),
+    [("passive", Mode.PASSIVE, 0.0), ("damp", Mode.VELOCITY, 0.0), ("hold", Mode.POSITION, 0.4)],
+)
+def test_fault_starts_the_stop_mode_of_the_robot(stop_mode: str, mode: Mode, target: float) -> None:
+    rig = armed(safety__action=stop_mode)
+    rig.observe(0.4)
+    rig.authority.fault(HOT)
+    for angle_rad in (0.4, 0.6, 0.9):  # later motion of the joint does not change the pose that is held
+        rig.observe(angle_rad)
+        decision = rig.pass_tick()
+        assert modes(decision) == {mode}
+        assert decision.setpoints.target == [target] * JOINTS
+
+
+def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
+    """From 1 rad/s at 50 rad/s² the joint is at rest after two periods of 10 ms."""
+    rig = armed(joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0)
+    rig.observe(0.1, 1.0)
+    rig.authority.fault(HOT)
+    braking = rig.pass_tick().setpoints
+    assert braking.mode == [Mode.VELOCITY, Mode.POSITION, Mode.VELOCITY]
+    assert 0.1 < braking.target[1] < 0.2
+    at_rest = rig.pass_tick().setpoints
+    assert at_rest.mode == [Mode.VELOCITY, Mode.PASSIVE, Mode.VELOCITY]
+    assert at_rest.target == [0.0] * JOINTS
+
+
+def test_fault_after_the_first_does_not_replace_the_reason() -> None:
+    rig = armed()
+    for what in ("bus_off", *["watchdog"] * 40):
+        rig.authority.fault(Fault(tick=1, what=what, cause=f"because of {what}"))
+    assert rig.authority.reason == "because of bus_off"
+    assert rig.authority.faults[0].cause == "because of bus_off"
+    assert rig.authority.faults[1].cause == "because of watchdog"
+
+
+def test_faults_since_start_survive_a_reset() -> None:
+    rig = armed()
+    rig.authority.fault(HOT)
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    assert rig.authority.faults == []
+    assert [fault.what for fault in rig.authority.faults_since_start.kept] == ["hot"]
+
+
+# --- heat, supply and measured states --------------------------------------------------------------------------
+
+
+def test_heat_derates_then_stops_then_blocks_arming() -> None:
+    rig = armed()
+    receive(rig, [20.0, 92.5, 20.0])
+    derated = rig.tick_with(0.1)
+    assert derated.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
+    assert derated.limited == {1: "thermal"}
+    assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
+    receive(rig, [20.0, 110.0, 20.0])
+    stopped = rig.pass_tick()
+    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
+    assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also while stopping
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.acquire()
+    rig.tick_with(0.1)
+    assert "joint_2 is at 110" in rig.arm().reason
+    receive(rig, [20.0, 70.0, 20.0])
+    rig.pass_tick()
+    rig.send(0.1)
+    assert rig.arm().ok
+
+
+def test_weak_supply_blocks_arming_with_one_explanation() -> None:
+    rig = Rig()
+    for _ in range(7):
+        receive(rig, [20.0] * JOINTS, volts=12.0)
+        rig.pass_tick()
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    answer = rig.arm()
+    assert answer.refusal == "not_ready"
+    assert answer.reason.count("12.0 V") == 1
+    assert MIN_VOLTAGE_FIELD in answer.reason
+
+
+def test_joint_angle_after_a_host_pause_may_be_far() -> None:
+    rig = armed()
+    rig.authority.observe(state(rig.robot, 0.9, timestamp_ns=rig.timestamp_ns), rig.timestamp_ns + 10**9)
+    rig.pass_tick()
+    assert rig.authority.state == "armed"
+
+
+def test_joint_state_with_nan_is_published_as_last_good() -> None:
+    rig = armed()
+    published = rig.authority.replace_unreadable(state(rig.robot, [0.2, float("nan"), 0.2]))
+    assert published.angle_rad == [0.2, 0.1, 0.2]
+    assert published.valid == [True, False, True]

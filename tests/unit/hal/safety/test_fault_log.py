@@ -1,0 +1,43 @@
+"""Which faults a full log keeps."""
+
+from snakesim_hal.safety.fault_log import MAX_FAULTS, FaultLog
+from snakesim_hal.wire.messages import Fault
+
+MAX_FAULTS_IN_STATUS = 64  # what the message `Status` holds: those since the reset, and those since the start
+
+
+def add_faults(log: FaultLog, ticks: range) -> None:
+    for tick in ticks:
+        log.add(Fault(tick=tick, what="late", cause="late"), stops=False)
+
+
+def kept_ticks(log: FaultLog) -> list[int]:
+    return [fault.tick for fault in log.kept]
+
+
+def test_fault_log_when_full_keeps_the_first_and_newest() -> None:
+    log = FaultLog()
+    add_faults(log, range(100))
+    assert kept_ticks(log) == [*range(16), *range(84, 100)]
+    assert log.left_out == 68
+
+
+def test_fault_log_fits_twice_into_a_status() -> None:
+    assert 2 * MAX_FAULTS <= MAX_FAULTS_IN_STATUS
+
+
+def test_fault_log_when_full_keeps_the_fault_that_stopped() -> None:
+    log = FaultLog()
+    add_faults(log, range(16))
+    log.add(Fault(tick=16, what="hot", cause="hot"), stops=True)
+    add_faults(log, range(17, 100))
+    assert kept_ticks(log) == [*range(17), *range(85, 100)]
+
+
+def test_fault_log_of_a_second_stop_keeps_the_newest_stop() -> None:
+    log = FaultLog()
+    add_faults(log, range(16))
+    log.add(Fault(tick=16, what="hot", cause="hot"), stops=True)
+    log.add(Fault(tick=17, what="estop", cause="estop"), stops=True)
+    add_faults(log, range(18, 100))
+    assert kept_ticks(log)[16] == 17
