@@ -49,7 +49,7 @@ CHART_DECIMATION = 5
 PICTURE_DECIMATION = 6
 QUESTION_DECIMATION = 3  # ten questions a second to the page in control, by which the age of its messages is known
 
-PANEL_WIDTH_PX = 460  # wide enough for all tabs in one line
+PANEL_WIDTH_PX = 490  # wide enough for all tabs in one line
 
 
 class Page:
