@@ -85,6 +85,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         watching = asyncio.create_task(viewer.watch())
         await until(lambda: viewer.shows("not checked: its joints have not been checked"), "the table")
         await until(lambda: viewer.shows("id 2"), "the table")
+        await until(lambda: viewer.has("Start step"), "the controls of the viewer")
         await viewer.click("Start step")  # of somebody who has no control
         await viewer.click("Take control")
         await until(lambda: viewer.has("Release control"), "control")
