@@ -112,8 +112,9 @@ def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_abov
         for tab in ("Joints", "State", "Signals", "Log"):
             page.click(tab)
             wait_until(lambda: page.value(PANEL_WIDTHS) == [400, 400], f"a panel as wide as the phone in tab {tab}")
-        assert page.value(f"{STOP_BOX}.bottom") < 100
-        assert "Stops the robot even if EMERGENCY STOP does not react. Self-test: ready" in page.text()
+        # On a busy computer the stop may report for a moment that it does not answer; then its box is higher.
+        wait_until(lambda: page.value(f"{STOP_BOX}.bottom") < 100, "a second stop at the top")
+        page.wait_for("Stops the robot even if EMERGENCY STOP does not react. Self-test: ready")
         assert page.value(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), "a notice, such as of missing WebGL, is not covered"
         page.size(1400, 860)
         wait_until(lambda: page.value(TAB_LINES) == 1, "tabs in one line")

@@ -223,8 +223,9 @@ class Page:
         if self._is_due(PICTURE_DECIMATION):
             self._display.show_pictures(snapshot)
         parameters = snapshot.parameters
-        is_new = parameters is not None and (previous is None or parameters != previous.parameters)
-        if is_new and self._viewers is not None:
+        if self._viewers is None or parameters is None:
+            return
+        if previous is None or parameters != previous.parameters:
             self._viewers.show_parameters(parameters)
 
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
