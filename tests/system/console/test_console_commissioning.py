@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -73,13 +74,18 @@ def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench:
 
 
 async def commission(address: str, home: Path, endpoint: str) -> None:
-    host_name, _, port = address.removeprefix("http://").rpartition(":")
-    async with StallingRelay(host_name, int(port)) as relay, viewing(f"http://127.0.0.1:{relay.port}") as socket:
+    parts = urlsplit(address)
+    assert parts.hostname is not None and parts.port is not None
+    async with (
+        StallingRelay(parts.hostname, parts.port) as relay,
+        viewing(f"http://127.0.0.1:{relay.port}{parts.path}") as socket,
+    ):
         viewer = Viewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
         await until(lambda: viewer.shows("not checked: its joints have not been checked"), "the table")
         await until(lambda: viewer.shows("id 2"), "the table")
+        await until(lambda: viewer.has("Start step"), "the controls of the viewer")
         await viewer.click("Start step")  # of somebody who has no control
         await viewer.click("Take control")
         await until(lambda: viewer.has("Release control"), "control")

@@ -38,7 +38,7 @@ def cells(tab: Tab) -> dict[str, list[str]]:
     rows = tab.value(
         "[...document.querySelectorAll('tr')].map(row => [...row.cells].map(cell => cell.innerText.trim()))"
     )
-    return {row[0].removeprefix("■ "): row[1:5] for row in rows}
+    return {row[0].removeprefix("■\xa0"): row[1:5] for row in rows}
 
 
 @pytest.mark.slow
