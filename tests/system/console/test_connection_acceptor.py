@@ -73,7 +73,7 @@ def is_closed(connection: socket.socket) -> bool:
     return False
 
 
-def test_of_too_many_incomplete_requests_the_oldest_is_closed_and_a_stop_is_answered() -> None:
+def test_acceptor_closes_oldest_incomplete_request_and_answers_a_stop() -> None:
     stop = ReadyStop()
     with door(stop) as at, contextlib.ExitStack() as stack:
         opened = [stack.enter_context(at.send(HALF[number % len(HALF)])) for number in range(3 * FEW.waiting)]
@@ -83,7 +83,7 @@ def test_of_too_many_incomplete_requests_the_oldest_is_closed_and_a_stop_is_answ
         assert at.ask("GET") == (200, "ready")
 
 
-def test_only_complete_requests_are_handed_on_and_no_more_than_the_limit() -> None:
+def test_acceptor_forwards_only_complete_requests_up_to_limit() -> None:
     with door(ReadyStop()) as at, contextlib.ExitStack() as stack:
         first = stack.enter_context(at.send(COMPLETE[:20]))
         with pytest.raises(BlockingIOError):
@@ -119,7 +119,7 @@ class FullTable(socket.socket):
         return super().accept()
 
 
-def test_a_full_file_table_costs_a_reserved_descriptor_or_the_oldest_request_and_no_stop() -> None:
+def test_acceptor_with_full_file_table_still_answers_a_stop() -> None:
     stop = ReadyStop()
     listening = FullTable(fileno=open_port(None).detach())
     handed_on = HandoffListener(listening.getsockname())
@@ -152,7 +152,7 @@ class BrokenStop(ReadyStop):
         return stopped
 
 
-def test_an_error_of_a_stop_is_its_answer_and_the_next_stop_is_taken() -> None:
+def test_acceptor_answers_failed_stop_with_error_and_takes_next() -> None:
     with door(BrokenStop()) as at:
         assert at.ask("POST") == (503, "[Errno 24] Too many open files")
         with pytest.raises((http.client.RemoteDisconnected, ConnectionResetError)):
@@ -172,7 +172,7 @@ def test_ready_is_what_the_self_test_says() -> None:
         assert at.ask("GET") == (503, "the robot's host does not answer")
 
 
-def test_of_one_user_no_more_wait_than_leave_room_for_the_others() -> None:
+def test_acceptor_limits_each_user_to_leave_room_for_others() -> None:
     limits = ConnectionLimits(waiting=6, waiting_of_user=4)
     waiting: PendingRequests[str] = PendingRequests(limits)
     assert [waiting.add(f"flood {number}", 1, number) for number in range(6)] == 4 * [None] + ["flood 0", "flood 1"]

@@ -48,7 +48,7 @@ def fastest_rad_s(joints: JointState) -> float:
 
 
 @pytest.mark.quiet
-def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path: Path) -> None:
+def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         began_s = time.monotonic()
         address = run.console()
@@ -79,7 +79,7 @@ NOTICE_BOX = "document.querySelector('[class*=Notification-root]').getBoundingCl
 TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab.offsetTop)).size"
 
 
-def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
+def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
     with serve_pages(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, None, PageLog(), recorded="a run")
@@ -99,7 +99,7 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
 
 
 @pytest.mark.slow
-def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_all_else() -> None:
+def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
     """And a wide screen shows the tabs in one line."""
     config, log = load("triplet").config, PageLog()
     with serve_pages(open_port(None), stop=ReadyStop()) as (server, address), chromium() as browser:
@@ -119,7 +119,7 @@ def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_abov
 
 
 @pytest.mark.slow
-def test_a_page_says_when_its_second_stop_does_not_answer_and_stops_by_it(tmp_path: Path) -> None:
+def test_console_page_reports_unanswering_second_stop_and_uses_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         page = browser.open(run.console(), *SMALL)
         page.wait_for("armed by snakesim run")

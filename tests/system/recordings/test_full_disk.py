@@ -41,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=lambda one: one if isinstance(one, str) else "",
 )
-def test_an_export_that_does_not_fit_is_named_and_leaves_nothing(
+def test_export_on_full_disk_is_named_and_leaves_nothing(
     run: Path, tmp_path: Path, command: list[str], name: str
 ) -> None:
     out = tmp_path / name

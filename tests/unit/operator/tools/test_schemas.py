@@ -45,7 +45,7 @@ def test_the_published_files_are_what_the_code_says() -> None:
         assert published[name] == text, f"schemas/{name} is out of date; run `make schemas` and commit what it changes"
 
 
-def test_writing_removes_what_is_not_part_of_the_contract_any_more(tmp_path: Path) -> None:
+def test_writing_schemas_removes_files_outside_the_contract(tmp_path: Path) -> None:
     write_schemas(tmp_path)
     (tmp_path / "messages" / "Gone.json").write_text("{}")
     (tmp_path / "README.md").write_text("by hand")
@@ -56,7 +56,7 @@ def test_writing_removes_what_is_not_part_of_the_contract_any_more(tmp_path: Pat
     assert {str(path.relative_to(tmp_path)) for path in written} == set(found)
 
 
-def test_writing_into_a_folder_of_somebody_else_removes_nothing_of_it(tmp_path: Path) -> None:
+def test_writing_schemas_into_foreign_folder_removes_nothing(tmp_path: Path) -> None:
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "thesis.json").write_text("{}")
     write_schemas(tmp_path)
@@ -133,7 +133,7 @@ def test_every_shipped_file_fits_its_schema_and_names_itself(kind: str, schema: 
 
 
 @pytest.mark.parametrize("name", list_shipped("scenarios"))
-def test_every_shipped_scenario_loads_and_fits_the_schema_of_a_run(name: str) -> None:
+def test_every_shipped_scenario_loads_and_fits_run_schema(name: str) -> None:
     config = load(name).config
     assert config.name == name
     assert fits(config, "files/run.json")
