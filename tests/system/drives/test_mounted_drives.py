@@ -12,7 +12,7 @@ EVERY_SECOND = [f"joint_{i}" for i in range(2, 14, 2)]
 MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5.zero_rad=-0.2"]
 
 
-def ran(*sets: str, backend: str = "can", duration_s: float = 2.0) -> RunSummary:
+def ran(*sets: str, backend: str = "can", duration_s: float = 1.2) -> RunSummary:
     fixed = (f"backend={backend}", f"duration_s={duration_s}")
     return simulate(load("peg_row", [parse_set(text) for text in (*fixed, *sets)]).config).summary
 
