@@ -1,5 +1,6 @@
 """Every test runs with a state folder of its own and tries the same examples each time. A failure is shown at once."""
 
+import gc
 import random
 
 import pytest
@@ -33,6 +34,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     seed = config.getoption("--shuffle")
     if seed is not None:
         random.Random(seed).shuffle(items)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Exclude the collected tests from garbage collection, which would visit all of them in every test."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -84,7 +84,7 @@ def test_c1_no_viewer_switches_the_stop_off(robot: Robot, at: str) -> None:
     robot.unharmed(health)
 
 
-def test_c2_who_has_no_control_commands_nothing_by_his_own_buttons_or_anothers(robot: Robot, at: str) -> None:
+def test_c2_user_without_control_cannot_command_by_any_button(robot: Robot, at: str) -> None:
     health = robot.health()
     with Page(at) as driver, Page(at) as intruder:
         driver.click("Take control")
@@ -135,7 +135,7 @@ NONSENSE: dict[str, Any] = {
 }
 
 
-def test_c3_what_no_page_says_ends_nothing_and_is_told_once(robot: Robot, at: str) -> None:
+def test_c3_unexpected_page_message_ends_nothing_and_is_reported_once(robot: Robot, at: str) -> None:
     health = robot.health()
     with Page(at) as viewer:
         viewer.find(STOP)
@@ -222,9 +222,7 @@ def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, rec
     robot.unharmed(health)
 
 
-def test_c8_half_sent_requests_of_several_processes_cost_nobody_the_stop(
-    robot: Robot, at: str, record_property: Record
-) -> None:
+def test_c8_half_sent_requests_do_not_block_the_stop(robot: Robot, at: str, record_property: Record) -> None:
     """With more of them than the console may open files, by all of its stops, during the flood and after it."""
     health = robot.health()
     with Page(at) as page, Page(at, draws=False) as without_scene:

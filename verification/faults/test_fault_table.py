@@ -11,14 +11,14 @@ from verification.faults.row import DRIVE_TYPES, Result, Row, Trial, judge
 from verification.faults.table import HEADINGS, ROWS
 
 
-def test_no_row_is_missing_and_every_row_stands_on_both_backends_or_says_why_not() -> None:
+def test_fault_table_has_every_row_on_both_backends() -> None:
     assert len(ROWS) == sum(len(heading.rows) for heading in HEADINGS)
     for row in ROWS.values():
         assert set(row.on) in ({"sim", "can"}, {"both"}, set(DRIVE_TYPES)), row.name
         assert any(not isinstance(measure, str) for measure in row.on.values()), row.name
 
 
-def test_the_page_is_short_and_is_made_of_the_raw_results(tmp_path: Path) -> None:
+def test_fault_table_page_is_short_and_matches_raw_results(tmp_path: Path) -> None:
     page = write(Store(), tmp_path / "faults.md").read_text()
     assert page == PAGE.read_text() and len(page.replace("|", "").split()) <= 600
     assert (tmp_path / TABLE_NAME).read_text() == PAGE.with_name(TABLE_NAME).read_text()
@@ -42,7 +42,7 @@ def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
         assert f"| {heading.fault} |" in page
 
 
-def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() -> None:
+def test_fault_table_row_is_judged_by_its_worst_trial() -> None:
     row = Row("r", "fault", "stop", "50 ms", 50.0, "ms", {"sim": lambda _request: iter(())})
 
     def judged(*trials: Trial, broken: str = "") -> tuple[bool, str]:

@@ -96,7 +96,7 @@ def frozen(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def test_an_operator_is_told_what_a_clock_that_stands_waits_for(in_lockstep: Running, tmp_path: Path) -> None:
+def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: Running, tmp_path: Path) -> None:
     """By the robot's own account; it has not gone."""
     why, run = " waits for navigation's answer to tick ", in_lockstep
     with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
@@ -114,7 +114,7 @@ def test_an_operator_is_told_what_a_clock_that_stands_waits_for(in_lockstep: Run
         assert "PowerOff" not in {one.state for one in found}
 
 
-def test_an_operator_is_told_that_the_robot_says_nothing_any_more(in_lockstep: Running, tmp_path: Path) -> None:
+def test_teleop_says_that_robot_stopped_sending(in_lockstep: Running, tmp_path: Path) -> None:
     with at_the_keyboard(in_lockstep, tmp_path) as operator:
         operator.shows("armed: ")
         with frozen(in_lockstep.part("host")):

@@ -40,7 +40,7 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     assert (latency.heard_median_ms, latency.heard_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
 
 
-def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -> None:
+def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
     traffic = Traffic("worm")
     traffic.add(Arrival("sensor/joints", b"noise", format_encoding(JointState), 0))
     for i in range(MAX_KEYS + 10):

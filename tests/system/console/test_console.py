@@ -49,7 +49,7 @@ def fastest_rad_s(joints: JointState) -> float:
 
 
 @pytest.mark.quiet
-def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path: Path) -> None:
+def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         began_s = time.monotonic()
         address = run.console()
@@ -80,7 +80,7 @@ NOTICE_BOX = "document.querySelector('[class*=Notification-root]').getBoundingCl
 TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab.offsetTop)).size"
 
 
-def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it_is_left() -> None:
+def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
     with served_console(ReadyStop()) as (server, address), chromium() as browser:
         Page(server, None, None, PageLog(), recorded="a run")
@@ -100,7 +100,7 @@ def test_a_page_is_dark_if_its_browser_prefers_that_and_lets_a_button_go_when_it
 
 
 @pytest.mark.slow
-def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_all_else() -> None:
+def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
     """And a wide screen shows the tabs in one line."""
     config, log = load("triplet").config, PageLog()
     with served_console(ReadyStop()) as (server, address), chromium() as browser:
@@ -121,7 +121,7 @@ def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_abov
 
 
 @pytest.mark.slow
-def test_a_page_needs_the_token_and_stops_the_robot_while_the_process_of_the_pages_is_stopped(tmp_path: Path) -> None:
+def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -> None:
     """On the page of the signals, which has the second stop and draws no scene."""
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         address = run.console()

@@ -34,7 +34,7 @@ def bench(tmp_path: Path) -> Path:
     return make_jogged_folder(tmp_path)
 
 
-def test_a_robot_that_nobody_checked_is_armed_by_the_page_by_an_explicit_word(home: Path) -> None:
+def test_console_arms_unchecked_robot_only_by_explicit_confirmation(home: Path) -> None:
     with running(home / "run", *RUN) as run:
         asyncio.run(asyncio.wait_for(arm_unchecked(run.console()), 2 * LIMIT_S))
 
@@ -68,7 +68,7 @@ def console(home: Path, endpoint: str) -> Iterator[str]:
 
 
 @pytest.mark.quiet
-def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench: Path) -> None:
+def test_console_sets_zeros_and_jogs_while_button_is_held(bench: Path) -> None:
     with host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
         asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
 

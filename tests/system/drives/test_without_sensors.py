@@ -18,7 +18,7 @@ BARE = [*SHORT, "--unset", "robot.sensors.imu"]  # and these servos have no cont
 
 
 @pytest.mark.slow
-def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is_estimated(tmp_path: Path) -> None:
+def test_drives_without_force_sensors_and_mocap_run_on_estimates(tmp_path: Path) -> None:
     watched = [*BARE, "--set", "mission.localization=dead_reckoning", "--out", "watched"]
     blind = [*BARE, "--unset", "robot.sensors.pose", "--out", "blind"]
     ended = {name: snakesim("run", *words, cwd=tmp_path) for name, words in (("watched", watched), ("blind", blind))}

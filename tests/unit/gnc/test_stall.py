@@ -67,7 +67,7 @@ def cause(**more):
     return explain(**{**given, **more})
 
 
-def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
+def test_stall_contacts_that_carry_load_are_no_jam():
     stall = cause()
     assert not stall.jammed and not stall.release_triplet
     assert stall.reason == (
@@ -117,7 +117,7 @@ def test_a_jam_is_what_obstacles_hold_back():
         ({"swung": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N wanted"),
     ],
 )
-def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given, words):
+def test_stall_straining_body_that_stands_is_released_without_jam(given, words):
     stall = cause(**given)
     assert stall.release_triplet and not stall.jammed
     assert words in stall.reason and not stall.reason.startswith("jam")

@@ -239,7 +239,7 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
 # --- pictures and neighbors -------------------------------------------------------------------------------
 
 
-def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:
+def test_protocol_document_examples_contain_only_defined_frames() -> None:
     lengths = {int(opcode): load_layouts()[opcode].length for opcode in Opcode}
     for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):
         frame = Frame(int(identifier, 16), bytes.fromhex(data))

@@ -55,7 +55,7 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     assert off < 3 * reported.position_sd_m + 0.005
 
 
-def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_elsewhere_is_something_new():
+def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
     map_ = mapped(cylinder("a", 0.8, 0.0))
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)

@@ -34,7 +34,7 @@ def test_arc_length_of_known_curves() -> None:
     assert Route(sine_points(0.1, 0.8, 4.0)).length_m == pytest.approx(exact, rel=1e-3)
 
 
-def test_positions_run_through_the_points_and_go_straight_on_at_both_ends() -> None:
+def test_route_passes_through_points_and_extends_straight_at_ends() -> None:
     route = Route([(0, 0), (3, 4), (3, 5)])
     wanted = {-5.0: (-3, -4), 0.0: (0, 0), 2.5: (1.5, 2), 5.0: (3, 4), 5.5: (3, 4.5), 6.0: (3, 5), 8.0: (3, 7)}
     assert route.position_w(np.array(list(wanted))) == pytest.approx(np.array(list(wanted.values())))
@@ -46,9 +46,7 @@ def test_the_fast_lookup_is_the_slow_one(route: Route, s_m: float) -> None:
 
 
 @given(route=gentle(), s_m=st.floats(-0.5, 7), step_m=st.floats(1e-4, 0.05))
-def test_no_chord_is_longer_than_its_arc_and_short_ones_are_nearly_as_long(
-    route: Route, s_m: float, step_m: float
-) -> None:
+def test_route_chord_is_at_most_and_nearly_its_arc(route: Route, s_m: float, step_m: float) -> None:
     chord = math.dist(route.point_at(s_m), route.point_at(s_m + step_m))
     assert 0.9 * step_m <= chord <= step_m * (1 + 1e-9)
 
@@ -98,7 +96,7 @@ def test_a_sine_bends_the_other_way_at_every_half_wave() -> None:
     assert np.abs(spots[:, 1]).max() < 0.01
 
 
-def test_inflections_are_found_across_a_straight_piece_and_not_where_there_is_none() -> None:
+def test_route_inflections_are_detected_across_straight_pieces_only() -> None:
     turn = np.linspace(0, 1, 50)
     first = np.column_stack([np.sin(turn), 1 - np.cos(turn)])
     forward = np.array([math.cos(1.0), math.sin(1.0)])
@@ -140,9 +138,7 @@ def nodes(tail_w: tuple[float, float], heading_rad: float, angles_rad: Floats, l
     tail_s_m=st.floats(-0.5, 2.0),
     lengths_m=st.lists(st.floats(0.04, 0.15), min_size=2, max_size=15),
 )
-def test_a_laid_chain_has_every_joint_on_the_route_at_its_right_distance(
-    route: Route, tail_s_m: float, lengths_m: list[float]
-) -> None:
+def test_route_laid_chain_has_joints_at_their_distances(route: Route, tail_s_m: float, lengths_m: list[float]) -> None:
     lay = lay_chain(route, tail_s_m, lengths_m)
     points = nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, lengths_m)
     assert lay.tail_w == pytest.approx(route.point_at(tail_s_m))

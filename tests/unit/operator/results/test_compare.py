@@ -110,7 +110,7 @@ def test_the_same_run_twice_differs_in_nothing() -> None:
 
 @pytest.mark.parametrize("name", ["angle_rad", "velocity_rad_s", "torque_nm", "target"])
 @pytest.mark.parametrize(("where", "wrong"), [(np.s_[:], np.nan), (np.s_[50:60, 3], np.nan), (np.s_[:], np.inf)])
-def test_what_is_not_a_number_in_both_runs_is_not_called_the_same(name: str, where: Any, wrong: float) -> None:
+def test_compare_nan_in_both_runs_is_not_equal(name: str, where: Any, wrong: float) -> None:
     record = made_up()
     hurt = getattr(record, name).copy()
     hurt[where] = wrong
@@ -193,7 +193,7 @@ def test_scaled_torques_correlate_fully() -> None:
     shown(difference)
 
 
-def test_rates_that_differ_are_compared_at_the_coarser_and_it_says_so() -> None:
+def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
     difference = differ(made_up(rate_hz=100), made_up(rate_hz=30, seconds=1.5))
     assert len(difference.aligned.time_s) == 45
     assert difference.aligned.how == "A at 100 Hz, B at 30 Hz: A is interpolated at the ticks of B"

@@ -135,7 +135,7 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     assert math.dist(ring[0][0], ring[-1][1]) == pytest.approx(lengths[0], abs=0.5)
 
 
-def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(page: Reader, record: RunRecord) -> None:
+def test_report_force_without_contact_is_drawn_as_requested(page: Reader, record: RunRecord) -> None:
     clear = changed(record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds])
     pages = page, read(clear)
     kinds = [{kind for frame in one.film["frames"] for kind in frame[8]} for one in pages]
@@ -148,7 +148,7 @@ def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(page: Reader
     assert "desired, but no contact was measured there" in pages[1].text
 
 
-def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(page: Reader) -> None:
+def test_report_drawing_texts_do_not_overlap_or_cut_obstacles(page: Reader) -> None:
     drawings = [ET.fromstring(found) for found in re.findall(DRAWING, page.html)]
     assert len(drawings) > 8
     for drawing in drawings:
@@ -183,7 +183,7 @@ def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
     assert balanced_instants(wrong) == [] and "whose forces balance" in read(wrong).text
 
 
-def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: RunRecord, page: Reader) -> None:
+def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page: Reader) -> None:
     for field in msgspec.structs.fields(RunSummary):
         if field.name not in ELSEWHERE:
             assert field.name in page.words, field.name
@@ -209,7 +209,7 @@ def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
     assert state_bands(record)[-1].end_s == pytest.approx(SECONDS)
 
 
-def test_the_reference_is_the_target_in_position_mode_and_the_controllers_word_in_torque_mode(
+def test_report_reference_depends_on_mode_of_joint(
     record: RunRecord,
 ) -> None:
     reference = reference_rad(record, 6)
@@ -235,7 +235,7 @@ def test_the_plotting_library_is_the_one_that_its_note_names() -> None:
     assert (LIBRARY.parent / "LICENSE-plotly.txt").is_file()
 
 
-def test_an_obstacle_that_yields_is_drawn_dashed_and_says_what_it_does(page: Reader, record: RunRecord) -> None:
+def test_report_yielding_obstacle_is_dashed_and_described(page: Reader, record: RunRecord) -> None:
     row = record.config.scene.pegs_along_route[0]
     made = msgspec.structs.replace(row, lean_rad=0.2, stiffness_n_per_m=800.0, mass_kg=2.0, base_friction=0.5)
     scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])
