@@ -120,7 +120,7 @@ bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link bes
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
 	$(bin)/python -m verification.golden
 
-schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables of faults and errors
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables, Python API
 	$(bin)/snakesim schema --out schemas
 	$(bin)/python -m docs.site.kinds_table
 	$(bin)/python -m docs.site.error_pages

@@ -1,4 +1,4 @@
-"""`docs/reference/can-protocol.md` says what the DBC file, the parameters and the emulators' firmware say."""
+"""The pages `docs/reference/can-*.md` say what the DBC file, the parameters and the emulators' firmware say."""
 
 import re
 from collections.abc import Callable
@@ -27,14 +27,15 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.physics.thermal import HeatLimits
 
-TEXT = (Path(__file__).parents[4] / "docs" / "reference" / "can-protocol.md").read_text(encoding="utf-8")
+REFERENCE = Path(__file__).parents[4] / "docs" / "reference"
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in sorted(REFERENCE.glob("can-*.md")))
 NODE = 5
 
 
 def section(heading: str) -> str:
     """The text under a heading, up to the next one."""
     found = re.search(rf"^#+ {re.escape(heading)}\n(.*?)(?=^#|\Z)", TEXT, re.MULTILINE | re.DOTALL)
-    assert found, f"docs/reference/can-protocol.md has no heading {heading!r}"
+    assert found, f"docs/reference/can-*.md have no heading {heading!r}"
     return found[1]
 
 
