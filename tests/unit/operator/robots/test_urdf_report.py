@@ -356,7 +356,7 @@ def test_a_joint_without_a_motor_does_not_get_that_of_its_neighbors(tmp_path: Pa
 def test_an_exporter_that_leaves_all_limits_zero_gets_a_report_of_what_is_assumed(tmp_path: Path) -> None:
     found = _edited(tmp_path, *[(f'effort="{effort}"', 'effort="0"') for effort in ("4.5", "4.6", "4.7")])
     assert {joint.limits.torque_nm for joint in found.robot.joint_table} == {7.0}, "as planar13"
-    said = "<limit effort> has 0: 7 N·m, from the robot given by --like, because no joint has a value"
+    said = "<limit effort> has 0: 7 N·m, from the robot of --like, because no joint has a value"
     places = [f"j{i + 1} (line {_line(f'4.{5 + i}')})" for i in range(3)]
     assert f"{said}: {', '.join(places)}" in found.assumed
 
