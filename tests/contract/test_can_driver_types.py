@@ -60,7 +60,7 @@ FAMILIES = {
         "motor_over_temp",
         "38550000000{}",
         "0.6.11",
-        "does not say its version: .*another id",
+        "does not report its version: .*another id",
         500,
     ),
     "moteus": Family(
@@ -72,7 +72,7 @@ FAMILIES = {
         "fault 38, over-temperature",
         "3033363665115510{:08X}",
         "",
-        "does not say its register map: .*another id",
+        "does not report its register map: .*another id",
         2000,
     ),
     "dynamixel": Family(

@@ -14,8 +14,8 @@ from verification.faults.table import HEADINGS, ROWS
 def test_fault_table_has_every_row_on_both_backends() -> None:
     assert len(ROWS) == sum(len(heading.rows) for heading in HEADINGS)
     for row in ROWS.values():
-        assert set(row.on) in ({"sim", "can"}, {"both"}, set(DRIVE_TYPES)), row.name
-        assert any(not isinstance(measure, str) for measure in row.on.values()), row.name
+        assert set(row.measures) in ({"sim", "can"}, {"both"}, set(DRIVE_TYPES)), row.name
+        assert any(not isinstance(measure, str) for measure in row.measures.values()), row.name
 
 
 def test_fault_table_page_is_short_and_matches_raw_results(tmp_path: Path) -> None:
@@ -28,9 +28,9 @@ def test_fault_table_page_is_short_and_matches_raw_results(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
     raw = tmp_path / "faults.json"
-    asked = ["--trials", "2", "--json", str(raw)]
-    assert main(["--rows", "host_silent", *asked]) == 0
-    assert main(["--rows", "bus_duplicate_at_start", *asked]) == 0
+    options = ["--trials", "2", "--json", str(raw)]
+    assert main(["--rows", "host_silent", *options]) == 0
+    assert main(["--rows", "bus_duplicate_at_start", *options]) == 0
     results = Store(raw).read()
     assert sorted(results) == [("bus_duplicate_at_start", "can"), ("host_silent", "can")]
     silent = results["host_silent", "can"]
@@ -43,7 +43,10 @@ def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
 
 
 def test_fault_table_row_is_judged_by_its_worst_trial() -> None:
-    row = Row("r", "fault", "stop", "50 ms", 50.0, "ms", {"sim": lambda _request: iter(())})
+    row = Row(
+        name="r", fault="fault", expected="stop", deadline="50 ms", limit=50.0, unit="ms",
+        measures={"sim": lambda _request: iter(())},
+    )  # fmt: skip
 
     def judged(*trials: Trial, broken: str = "") -> tuple[bool, str]:
         result = Result(
@@ -51,7 +54,7 @@ def test_fault_table_row_is_judged_by_its_worst_trial() -> None:
             broken=broken,
         )  # fmt: skip
         verdict = judge(row, result)
-        return verdict.met, verdict.why
+        return verdict.met, verdict.reason
 
     good, late = Trial(value=40.0, recovered=True), Trial(value=50.1)
     assert judged(good, good) == (True, "")

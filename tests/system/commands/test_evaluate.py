@@ -135,9 +135,9 @@ def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tup
 STOPPED = {
     "evaluate": (
         "workers, on this computer",
-        "cases are done; the same command goes on with\n  --resume --out stopped",
+        "cases are done; the same command continues with\n  --resume --out stopped",
     ),
-    "optimize": ("keeps all trials", "the same command goes on with\n  --storage stopped.db"),
+    "optimize": ("keeps all trials", "the same command continues with\n  --storage stopped.db"),
     "train": ("generation 1:", "stopped/policy.onnx is the best policy until then, .* goes on with --resume"),
 }
 TYPED = {

@@ -53,7 +53,7 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost.type(LEFT)
                 wait_until(lambda: (intents.drain() or [NOTHING])[-1].heading_w_rad is not None, "a direction")
-                lost.shows("asked: +0.10 m/s")
+                lost.shows("requested: +0.10 m/s")
                 lost.process.send_signal(signal.SIGKILL)
                 wait_until(lambda: way.is_at(0.0, "expired"), "navigation to stop", 5.0)
             with at_the_keyboard(run, tmp_path) as left:
@@ -101,7 +101,7 @@ def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: Running, tmp_pat
     why, run = " waits for navigation's answer to tick ", in_lockstep
     with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
         operator.type(UP)
-        operator.shows("asked: +0.05 m/s")
+        operator.shows("requested: +0.05 m/s")
         states, found = session.reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
 
         def told() -> bool:

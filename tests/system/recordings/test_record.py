@@ -28,8 +28,8 @@ LONG = ["triplet", "--controller", "hold", "--duration", "30", "--clock-mode", "
 SHORT = ["triplet", "--duration", "5", "--seed", "7"]
 RATE_HZ = 50
 IN_ONE, LOCKED = ["--in-process"], "mount -o remount,ro ."
-FULL = "No space left on device; the run goes on"
-READ_ONLY = "Read-only file system; the run goes on, but nothing of it is recorded"
+FULL = "No space left on device; the run continues"
+READ_ONLY = "Read-only file system; the run continues, but nothing of it is recorded"
 
 
 def handles(pid: int, number: signal.Signals) -> bool:

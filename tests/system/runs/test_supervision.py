@@ -115,7 +115,7 @@ def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -
             robot.reaches("armed")
         summary = interrupt(run)
     assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
-    assert summary.ended == "interrupted" and "go on with `snakesim robot reset`" in run.said()
+    assert summary.ended == "interrupted" and "continue with `snakesim robot reset`" in run.said()
 
 
 @pytest.mark.slow  # a row of the fault table

@@ -70,7 +70,7 @@ def test_run_without_pose_sensor_uses_joints_or_dead_reckoning(
     assert ended.code == 0 and summary.pose_from is None, ended.err
     ended, summary = run_to_summary(tmp_path / "pushed", *short)
     assert ended.code == 0 and summary.pose_from == "dead_reckoning" and summary.contacts_from == "sensor", ended.err
-    assert summary.path_distance_m is None and (summary.reckoned_distance_m or 0.0) > 0.03
+    assert summary.path_distance_m is None and (summary.dead_reckoned_distance_m or 0.0) > 0.03
     wrong = snakesim("run", *short, "--unset", "robot.sensors.contact", "--out", "wrong", cwd=tmp_path)
     assert wrong.code == 2 and "contact" in wrong.err and not (tmp_path / "wrong").exists()
 

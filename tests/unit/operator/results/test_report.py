@@ -16,10 +16,10 @@ from snakesim_operator.results.metrics.propulsion import find_propulsion_interva
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report.events import drawn_instants, find_events
-from snakesim_operator.results.report.instants import balanced_instants
+from snakesim_operator.results.report.events import drawn_snapshots, find_events
 from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
+from snakesim_operator.results.report.snapshots import balanced_snapshots
 from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.run_log import RunRecord
@@ -104,7 +104,7 @@ def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page
     assert [one.joint for one in found if one.joint is not None] == list(INTERVALS_S)
     assert found[0].words == "Start" and found[-1].words == "Stop"
     assert sum(one.words.startswith("Largest contact force") for one in found) == 1
-    drawn = drawn_instants(record, found)
+    drawn = drawn_snapshots(record, found)
     bodies = [nodes_xy_w(record, instant.row) for _, instant in drawn]
     assert all(np.abs(a - b).max() > 0.004 for a, b in itertools.combinations(bodies, 2))
     said = "; ".join(event.words for event, _ in drawn)
@@ -114,7 +114,7 @@ def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page
 
 
 def test_forces_balance_and_add_up_to_the_commanded_one(record: RunRecord) -> None:
-    found = balanced_instants(record)
+    found = balanced_snapshots(record)
     assert len(found) > 50
     for one in found:
         assert one.balance is not None and one.balance.gap_n < 1e-9
@@ -127,7 +127,7 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     figure = r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>'
     polygons = re.findall(figure, page.html)
     lengths = [math.dist(*edge) for svg in polygons for edge in drawn_edges(svg, "commanded")]
-    drawn = drawn_instants(record, find_events(record, summarise(record, "complete")))
+    drawn = drawn_snapshots(record, find_events(record, summarise(record, "complete")))
     forces_n = [one.state.propulsion_n for _, one in drawn if one.balance is not None and one.state is not None]
     assert len(lengths) == len(polygons) == len(forces_n) > 2
     assert lengths == pytest.approx([lengths[0] / (forces_n[0] or 0) * (force_n or 0) for force_n in forces_n], abs=0.5)
@@ -139,11 +139,11 @@ def test_report_force_without_contact_is_drawn_as_requested(page: Reader, record
     clear = changed(record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds])
     pages = page, read(clear)
     kinds = [{kind for frame in one.film["frames"] for kind in frame[8]} for one in pages]
-    assert {"solved", "resultant", "solved asked", "resultant asked"} == kinds[0]
-    assert {"solved asked", "resultant asked"} == kinds[1]
+    assert {"solved", "resultant", "solved unmeasured", "resultant unmeasured"} == kinds[0]
+    assert {"solved unmeasured", "resultant unmeasured"} == kinds[1]
     drawings = re.findall(DRAWING, pages[1].html)
     classes = {found for svg in drawings for found in re.findall(r'class="((?:solved|resultant)[^"]*)"', svg)}
-    assert {"solved asked shaft", "solved asked head", "resultant asked shaft"} <= classes
+    assert {"solved unmeasured shaft", "solved unmeasured head", "resultant unmeasured shaft"} <= classes
     assert not {"solved shaft", "solved head", "resultant shaft", "resultant head"} & classes
     assert "desired, but no contact was measured there" in pages[1].text
 
@@ -180,7 +180,7 @@ def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
         msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n]) for one in record.control
     ]
     wrong = changed(record, control=more)
-    assert balanced_instants(wrong) == [] and "whose forces balance" in read(wrong).text
+    assert balanced_snapshots(wrong) == [] and "whose forces balance" in read(wrong).text
 
 
 def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page: Reader) -> None:

@@ -356,7 +356,7 @@ def test_urdf_report_joint_without_motor_gets_none_from_neighbors(tmp_path: Path
 def test_urdf_report_lists_assumptions_for_all_zero_limits(tmp_path: Path) -> None:
     found = _edited(tmp_path, *[(f'effort="{effort}"', 'effort="0"') for effort in ("4.5", "4.6", "4.7")])
     assert {joint.limits.torque_nm for joint in found.robot.joint_table} == {7.0}, "as planar13"
-    said = "<limit effort> has 0: 7 N·m, from the robot given by --like, because no joint has a value"
+    said = "<limit effort> has 0: 7 N·m, from the robot of --like, because no joint has a value"
     places = [f"j{i + 1} (line {_line(f'4.{5 + i}')})" for i in range(3)]
     assert f"{said}: {', '.join(places)}" in found.assumed
 

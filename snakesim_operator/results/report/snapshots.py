@@ -1,4 +1,4 @@
-"""What is known of one instant of a run, and how the forces balance in it.
+"""A snapshot of a run at one time: what is known of it, and how the forces balance in it.
 
 The balance is the paper's equation (10), f_s + f_1 + f_2 + f_3 = 0, with f_s = -F t_1: the tether of the static
 model pulls the tail back along the tangent at o_1. So the contact forces add up to -f_s, and that sum, the resultant
@@ -60,7 +60,7 @@ class Balance:
     def force_classes(self, measured: list[WorldContact]) -> tuple[list[str], str]:
         """Return the CSS classes of each contact force, and of the resultant.
 
-        A force is drawn as "asked" if no contact was measured there, the resultant if that holds for any of them.
+        A force is drawn as "unmeasured" if no contact was measured there, the resultant if that holds for any of them.
         """
         contact_classes: list[str] = []
         all_measured = True
@@ -68,13 +68,13 @@ class Balance:
             if is_measured(contact, measured):
                 contact_classes.append("solved")
             else:
-                contact_classes.append("solved asked")
+                contact_classes.append("solved unmeasured")
                 all_measured = False
-        return contact_classes, "resultant" if all_measured else "resultant asked"
+        return contact_classes, "resultant" if all_measured else "resultant unmeasured"
 
 
 @dataclass(frozen=True)
-class Instant:
+class Snapshot:
     """One moment of a run."""
 
     time_s: float  # on the time axis
@@ -106,7 +106,7 @@ def balance_of(state: ControlState) -> Balance | None:
     )
 
 
-def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Instant]:
+def balanced_snapshots(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Snapshot]:
     """Return the moments of locomotion whose solved forces balance, in order of time.
 
     Args:
@@ -116,7 +116,7 @@ def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = ma
     """
     if not len(record.time_s):
         return []
-    instants: list[Instant] = []
+    snapshots: list[Snapshot] = []
     for state in record.control:
         at_s = reported_at_s(record, state)
         if not begin_s <= at_s <= end_s or state.propulsion_joint is None or state.state != "Locomoting":
@@ -124,10 +124,10 @@ def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = ma
         balance = balance_of(state)
         if balance is None or not _is_balanced(balance):
             continue
-        instant = _make_instant(record, at_s, state, balance)
-        if record.nodes_w(instant.row) is not None:
-            instants.append(instant)
-    return instants
+        snapshot = _make_snapshot(record, at_s, state, balance)
+        if record.nodes_w(snapshot.row) is not None:
+            snapshots.append(snapshot)
+    return snapshots
 
 
 def _is_balanced(balance: Balance) -> bool:
@@ -135,36 +135,36 @@ def _is_balanced(balance: Balance) -> bool:
     return not (balance.gap_n > MAX_GAP_FRACTION * balance.commanded_n or min(balance.size_n) <= 0)
 
 
-def instant_at(record: RunRecord, time_s: float) -> Instant | None:
+def find_snapshot(record: RunRecord, time_s: float) -> Snapshot | None:
     """Return a moment without solved forces, or None if the pose is unknown then."""
     row = record.row_at(float(record.time_s[0]) + time_s)
     if record.nodes_w(row) is None:
         return None
     earlier = [state for state in record.control if reported_at_s(record, state) <= time_s]
     last_state = earlier[-1] if earlier else None
-    return _make_instant(record, time_s, last_state, None)
+    return _make_snapshot(record, time_s, last_state, None)
 
 
-def measured_along_n(instant: Instant, direction_w: Floats) -> float:
+def measured_along_n(snapshot: Snapshot, direction_w: Floats) -> float:
     """Return how much the measured contact forces push along a direction, (2,) of any length."""
     unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
-    return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.measured_contacts)
+    return sum(float(np.dot(contact.force_w[:2], unit)) for contact in snapshot.measured_contacts)
 
 
-def count_unmeasured(instant: Instant) -> int:
+def count_unmeasured(snapshot: Snapshot) -> int:
     """Count the solved contacts at which no sensor measured a force."""
-    if instant.balance is None:
+    if snapshot.balance is None:
         return 0
-    return sum(not is_measured(contact, instant.measured_contacts) for contact in instant.balance.contacts)
+    return sum(not is_measured(contact, snapshot.measured_contacts) for contact in snapshot.balance.contacts)
 
 
-def _make_instant(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Instant:
+def _make_snapshot(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Snapshot:
     robot_time_s = float(record.time_s[0]) + time_s
     tolerance_s = SIMULTANEOUS_S if balance is not None else 3 * SIMULTANEOUS_S
     world = _find_world_near(record, robot_time_s, tolerance_s)
     names = [joint.name for joint in record.description.joints]
     propelling = state.propulsion_joint if state is not None else None
-    return Instant(
+    return Snapshot(
         time_s=time_s,
         row=record.row_at(robot_time_s),
         state=state,
