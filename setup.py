@@ -44,7 +44,7 @@ class WheelWithLibraries(bdist_wheel):
 
     def get_tag(self) -> tuple[str, str, str]:
         """Return the tags of the wheel's name: any Python 3, no ABI, and the platform."""
-        if not list(Path(self.bdist_dir).glob("snakesim_native/compiled/*.so")):
+        if not list(Path(self.bdist_dir or ".").glob("snakesim_native/compiled/*.so")):
             return super().get_tag()
         self.root_is_pure = False
         *_, platform = super().get_tag()

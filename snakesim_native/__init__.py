@@ -8,6 +8,12 @@
 Every library has a Python version of the same functions, with the same results to the last bit. SnakeSIM uses the
 Python version where no library can be loaded, for example because the computer has no C compiler.
 
-To add a C file, put it into the folder of a library. To add a library, make a folder and add a line in `libraries`.
+To add a C file, put it into the folder of a library. To add a library, make a folder and add it to `LIBRARIES`. Then:
+
+    from snakesim_native.libraries import LAWS
+    from snakesim_native.load import load
+
+    handle = load(LAWS).handle  # a ctypes.CDLL, or None: use the Python version
+
 This package imports nothing of SnakeSIM.
 """
