@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import mujoco
 import numpy as np
 
@@ -62,7 +63,7 @@ class SimBackend(Backend):
         Raises:
             ConfigError: the settings do not match the robot or the scene.
         """
-        self._description = describe_robot(
+        description = describe_robot(
             config.robot,
             backend=NAME,
             period_ns=config.period_ns,
@@ -78,6 +79,7 @@ class SimBackend(Backend):
 
         # Physics and motors, with the snake at rest.
         self._sim = build(config, settings)
+        self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)
         self._physics = Physics(self._sim, self._data)
