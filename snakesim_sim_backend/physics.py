@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import mujoco
 
-from snakesim_sim_backend.chain import Chain
-from snakesim_sim_backend.contact_friction import ContactFriction, count_numbers
-from snakesim_sim_backend.flat_ground import NUMBERS_PER_FOOT, FlatGround
-from snakesim_sim_backend.model import SimModel
-from snakesim_sim_backend.yielding import DOFS, Yielding
+from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.contact_friction import ContactFriction, count_numbers
+from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT, FlatGround
+from snakesim_sim_backend.laws.yielding import DOFS, Yielding
+from snakesim_sim_backend.model.build import SimModel
 
 AFTER_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 

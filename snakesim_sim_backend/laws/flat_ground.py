@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.chain import Chain
+from snakesim_sim_backend.laws.chain import Chain
 
 SINK_M = 2e-4  # how deep a foot sinks in under its share of the weight
 MAX_PHASE_RAD = 0.7  # the normal spring vibrates by at most this in one step; long steps get softer ground

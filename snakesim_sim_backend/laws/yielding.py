@@ -20,7 +20,7 @@ import numpy as np
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_sim_backend.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
+from snakesim_sim_backend.laws.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
 
 JOINT_OF_AXIS = {
     "x": mujoco.mjtJoint.mjJNT_SLIDE,

@@ -22,16 +22,16 @@ from snakesim_hal.model.scene import Placed
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
-from snakesim_sim_backend.chain import FREE_DOFS
-from snakesim_sim_backend.contact_friction import count_numbers
-from snakesim_sim_backend.flat_ground import NUMBERS_PER_FOOT, Feet, find_feet
-from snakesim_sim_backend.ground import add_ground
-from snakesim_sim_backend.imu import add_imus
-from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle, geom_name
+from snakesim_sim_backend.laws.chain import FREE_DOFS
+from snakesim_sim_backend.laws.contact_friction import count_numbers
+from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT, Feet, find_feet
+from snakesim_sim_backend.laws.yielding import DOFS, check_yielding
+from snakesim_sim_backend.model.ground import add_ground
+from snakesim_sim_backend.model.imu import add_imus
+from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, geom_name
+from snakesim_sim_backend.model.surface import ContactParameters, contact_parameters
+from snakesim_sim_backend.model.tether import add_tether
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.surface import ContactParameters, contact_parameters
-from snakesim_sim_backend.tether import add_tether
-from snakesim_sim_backend.yielding import DOFS, check_yielding
 
 FREE_QPOS = 7  # coordinates of the base: position and quaternion
 CLAMP_INERTIA = 1e6  # kg and kg·m²: more than the robot can move, in all six degrees of freedom

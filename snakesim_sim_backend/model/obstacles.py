@@ -9,9 +9,9 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scene import Placed
-from snakesim_sim_backend.ground import GROUND_GROUP, SAND
-from snakesim_sim_backend.surface import ContactParameters
-from snakesim_sim_backend.yielding import JOINT_OF_AXIS, compute_mass_kg
+from snakesim_sim_backend.laws.yielding import JOINT_OF_AXIS, compute_mass_kg
+from snakesim_sim_backend.model.ground import GROUND_GROUP, SAND
+from snakesim_sim_backend.model.surface import ContactParameters
 
 OBSTACLE = "obstacle:"  # prefix of the geom of an obstacle
 STEP = "step:"  # prefix of the geom of an obstacle that the snake may lie on

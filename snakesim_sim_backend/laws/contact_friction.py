@@ -24,7 +24,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.chain import Chain
+from snakesim_sim_backend.laws.chain import Chain
 
 # Numbers per contact in `userdata`: its key, the link's body, the other body, the mass that the spring has to follow in
 # kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, and the contact point in the frame of the
