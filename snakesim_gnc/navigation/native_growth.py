@@ -379,7 +379,7 @@ class NativeGrowth:
     def _fill_scratch(self, layout: _Layout, curvature_count: int) -> None:
         scratch = self._search.scratch
         arc_room = self._node_room * curvature_count
-        entry_room = 1 << (2 * arc_room - 1).bit_length()  # a power of two, at least twice arc_room
+        entry_room = 1 << (arc_room * 5 // 4).bit_length()  # a power of two; the table is at most 80 % full
         scratch.entry_room = entry_room
         scratch.stamp = 0
         scratch.arcs = self._provide(arc_room * layout.arc)

@@ -111,21 +111,22 @@ static bool steer(const Search* search, const LayerLimits* limits, const Node* p
     return true;
 }
 
-// Store an arc if it is the cheapest one in its cell; among equal ones the first. Return the number of stored arcs.
-static int64_t store_arc(Search* search, int64_t arc_count, const Arc* arc)
+// Keep the arc in row `arc_count` if it is the cheapest one in its cell; among equal ones, the first. Return the number
+// of kept arcs.
+static int64_t keep_cheapest(Search* search, int64_t arc_count)
 {
     const Parameters* parameters = &search->parameters;
-    Scratch* scratch = &search->scratch;
+    Arc* arcs = search->scratch.arcs;
+    const Arc* arc = &arcs[arc_count];
     int64_t cell =
         planner_number_cell(arc->x_m, arc->y_m, arc->heading_rad, parameters->cell_m, parameters->cell_rad);
-    CellEntry* entry = planner_find_entry(scratch, cell);
+    CellEntry* entry = planner_find_entry(&search->scratch, cell);
     if (entry->value == NEW_CELL) {
         entry->value = (int32_t)arc_count;
-        scratch->arcs[arc_count] = *arc;
         return arc_count + 1;
     }
-    if (arc->cost_m < scratch->arcs[entry->value].cost_m)
-        scratch->arcs[entry->value] = *arc;
+    if (arc->cost_m < arcs[entry->value].cost_m)
+        arcs[entry->value] = *arc;
     return arc_count;
 }
 
@@ -160,11 +161,11 @@ int64_t planner_grow_arcs(Search* search, const LayerLimits* limits)
         double cosine = cos(parent->heading_rad);
         double sine = sin(parent->heading_rad);
         for (int64_t k = 0; k < search->arc_table.count; k++) {
-            Arc arc;
-            arc.parent = row;
-            arc.curvature = k;
-            if (steer(search, limits, parent, cosine, sine, &arc))
-                arc_count = store_arc(search, arc_count, &arc);
+            Arc* arc = &search->scratch.arcs[arc_count];
+            arc->parent = row;
+            arc->curvature = k;
+            if (steer(search, limits, parent, cosine, sine, arc))
+                arc_count = keep_cheapest(search, arc_count);
         }
     }
     return arc_count;

@@ -22,7 +22,7 @@ int64_t planner_number_cell(double x_m, double y_m, double heading_rad, double s
 // An entry counts only with the newest stamp, so a new stamp empties the table.
 void planner_clear_cells(Scratch* scratch) { scratch->stamp += 1; }
 
-// The table is at most half full, so the loop ends at the cell's entry or at an empty one.
+// The table is never full, so the loop ends at the cell's entry or at an empty one.
 CellEntry* planner_find_entry(Scratch* scratch, int64_t cell)
 {
     uint64_t mask = (uint64_t)scratch->entry_room - 1;

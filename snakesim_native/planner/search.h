@@ -200,7 +200,7 @@ typedef struct {
 
 // Memory for the work on one layer.
 typedef struct {
-    int64_t entry_room; // a power of two, at least 2 * node_room * c
+    int64_t entry_room;    // a power of two, more than 5/4 of node_room * c
     int32_t stamp;         // of the newest use of the hash table
     Arc* arcs;             // (node_room * c)
     SortKey* keys;         // (node_room * c)
