@@ -142,7 +142,7 @@ class _Library:
 
 
 @cache
-def _load_library() -> _Library | None:
+def load_library() -> _Library | None:
     """Return the C library; None if it is not installed here.
 
     Raises:
@@ -167,7 +167,7 @@ def _load_library() -> _Library | None:
 
 def is_native_available() -> bool:
     """Return whether the C library can be loaded here."""
-    return _load_library() is not None
+    return load_library() is not None
 
 
 class NativeGrowth:
@@ -188,7 +188,7 @@ class NativeGrowth:
         Raises:
             NativeGrowthError: the C library is not installed, or an array has another size than it must have.
         """
-        library = _load_library()
+        library = load_library()
         if library is None:
             raise NativeGrowthError(f"there is no C library of the planner: {load(PLANNER).problem}")
         self._expand = library.expand
