@@ -1,6 +1,7 @@
 """The parts of SnakeSIM that are written in C, and their compilation.
 
 `laws/`      ground, friction and yielding obstacles, as a plugin of MuJoCo's engine
+`planner/`   the beam search of the path planner
 `libraries`  names the libraries; a folder of C files is one library
 `compile`    compiles them: `python -m snakesim_native.compile`
 `load`       finds the compiled library and loads it; compiles it first if its sources have changed

@@ -41,7 +41,12 @@ LAWS = NativeLibrary(
     uses_mujoco=True,
     python_cost="a physics step takes about three times as long",
 )
-LIBRARIES = (LAWS,)
+PLANNER = NativeLibrary(
+    name="planner",
+    uses_mujoco=False,
+    python_cost="a search of the path planner takes about eight times as long",
+)
+LIBRARIES = (LAWS, PLANNER)
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,43 @@ def test_projection_is_the_nearest_point(route: Route, x: float, y: float) -> No
     assert found <= float(np.hypot(*(tried - [x, y]).T).min()) + 1e-9
 
 
+def project_by_measuring_all(route: Route, point_w: Floats, first: int, last: int) -> float:
+    """Measure every segment from `first` to before `last`. Returns what `Route.project` must return, bit for bit."""
+    lengths = np.hypot(*np.diff(route.points_w, axis=0).T)
+    s_m = np.concatenate(([0.0], np.cumsum(lengths)))
+    starts = route.points_w[first:last]
+    directions = np.diff(route.points_w, axis=0)[first:last] / lengths[first:last, None]
+    along = np.einsum("ij,ij->i", point_w - starts, directions)
+    low = np.zeros(last - first)
+    high = np.diff(s_m[first : last + 1])
+    if first == 0:
+        low[0] = -np.inf
+    if last == len(lengths):
+        high[-1] = np.inf
+    along = np.clip(along, low, high)
+    gaps = starts + along[:, None] * directions - point_w
+    nearest = int(np.argmin(np.einsum("ij,ij->i", gaps, gaps)))
+    return float(s_m[first + nearest] + along[nearest])
+
+
+@given(
+    seed=st.integers(0, 2**31), count=st.sampled_from([1, 2, 5, 17, 300]), spread_m=st.sampled_from([0.02, 1.0, 50.0])
+)
+def test_projection_has_the_bits_of_measuring_every_segment(seed: int, count: int, spread_m: float) -> None:
+    """Random walks that cross themselves, points on them and far away, with and without a window."""
+    random = np.random.default_rng(seed)
+    headings_rad = np.cumsum(random.normal(0.0, random.choice([0.05, 1.0]), count))
+    steps = random.uniform(0.002, 0.05, count)[:, None] * np.column_stack([np.cos(headings_rad), np.sin(headings_rad)])
+    route = Route(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
+    for _ in range(8):
+        place_w = route.points_w[random.integers(len(route.points_w))]
+        point_w = place_w + random.normal(0.0, spread_m, 2) * random.integers(2)
+        assert route.project(point_w) == project_by_measuring_all(route, point_w, 0, count)
+        near_s_m = float(random.uniform(-1.0, route.length_m + 1.0))
+        first, last = route._segments_near(near_s_m, 0.3)
+        assert route.project(point_w, near_s_m, 0.3) == project_by_measuring_all(route, point_w, first, last)
+
+
 def test_projection_near_a_place_stays_on_its_branch() -> None:
     """A hairpin: the nearest point of all is on the other leg, but the snake is on this one."""
     route = Route([(0, 0), (2, 0), (2, 0.2), (0, 0.2)])
