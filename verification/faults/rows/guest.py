@@ -106,7 +106,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
 
 
 def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
-    """Whether every module had a setpoint within the last three periods, and nobody had been told to stop."""
+    """Return whether every module had a setpoint within the last three periods, and none had a stop command."""
     recent_ns = now_ns - round(3e9 / RATE_HZ)
     driven = {parse_node(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
     return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
