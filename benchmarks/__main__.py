@@ -25,7 +25,7 @@ LISTED_PACKAGES = 6  # the largest ones of each installation
 
 
 class Results:
-    """The lines of the report: printed as soon as they are known, and kept for the file."""
+    """The lines of the report: printed as soon as they are known, and collected for the file."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []

@@ -264,7 +264,7 @@ def decode_parameters(
     return decode(Table(section, source, origin or {}), controller.Parameters, where)
 
 
-def motion_wanted(observation: Observation) -> bool:
+def is_motion_requested(observation: Observation) -> bool:
     """Return whether there is a path, a speed along it, and a world to move in; without them a controller holds."""
     return (
         observation.world is not None and observation.trajectory is not None and observation.trajectory.speed_m_s != 0.0

@@ -67,7 +67,7 @@ def film(
     """Film a record.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         out: The film, an .mp4 or .gif file.
         size: Width and height in pixels.
         fps: Pictures a second.

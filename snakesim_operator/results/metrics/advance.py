@@ -30,7 +30,7 @@ class Advance:
     head_w: Floats  # (m, 2)
 
     @staticmethod
-    def of(record: RunRecord) -> "Advance | None":
+    def from_run(record: RunRecord) -> "Advance | None":
         """Sample a run, or return None if its pose is never known."""
         posed_rows = np.flatnonzero(record.posed)
         if len(posed_rows) < 2:

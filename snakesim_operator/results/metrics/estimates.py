@@ -21,7 +21,7 @@ class Estimates:
     dead_reckoning_error_m: float | None = None
 
     @staticmethod
-    def of(record: RunRecord) -> "Estimates":
+    def from_run(record: RunRecord) -> "Estimates":
         """Return the estimates of a run. Distances are known only where the pose was estimated by dead reckoning."""
         if not record.worlds or len(record.time_s) == 0:
             return Estimates()

@@ -19,7 +19,7 @@ def over_can(*sets: str) -> Result:
 def test_clutter_run_over_can_continues_without_lost_joint() -> None:
     reported = over_can("duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
     assert reported.summary.ended == "complete" and list(reported.record.host.isolated) == ["joint_7"]
-    advance = Advance.of(reported.record)
+    advance = Advance.from_run(reported.record)
     assert advance is not None
     before_m = float(np.interp(LOST_S, advance.time_s, advance.along_m))
     assert before_m > 0.4, "it moved before"

@@ -104,7 +104,7 @@ def test_names_that_no_file_has() -> None:
     with raises_error(ConfigError, code="config/unknown-name"):
         find_file("x" * 5000, "scenarios")
     with raises_error(ConfigError, code="config/unknown-key"):
-        Table({"a": [1]}, "x").put("a.²", 1, "--set")
+        Table({"a": [1]}, "x").set_value("a.²", 1, "--set")
 
 
 def test_a_router_file_that_would_overflow_zenoh(tmp_path: Path) -> None:

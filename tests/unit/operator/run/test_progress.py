@@ -13,7 +13,7 @@ def at(tick: int, lifecycle: LifecycleState = "armed") -> Status:
 
 def shown(progress: Progress, found: Status, capsys: pytest.CaptureFixture[str]) -> str:
     progress._next = 0.0  # pyright: ignore[reportPrivateUsage] - as if it were time to
-    progress.show(found, None, armed=True)
+    progress.update(found, None, armed=True)
     return capsys.readouterr().out.strip() or progress._last.strip()  # pyright: ignore[reportPrivateUsage]
 
 
