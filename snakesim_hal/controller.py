@@ -117,6 +117,7 @@ class Controller(ABC, Generic[ParametersT]):
         class SwingParameters(snakesim.Parameters, frozen=True):
             amplitude_rad: float = 0.2
 
+
         class Swing(snakesim.Controller[SwingParameters]):
             Parameters = SwingParameters
             needs_world = False
