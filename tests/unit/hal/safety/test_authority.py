@@ -15,7 +15,6 @@ from snakesim_testing.hal.authority_rig import (
     CLEAR,
     DISARM,
     ESTOP,
-    FINISH,
     JOINTS,
     Rig,
     armed,
@@ -206,6 +205,21 @@ def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
     assert rig.authority.reason == "control is gone"
 
 
+def test_decision_before_any_input_is_passive() -> None:
+    rig = Rig()
+    assert rig.send(0.1) == "no_lease"
+    assert modes(rig.authority.decide()) == {Mode.PASSIVE}
+
+
+def test_decision_in_lockstep_uses_the_command_of_its_tick() -> None:
+    rig = armed()
+    rig.send(0.11, tick=0)
+    rig.tick = 1
+    rig.send(0.12, tick=1)
+    assert rig.authority.decide(0).setpoints.target == pytest.approx([0.11] * JOINTS)
+    assert rig.authority.decide(1).setpoints.target == pytest.approx([0.12] * JOINTS)
+
+
 def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
     """The pose at arming would be a jump that no limiter has limited."""
     rig = armed()
@@ -287,17 +301,11 @@ def test_faults_of_a_full_log_include_the_first_stop(stop: str) -> None:
             rig.authority.on_estop(ESTOP, 16)
             rig.authority.on_estop(ESTOP, 17)
     rig.authority.fault(Fault(tick=18, what="hot", cause="hot"))
-    for tick in range(19, 100):
+    for tick in range(19, 60):
         rig.authority.fault(Fault(tick=tick, what="late", cause="late", reach="none"))
+    for tick in range(60, 100):
+        rig.authority.record_fault(Fault(tick=tick, what="late", cause="late"))
     assert [fault.tick for fault in rig.authority.faults][:17] == [*range(17)]
-
-
-def test_finish_while_armed_disarms() -> None:
-    rig = armed()
-    answer = rig.authority.on_lifecycle(FINISH, rig.now_ns)
-    assert answer.ok
-    assert answer.lifecycle == "disarmed"
-    assert answer.reason.startswith("finished by")
 
 
 def test_faults_since_start_survive_a_reset() -> None:

@@ -366,6 +366,7 @@ class Everything(Model):
         self.leave_for("estop")
         self.note_fault()
         self.check(answer, True)
+        assert self.authority.faults[-1] == Fault(tick=self.tick, what="estop", cause=f"emergency stop by {who}")
 
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
@@ -384,7 +385,10 @@ class Everything(Model):
     def record_fault(self, precedes_stop: bool) -> None:
         """A fault that is only recorded, so that it is not taken for the reason of a stop."""
         fault = Fault(tick=self.tick, what="service_lost", cause="guidance is gone", reach="robot")
-        self.authority.record_fault(fault, precedes_stop=precedes_stop)
+        if precedes_stop:
+            self.authority.record_fault(fault, precedes_stop=True)
+        else:
+            self.authority.record_fault(fault)
         self.note_fault()
         assert self.authority.faults[-1].reach == ("robot" if precedes_stop else "none")
 
@@ -438,6 +442,25 @@ class Everything(Model):
             self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0, 0, later_ns)
             self.send_commands(wanted, mode, torque_limit, False, set(), False, 0, 0, 1)
             self.end_a_tick(PERIOD_NS)
+
+    @precondition(lambda self: self.state == "armed")
+    @rule(passes_ns=TIMES_NS)
+    def renew_while_armed(self, passes_ns: int) -> None:
+        """While armed only commands renew the lease."""
+        self.now_ns += passes_ns
+        self.ask_for_the_lease(str(self.holder), "renew", 100, 0)
+
+    @precondition(lambda self: self.state == "armed")
+    @rule()
+    def finish_while_armed(self) -> None:
+        self.ask_for_less("finish")
+
+    @precondition(lambda self: self.state == "armed" and self.live)
+    @rule(later=st.integers(0, 1))
+    def send_for_the_arm_session_before(self, later: int) -> None:
+        """Only a command that answers a state after the arming counts as rejected."""
+        back = self.tick - self.armed_tick - later
+        self.send_commands([0.0] * JOINTS, [Mode.POSITION] * JOINTS, None, False, set(), False, -1, max(back, 0), 1)
 
     # --- time, and what goes out -------------------------------------------------------------------------------
 
