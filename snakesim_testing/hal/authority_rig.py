@@ -65,7 +65,8 @@ def commanded(target: Any = 0.1, mode: Any = Mode.POSITION, **robot: Any) -> Rig
     """Not armed yet: its joints are at 0.1 rad, and a holder of the lease commands it."""
     rig = Rig(**robot)
     rig.observe(0.1)
-    assert rig.acquire().ok and rig.send(target, mode) is None
+    assert rig.acquire().ok
+    assert rig.send(target, mode) is None
     return rig
 
 

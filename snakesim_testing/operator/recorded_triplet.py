@@ -115,7 +115,8 @@ def read(record: RunRecord, ended: str = "complete") -> Reader:
     assert not re.search(r"\b(None|nan|inf)\b", reader.text)
     assert not [a for a in reader.attributes if a[1] in ("src", "href")]
     ours = page.replace(PLOTLY, "")
-    assert len(ours) < len(page) and not re.search(r"@import|url\(|https?://", ours.replace(SVG_NAMESPACE, ""))
+    assert len(ours) < len(page)
+    assert not re.search(r"@import|url\(|https?://", ours.replace(SVG_NAMESPACE, ""))
     return reader
 
 

@@ -58,9 +58,11 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
                 pose_rad[joint] += 0.3
                 hold(home, pose_rad)
                 assert ("the other way round" if SIGN[joint] < 0 else "matches the file") in line(process)
-            assert "1 joints changed" in line(process) and process.wait(20) == 0
+            assert "1 joints changed" in line(process)
+            assert process.wait(20) == 0
         stale = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
-        assert stale.code == 2 and "restart the host with this file" in stale.err
+        assert stale.code == 2
+        assert "restart the host with this file" in stale.err
     hold(home, [0.0] * JOINTS)
     with host(home, BACKEND) as endpoint:
         with told(home, endpoint, "limits", "snake.toml", "joint_1") as process:
@@ -73,7 +75,8 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
         with told(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
             assert line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
             hold(home, [1.2, 0.4, np.pi / 4, 0.0])
-            assert "45 of 45 degrees: matches the file" in line(process) and process.wait(20) == 0
+            assert "45 of 45 degrees: matches the file" in line(process)
+            assert process.wait(20) == 0
         hold(home, [0.0] * JOINTS)
         seen(home, endpoint, ZERO_RAD[0])
         assert snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0
@@ -83,7 +86,8 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
     ends = found[0].limits
     assert (ends.lower_rad, ends.upper_rad) == pytest.approx((-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3)
     text = (home / "snake.toml").read_text()
-    assert "# paper, section IV-A" in text and "sign = -1 # turned by hand, " in text
+    assert "# paper, section IV-A" in text
+    assert "sign = -1 # turned by hand, " in text
 
 
 def swapped(home: Path, endpoint: str) -> str:

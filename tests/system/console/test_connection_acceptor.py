@@ -79,7 +79,8 @@ def test_acceptor_closes_oldest_incomplete_request_and_answers_a_stop() -> None:
         opened = [stack.enter_context(at.send(HALF[number % len(HALF)])) for number in range(3 * FEW.waiting)]
         wait_until(lambda: sum(map(is_closed, opened)) == 2 * FEW.waiting, "the oldest ones closed", 5.0)
         assert not is_closed(opened[-1])
-        assert at.ask("POST") == (200, "stopped") and stop.requesters == ["a page's second stop"]
+        assert at.ask("POST") == (200, "stopped")
+        assert stop.requesters == ["a page's second stop"]
         assert at.ask("GET") == (200, "ready")
 
 
@@ -101,7 +102,8 @@ def test_acceptor_forwards_only_complete_requests_up_to_limit() -> None:
         wait_until(accept, "the pages", 5.0)
         assert served[0].recv(1000) == COMPLETE
         refused = stack.enter_context(at.send(COMPLETE))
-        assert refused.recv(1000).startswith(b"HTTP/1.1 503") and at.ask("GET") == (200, "ready")
+        assert refused.recv(1000).startswith(b"HTTP/1.1 503")
+        assert at.ask("GET") == (200, "ready")
         served.pop().close()
         stack.enter_context(at.send(COMPLETE))
         wait_until(accept, "a page in the place of one that was closed", 5.0)
@@ -178,8 +180,10 @@ def test_acceptor_limits_each_user_to_leave_room_for_others() -> None:
     assert [waiting.add(f"flood {number}", 1, number) for number in range(6)] == 4 * [None] + ["flood 0", "flood 1"]
     assert [waiting.add(name, 2, 10.0) for name in ("a", "b")] == [None, None]
     assert waiting.add("c", 2, 11.0) == "flood 2", "of the user who has most"
-    assert waiting.list_older_than(5.0) == ["flood 3", "flood 4"] and waiting.oldest(2) == "a"
-    assert waiting.remove("a") == 2 and len(waiting) == 5
+    assert waiting.list_older_than(5.0) == ["flood 3", "flood 4"]
+    assert waiting.oldest(2) == "a"
+    assert waiting.remove("a") == 2
+    assert len(waiting) == 5
 
 
 def test_pages_are_limited_in_all_and_for_each_user() -> None:
@@ -194,7 +198,8 @@ def test_pages_are_limited_in_all_and_for_each_user() -> None:
 def test_limits_leave_files_for_everything_else(files: int) -> None:
     limits = choose_limits(files, files - 40)
     taken = limits.waiting + limits.pages + limits.asking
-    assert taken <= max(files - 40 - 64, files // 8) and limits.waiting_of_user < limits.waiting
+    assert taken <= max(files - 40 - 64, files // 8)
+    assert limits.waiting_of_user < limits.waiting
     assert limits == ConnectionLimits() or files < 1024
 
 

@@ -38,7 +38,9 @@ def test_drives_mounted_reversed_move_the_robot_equally(backend: str, others: li
     in_truth = [f"backend.mounted.{text}" for text in built]
     declared = run(*in_truth, *(f"robot.joints.{text}" for text in built))
     undeclared = run(*in_truth)
-    assert nominal.path_distance_m and nominal.peak_joint_torque_nm and undeclared.peak_joint_torque_nm
+    assert nominal.path_distance_m
+    assert nominal.peak_joint_torque_nm
+    assert undeclared.peak_joint_torque_nm
     assert declared.path_distance_m == pytest.approx(nominal.path_distance_m, rel=0.05)
     assert undeclared.peak_joint_torque_nm > 1.5 * nominal.peak_joint_torque_nm, "it shows at once"
 
@@ -49,7 +51,8 @@ def test_every_second_module_reversed_and_declared_is_the_same_run(plain: RunSum
     assert declared.path_distance_m == plain.path_distance_m
     in_truth = [f"backend.mounted.{joint}.sign=-1" for joint in EVERY_SECOND]
     undeclared = ran(*in_truth)
-    assert plain.path_distance_m and undeclared.path_distance_m
+    assert plain.path_distance_m
+    assert undeclared.path_distance_m
     assert undeclared.path_distance_m < 0.6 * plain.path_distance_m, "it shows at once"
     believed = ran(
         *(f"robot.joints.{joint}.sign=-1" for joint in EVERY_SECOND),

@@ -100,7 +100,8 @@ def test_body_on_path_repeated_pose_is_not_standing_still():
         located = progress.update(
             stage.observe(tick, 0.3 + 0.2 * tick * PERIOD_S, world_tail_s_m=0.3 + 0.2 * 0.58, pose_age_ticks=tick - 58)
         )
-        assert isinstance(located, Located) and located.fresh
+        assert isinstance(located, Located)
+        assert located.fresh
         assert located.speed_m_s == pytest.approx(0.2, abs=0.01)
         assert located.tail_s_m == pytest.approx(0.3 + 0.2 * tick * PERIOD_S, abs=2e-3)
 
@@ -111,8 +112,10 @@ def test_body_on_path_lost_body_is_located_again():
     for tick in range(61, 161):
         progress.update(stage.observe(tick, 0.5, without="world"))
     found = progress.update(stage.observe(161, 0.55))
-    assert isinstance(found, Located) and found.restarted
-    assert found.tail_s_m == pytest.approx(0.55, abs=2e-3) and found.speed_m_s == 0.0
+    assert isinstance(found, Located)
+    assert found.restarted
+    assert found.tail_s_m == pytest.approx(0.55, abs=2e-3)
+    assert found.speed_m_s == 0.0
 
 
 def test_a_new_path_is_noticed():

@@ -162,7 +162,8 @@ def test_triplet_standing_still_is_reported_and_jam_released():
             jams.append(report.reason)
             pushed += report.propulsion_joint is not None
             released += report.propulsion_joint is None
-    assert jams[0].startswith("jammed: standing still") and jams[0].endswith("peg_2 most")
+    assert jams[0].startswith("jammed: standing still")
+    assert jams[0].endswith("peg_2 most")
     assert pushed
     assert released
     moved = stay(controller, stage, 3)

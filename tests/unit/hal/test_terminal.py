@@ -31,7 +31,8 @@ def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
 def test_a_json_text_that_is_printed_stays_one(text: str) -> None:
     value = {text: [text]}
     shown = escape_invisible(json.dumps(value, ensure_ascii=False))
-    assert json.loads(shown) == value and "\n" not in shown
+    assert json.loads(shown) == value
+    assert "\n" not in shown
 
 
 def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,7 +54,9 @@ def test_there_are_few_words_to_begin_with() -> None:
 @pytest.mark.parametrize("name", LEAVES)
 def test_each_command_has_help_and_two_examples_that_parse(name: str) -> None:
     leaf = LEAVES[name]
-    assert leaf.description and leaf.description.endswith(".") and leaf.epilog
+    assert leaf.description
+    assert leaf.description.endswith(".")
+    assert leaf.epilog
     _, _, examples = leaf.epilog.rpartition("examples:\n")
     lines = [line.strip() for line in examples.splitlines()]
     assert len(lines) == 2 and len(set(lines)) == 2, lines
@@ -131,4 +133,5 @@ def test_command_without_noun_is_reported_and_others_work(
         parser = MainParser()
         parser.add_installed()
     assert "no Noun 'arm_rest' is registered" in capsys.readouterr().err
-    assert isinstance(parser, CommandParser) and parser.has_command(["robot", "check"])
+    assert isinstance(parser, CommandParser)
+    assert parser.has_command(["robot", "check"])

@@ -129,7 +129,10 @@ def test_without_torque_it_stays_where_it_lies():
     assert physics_model.angle_rad == pytest.approx(angles, abs=1e-4)
     assert after.position_w == pytest.approx(before.position_w, abs=1e-4)
     assert np.abs(physics_model.velocity_rad_s).max() < 1e-4
-    assert (before.tick, before.timestamp_ns, after.tick, after.timestamp_ns) == (0, 0, 0, 10**9)
+    assert before.tick == 0
+    assert before.timestamp_ns == 0
+    assert after.tick == 0
+    assert after.timestamp_ns == 10**9
 
 
 # --- torques ------------------------------------------------------------------------------------------------------
@@ -217,7 +220,8 @@ def test_contact_forces_without_contact_or_imus_are_zero():
     physics_model = make_physics_model(make_config({"sensors!": {"joints": {}}}))
     assert physics_model.loads() == []
     pass_time(physics_model)
-    assert physics_model.loads() == [] and physics_model.imu() is None
+    assert physics_model.loads() == []
+    assert physics_model.imu() is None
 
 
 def test_motor_between_three_pegs_measures_their_moment():
@@ -230,7 +234,9 @@ def test_motor_between_three_pegs_measures_their_moment():
     for k in range(500):
         firmware.drive(physics_model, np.array([0.0, 0.0, -min(k * 1e-4, 0.03), 0.0, 0.0, 0.0]))
     tail, middle, head = physics_model.loads()
-    assert (tail.link, middle.link, head.link) == (0, 2, 6)
+    assert tail.link == 0
+    assert middle.link == 2
+    assert head.link == 6
     assert middle.force_l[1] < -1.0 < 1.0 < min(tail.force_l[1], head.force_l[1])
     assert tail.position_l[1] < 0.0 < middle.position_l[1]
     assert np.abs(physics_model.velocity_rad_s).max() < 0.02  # it is being squeezed out forwards, slowly

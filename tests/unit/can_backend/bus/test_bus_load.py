@@ -135,8 +135,10 @@ def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> Non
     if buses > joints:
         return
     found = joints_per_bus(run_of(joints), CanSettings(channels=channels(buses)))
-    assert sum(found) == joints and len(found) == max(buses, 1)
-    assert max(found) - min(found) <= 1 and found == sorted(found, reverse=True)
+    assert sum(found) == joints
+    assert len(found) == max(buses, 1)
+    assert max(found) - min(found) <= 1
+    assert found == sorted(found, reverse=True)
 
 
 def test_given_shares_are_kept() -> None:
@@ -194,7 +196,8 @@ def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[
 def test_fewer_forces_are_suggested_when_that_is_enough() -> None:
     config, settings = run_of(13, 190.0), CanSettings(contact_rate_hz=190.0)
     text = refusal(config, settings)
-    assert text is not None and "backends.can.contact_rate_hz = 47.5" in text
+    assert text is not None
+    assert "backends.can.contact_rate_hz = 47.5" in text
 
 
 @given(
@@ -237,5 +240,7 @@ def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
 
 def test_a_bus_that_nothing_helps() -> None:
     text = refusal(run_of(LAST_NODE, 5000.0), CanSettings(channels=channels(8)))
-    assert text is not None and "rate_hz = " in text  # slower always helps
-    assert "channels with" not in text and "contact_rate_hz" not in text
+    assert text is not None
+    assert "rate_hz = " in text  # slower always helps
+    assert "channels with" not in text
+    assert "contact_rate_hz" not in text

@@ -73,7 +73,9 @@ def test_every_value_comes_back_within_half_a_step(
     layout, signal = of
     value = data.draw(st.floats(signal.low, signal.high))
     frame = layout.encode(node, **{signal.name: value})
-    assert (parse_opcode(frame.id), parse_node(frame.id), len(frame.data)) == (layout.opcode, node, layout.length)
+    assert parse_opcode(frame.id) == layout.opcode
+    assert parse_node(frame.id) == node
+    assert len(frame.data) == layout.length
     assert abs(layout.decode(frame.data)[signal.name] - value) <= slack(signal, value)
 
 
@@ -137,7 +139,8 @@ def test_a_writer_writes_what_a_reader_reads(layout: MessageLayout, data: st.Dat
     frame = layout.make_writer(*names)(node, [numbers[name] for name in names])
     assert layout.make_reader(*names)(frame.data) == tuple(numbers[name] for name in names)
     if layout.opcode in WITH_CHECKSUM:
-        assert has_valid_checksum(frame) and frame.data[-1] == checksum(frame.id, frame.data[:-1])
+        assert has_valid_checksum(frame)
+        assert frame.data[-1] == checksum(frame.id, frame.data[:-1])
 
 
 @each_layout

@@ -86,7 +86,8 @@ def test_checksum_is_last_byte_of_messages_that_have_one() -> None:
         assert ("checksum" in layout.signals) == (opcode in WITH_CHECKSUM)
         if opcode in WITH_CHECKSUM:
             signal = layout.signals["checksum"]
-            assert (signal.shift, signal.bits) == (8 * layout.length - 8, 8)
+            assert signal.shift == 8 * layout.length - 8
+            assert signal.bits == 8
 
 
 def test_signals_of_a_message_overlap_only_for_setpoint_targets() -> None:

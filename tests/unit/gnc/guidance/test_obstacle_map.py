@@ -39,7 +39,9 @@ def test_what_is_seen_again_and_again_is_believed_more():
     once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
     reported = only(often)
     assert only(once).confidence < 0.65
-    assert reported.confidence > 0.9 and reported.last_seen_ns == 5 * S // 20 and not reported.felt
+    assert reported.confidence > 0.9
+    assert reported.last_seen_ns == 5 * S // 20
+    assert not reported.felt
     assert only(often, now_ns=120 * S).confidence < reported.confidence  # belief fades
 
 
@@ -50,7 +52,9 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     for angle in angles:
         touch(map_, (0.5, 0.2), radius, angle)
     reported = only(map_)
-    assert reported.felt and reported.name.startswith("felt") and reported.shape == "cylinder"
+    assert reported.felt
+    assert reported.name.startswith("felt")
+    assert reported.shape == "cylinder"
     off = math.dist(reported.position_w[:2], (0.5, 0.2))
     assert off < 3 * reported.position_sd_m + 0.005
 
@@ -60,8 +64,10 @@ def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
     reported = only(map_)
-    assert reported.felt and reported.name == name
-    assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0] and map_.find_track(np.array([0.5, 0.5])) is None
+    assert reported.felt
+    assert reported.name == name
+    assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0]
+    assert map_.find_track(np.array([0.5, 0.5])) is None
     touch(map_, (0.8, 0.4), 0.05, 3.0)
     assert len(map_.obstacles(0, 0.0)) == 2
 
@@ -90,7 +96,8 @@ def test_what_the_body_passes_through_does_not_exist():
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
         map_.carve_body(axis, BODY_M)
     reported = map_.obstacles(0, 0.0)
-    assert len(reported) == 1 and math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
+    assert len(reported) == 1
+    assert math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
 
 
 def test_where_the_body_lies_nothing_reaches():
@@ -98,7 +105,8 @@ def test_where_the_body_lies_nothing_reaches():
     for k in range(4):  # one face of a box: how deep it is, is a guess
         map_.add_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
     axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
-    assert (outer := only(map_)).half_size_m and _depth_beyond(outer, axis) > 0.02
+    assert (outer := only(map_)).half_size_m
+    assert _depth_beyond(outer, axis) > 0.02
     for _ in range(5):
         map_.carve_body(axis, BODY_M)
     assert _depth_beyond(only(map_), axis) < 0.012

@@ -62,7 +62,8 @@ def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
     off = math.dist(track.center_w, (x, y))
     assert off < 5 * track.position_sd_m
     if track.shape == "cylinder":  # seen by five beams, one in thousands is taken for a box
-        assert off < 0.02 and abs(track.radius_m - radius) < 5 * track.size_sd_m
+        assert off < 0.02
+        assert abs(track.radius_m - radius) < 5 * track.size_sd_m
 
 
 @given(st.floats(0.08, 0.3), st.floats(0.08, 0.3), st.floats(0.35, 1.2), st.integers(0, 1000))
@@ -79,18 +80,21 @@ def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
 
 def test_shape_with_single_visible_face_marks_depth_as_guess():
     one = seen(box("it", 0.8, 0.0, (0.1, 0.16)))
-    assert one.shape == "box" and one.position_sd_m > 0.015  # its back side is open
+    assert one.shape == "box"
+    assert one.position_sd_m > 0.015  # its back side is open
     face = one.center_w[0] - min(one.half_m)
-    assert abs(one.center_w[1]) < 0.01 and (
-        abs(face - 0.75) < 0.01 or abs(one.center_w[0] - max(one.half_m) - 0.75) < 0.01
-    )
+    assert abs(one.center_w[1]) < 0.01
+    assert abs(face - 0.75) < 0.01 or abs(one.center_w[0] - max(one.half_m) - 0.75) < 0.01
     around = seen(box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6)))
-    assert around.position_sd_m < 0.01 and math.dist(around.center_w, (0.8, 0.0)) < 0.01
+    assert around.position_sd_m < 0.01
+    assert math.dist(around.center_w, (0.8, 0.0)) < 0.01
 
 
 def test_a_long_face_is_a_thin_wall():
     wall = seen(box("it", 0.8, 0.0, (0.04, 1.0)))
-    assert wall.shape == "box" and min(wall.half_m) < 0.04 and max(wall.half_m) == pytest.approx(0.5, abs=0.05)
+    assert wall.shape == "box"
+    assert min(wall.half_m) < 0.04
+    assert max(wall.half_m) == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_short_arc_leaves_the_line_of_sight_uncertain():
@@ -118,7 +122,8 @@ def test_fusing_looks_lowers_the_scatter_and_the_told_error():
         return float(np.std([t.center_w[0] for t in found])), float(np.median([t.position_sd_m for t in found]))
 
     once, often = scatter_m(1), scatter_m(10)
-    assert often[0] < 0.5 * once[0] and often[1] < 0.7 * once[1]
+    assert often[0] < 0.5 * once[0]
+    assert often[1] < 0.7 * once[1]
     assert often[1] > often[0]  # it is not thought better than it is
 
 

@@ -286,7 +286,8 @@ class Everything(Model):
         refusal = self.authority.offer_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
         self.offered += 1
         if expected is not None:
-            assert refusal == expected and self.authority.rejected_counts[expected] == counted + 1
+            assert refusal == expected
+            assert self.authority.rejected_counts[expected] == counted + 1
             self.rejected += 1
             return
         if self.state == "armed" and asked.arm_session != self.arm_session:
@@ -492,7 +493,9 @@ class Everything(Model):
             self.reported = True
             self.check_safe(decision)
         else:
-            assert self.live and self.doubt is not None and self.doubt <= self.aside
+            assert self.live
+            assert self.doubt is not None
+            assert self.doubt <= self.aside
             for sent in self.since_arming[-KEPT:]:
                 self.counting = sent if up_to is None or sent.tick <= up_to else self.counting
             assert decision.sequence == (None if self.counting is None else self.counting.sequence)
@@ -511,10 +514,13 @@ class Everything(Model):
         assert found.arm_session == self.arm_session
         expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
         assert found.lease.epoch == self.epoch  # the model's only ever grows
-        assert (found.lease.holder, found.lease.is_live(self.now_ns)) == (self.holder, self.live)
+        assert found.lease.holder == self.holder
+        assert found.lease.is_live(self.now_ns) == self.live
         assert not self.holder or found.lease == expected
-        assert found.reason and len(found.reason) <= 500
-        assert len(found.faults) == self.faults and all(len(fault.cause) <= 500 for fault in found.faults)
+        assert found.reason
+        assert len(found.reason) <= 500
+        assert len(found.faults) == self.faults
+        assert all(len(fault.cause) <= 500 for fault in found.faults)
         assert found.rejected_counts.total() == self.rejected
         assert found.accepted_count == len(self.since_arming) or found.arm_session > 1
         assert found.accepted_count + found.standby_count + found.rejected_counts.total() == self.offered

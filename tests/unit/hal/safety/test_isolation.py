@@ -16,7 +16,8 @@ def lame(**robot: Any) -> Rig:
     rig = armed(safety__max_isolated_joints=1, **robot)
     rig.observe(0.1, valid=SAYS_NO)
     rig.tick_with(0.1)
-    assert rig.authority.state == "armed" and rig.authority.isolated_joints == ["joint_2"]
+    assert rig.authority.state == "armed"
+    assert rig.authority.isolated_joints == ["joint_2"]
     return rig
 
 
@@ -28,15 +29,19 @@ def test_by_default_one_joint_stops_the_robot() -> None:
     rig = armed()
     rig.observe(0.1, valid=SAYS_NO)
     rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
     (fault,) = rig.authority.faults
-    assert fault.joint == "joint_2" and fault.reach == "robot"
+    assert fault.joint == "joint_2"
+    assert fault.reach == "robot"
 
 
 def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
     rig = lame()
     (fault,) = rig.authority.faults
-    assert (fault.what, fault.joint, fault.reach) == ("state_invalid", "joint_2", "joint")
+    assert fault.what == "state_invalid"
+    assert fault.joint == "joint_2"
+    assert fault.reach == "joint"
     assert rig.authority.reason == "armed, without joint_2: no valid and fresh state of joint_2"
     for _ in range(20):
         rig.observe(0.1, valid=SAYS_NO)
@@ -44,9 +49,12 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
         decision = rig.pass_tick()
         points = decision.setpoints
         assert points.mode == [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]
-        assert points.target == [0.12, 0.0, 0.12] and points.torque_limit_nm == [3.0, 0.0, 3.0]
-        assert points.isolated == {1} and decision.limited == {1: "isolated"}
-    assert rig.authority.state == "armed" and len(rig.authority.faults) == 1
+        assert points.target == [0.12, 0.0, 0.12]
+        assert points.torque_limit_nm == [3.0, 0.0, 3.0]
+        assert points.isolated == {1}
+        assert decision.limited == {1: "isolated"}
+    assert rig.authority.state == "armed"
+    assert len(rig.authority.faults) == 1
     assert rig.authority.limited_counts["isolated"] == 21
 
 
@@ -74,11 +82,13 @@ def test_two_that_fail_at_once_are_two() -> None:
     rig = armed(safety__max_isolated_joints=1)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
     rig = armed(safety__max_isolated_joints=2)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
-    assert rig.authority.state == "armed" and rig.authority.isolated_joints == ["joint_2", "joint_3"]
+    assert rig.authority.state == "armed"
+    assert rig.authority.isolated_joints == ["joint_2", "joint_3"]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +97,8 @@ def test_two_that_fail_at_once_are_two() -> None:
 def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
     rig = armed(safety__max_isolated_joints=3)
     rig.authority.fault(fault)
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
 
 
 def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
@@ -102,7 +113,8 @@ def test_what_a_lost_joint_complains_of_is_no_news() -> None:
     rig.authority.fault(broken())
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.authority.fault(broken())
-    assert rig.authority.state == "disarmed" and len(rig.authority.faults) == 1
+    assert rig.authority.state == "disarmed"
+    assert len(rig.authority.faults) == 1
 
 
 def test_while_disarmed_no_joint_is_set_aside() -> None:
@@ -111,9 +123,11 @@ def test_while_disarmed_no_joint_is_set_aside() -> None:
     rig.acquire()
     rig.send(0.1)
     answer = rig.arm()
-    assert answer.refusal == "not_ready" and "joint_2" in answer.reason
+    assert answer.refusal == "not_ready"
+    assert "joint_2" in answer.reason
     rig.authority.fault(broken())
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
 
 
 def test_it_may_be_armed_again_without_the_joint() -> None:
@@ -134,7 +148,8 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
-    assert rig.authority.isolated_joints == [] and rig.authority.faults == []
+    assert rig.authority.isolated_joints == []
+    assert rig.authority.faults == []
     rig.send(0.1)
     assert "no joint state since the reset" in rig.arm().reason
     rig.observe(0.1)
@@ -149,21 +164,26 @@ def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
     rig.pass_tick(6)
     assert rig.authority.state == "fault"
     points = rig.pass_tick().setpoints
-    assert points.isolated == {1} and points.mode[1] is Mode.PASSIVE and points.torque_limit_nm[1] == 0.0
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
+    assert points.isolated == {1}
+    assert points.mode[1] is Mode.PASSIVE
+    assert points.torque_limit_nm[1] == 0.0
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    assert rig.authority.isolated_joints == []
 
 
 def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
     rig = lame()
     rig.authority.on_estop(ESTOP, rig.tick)
     assert rig.authority.isolated_joints == ["joint_2"]
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    assert rig.authority.isolated_joints == []
 
 
 def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     rig = armed(safety__max_isolated_joints=1)
     receive(rig, [20.0, 110.0, 20.0])
-    assert rig.tick_with(0.1).setpoints.isolated == {1} and rig.authority.state == "armed"
+    assert rig.tick_with(0.1).setpoints.isolated == {1}
+    assert rig.authority.state == "armed"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
@@ -171,7 +191,8 @@ def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     receive(rig, [20.0, 110.0, 20.0], volts=12.0)
     for _ in range(7):
         rig.tick_with(0.1)
-    assert rig.authority.state == "fault" and rig.authority.faults[-1].what == "undervoltage"
+    assert rig.authority.state == "fault"
+    assert rig.authority.faults[-1].what == "undervoltage"
 
 
 def test_isolation_silent_health_of_lost_joint_is_not_recorded() -> None:
@@ -196,6 +217,8 @@ def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None
     log = getattr(rig.authority, kept)
     for tick in range(2000, 2100):
         rig.authority.fault(Fault(tick=tick, what="follows", cause=""))
-        assert 1000 in [fault.tick for fault in log.kept] and log.kept[-1].tick == tick
-        assert len(log.kept) <= MAX_FAULTS_KEPT and len(log.kept) + log.left_out == before + 1 + tick - 1999
+        assert 1000 in [fault.tick for fault in log.kept]
+        assert log.kept[-1].tick == tick
+        assert len(log.kept) <= MAX_FAULTS_KEPT
+        assert len(log.kept) + log.left_out == before + 1 + tick - 1999
     assert [fault.tick for fault in log.kept] == sorted(fault.tick for fault in log.kept)

@@ -149,7 +149,8 @@ def test_codec_accepts_largest_images_and_no_other_large_message() -> None:
     for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColorImage, "rgb", b"\1\2\3")):
         largest = {**plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
         taken = take(message, encode(largest))
-        assert taken is not None and getattr(taken, field) == largest[field]
+        assert taken is not None
+        assert getattr(taken, field) == largest[field]
         assert take(message, encode({**largest, field: largest[field] + b"\1"})) is None
         assert take(JointState, encode({**plain_example(JointState), "other": largest[field]})) is None
 

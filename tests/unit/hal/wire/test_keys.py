@@ -20,7 +20,9 @@ def test_every_key_of_the_space_parses_back(row: keys.KeyRow) -> None:
     key = concrete(row.key)
     assert keys.find_message(key) is row.message
     assert keys.split_namespace(key) is None  # without a namespace there is nothing to split off
-    assert row.kind in ("stream", "latched", "query", "liveliness") and row.writer and row.about
+    assert row.kind in ("stream", "latched", "query", "liveliness")
+    assert row.writer
+    assert row.about
 
 
 def test_keys_are_unique_without_outer_slashes() -> None:

@@ -151,4 +151,5 @@ def test_search_printout_for_several_seeds_names_the_first(tmp_path: Path, capsy
     words = shlex.split(command)
     propulsion = float(next(word for word in words if word.startswith(PROPULSION)).partition("=")[2])
     assert best.startswith(f"best path_distance_m: {propulsion + 600:.4g}, trial ")
-    assert "seed=5" in words and about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"
+    assert "seed=5" in words
+    assert about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"

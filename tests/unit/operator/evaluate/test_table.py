@@ -41,7 +41,9 @@ def test_speed_is_of_the_runs_that_crossed() -> None:
     assert [line.controller for line in lines] == ["poal"]  # of hold nothing is known yet
     head, row = table_lines(lines)
     assert head.split()[:3] == ["setting", "controller", "crossed"]
-    assert "1/3" in row and "0.200" in row and row.endswith(" 1")
+    assert "1/3" in row
+    assert "0.200" in row
+    assert row.endswith(" 1")
 
 
 def test_without_a_goal_the_advance_has_an_interval() -> None:
@@ -50,7 +52,8 @@ def test_without_a_goal_the_advance_has_an_interval() -> None:
     done = {one.id: CaseOutcome(numbers={"advance_m": 0.2 + 0.01 * one.field, "ended": "complete"}) for one in cases}
     head, two_runs, one_run = table_lines(group_results(cases, done))
     assert head.split()[-5:] == ["m", "95", "%", "of", "m"]
-    assert two_runs.endswith("0.15 to 0.28") and one_run.endswith(UNKNOWN)
+    assert two_runs.endswith("0.15 to 0.28")
+    assert one_run.endswith(UNKNOWN)
     assert "95 %" not in table_lines(group_results([cases[2]], done))[0]
 
 

@@ -45,13 +45,16 @@ def test_the_tree_is_our_kinematics(name: str) -> None:
     )
     for i in range(len(robot.links)):
         position, rotation = walked(tree, f"lab/{robot.links[i].name}")
-        assert np.allclose(position, origins[i]) and np.allclose(rotation, rotations[i])
+        assert np.allclose(position, origins[i])
+        assert np.allclose(rotation, rotations[i])
 
 
 def test_optical_frames_look_along_z() -> None:
     optical = rotation_from_quaternion(OPTICAL_IN_CAMERA)
     right, down, forward = optical.T
-    assert np.allclose(forward, [1, 0, 0]) and np.allclose(right, [0, -1, 0]) and np.allclose(down, [0, 0, -1])
+    assert np.allclose(forward, [1, 0, 0])
+    assert np.allclose(right, [0, -1, 0])
+    assert np.allclose(down, [0, 0, -1])
     assert yaw_from_rotation(np.eye(3)) == 0.0
 
 

@@ -29,12 +29,16 @@ def waits(*rows: tuple[float, float]) -> list[tuple[float, Usage]]:
 
 def test_processor_wait_of_most_of_a_lease_is_named() -> None:
     found = seen(waits((0.0, 5.0), (0.1, 5.09), (0.2, 5.09))).find_longest()
-    assert found is not None and found[0] == "control" and found[1:] == pytest.approx((0.09, 0.1))
+    assert found is not None
+    assert found[0] == "control"
+    assert found[1:] == pytest.approx((0.09, 0.1))
 
 
 def test_processor_wait_in_progress_counts_before_kernel_reports_it() -> None:
     found = seen((0.1 * i, Usage(1.0, 2.0, True)) for i in range(4)).find_longest()
-    assert found is not None and found[0] == "control" and found[1] == pytest.approx(found[2])
+    assert found is not None
+    assert found[0] == "control"
+    assert found[1] == pytest.approx(found[2])
 
 
 def test_who_sleeps_or_is_stopped_does_not_wait() -> None:
@@ -47,7 +51,8 @@ def test_short_waits_at_any_time_are_nothing() -> None:
 
 def test_what_was_long_ago_is_no_cause() -> None:
     rows = waits(*((0.1 * i, min(0.1 * i, 0.5)) for i in range(60)))
-    assert seen(rows[:10]).find_longest() is not None and seen(rows).find_longest() is None
+    assert seen(rows[:10]).find_longest() is not None
+    assert seen(rows).find_longest() is None
 
 
 def test_rare_looks_are_enough() -> None:
@@ -59,9 +64,11 @@ def test_where_the_kernel_does_not_tell_nothing_is_said() -> None:
     silent = ProcessorWaits(0.1, read=lambda _pid: {})
     for _ in range(3):
         silent.sample(PIDS)
-    assert silent.find_longest() is None and read_usages(-1) == {}
+    assert silent.find_longest() is None
+    assert read_usages(-1) == {}
 
 
 def test_the_kernel_is_asked() -> None:
     ours = read_usages(os.getpid())[threading.get_native_id()]
-    assert ours.ran_s > 0 and ours.ready
+    assert ours.ran_s > 0
+    assert ours.ready
