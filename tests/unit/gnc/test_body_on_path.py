@@ -18,7 +18,7 @@ BODY = BodyOnPath(ROUTE, SEGMENTS)
 
 
 @given(st.floats(-1.0, 7.0))
-def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
+def test_body_on_path_lies_as_the_start_pose_is_laid(tail_s_m):
     lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.pose_at(tail_s_m)
     assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=5e-3)
     assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=3e-4)
@@ -49,7 +49,7 @@ def test_nodes_are_those_of_the_3d_kinematics():
 
 
 @given(st.floats(-3.1, 3.1))
-def test_heading_of_a_quaternion(yaw_rad):
+def test_heading_is_computed_from_a_quaternion(yaw_rad):
     assert compute_heading_rad(quaternion_from_yaw(yaw_rad)) == pytest.approx(yaw_rad)
 
 

@@ -49,7 +49,7 @@ def test_climb_every_body_part_has_height_of_path(tail_s_m: float) -> None:
     assert np.abs(heights - wanted[:-1]).max() < ABOVE_M
 
 
-def test_who_only_turns_left_and_right_does_not_climb() -> None:
+def test_climb_needs_pitch_joints() -> None:
     assert not Climb(make_robot(13)).angles_rad([RISE], 0.5).any()
 
 

@@ -96,7 +96,7 @@ def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
     assert any(SEARCHES in controller.update(observation).telemetry.reason for observation in observations)
 
 
-def test_nobody_searches_when_told_not_to() -> None:
+def test_contact_search_can_be_disabled() -> None:
     stage, never = searching(search_after_s=0.0)
     assert not any(SEARCHES in command.telemetry.reason for command in stands(never, stage, range(500)))
 

@@ -61,7 +61,7 @@ def test_a_run_without_guidance_or_navigation_has_limits_too() -> None:
     assert found.trajectory_s == pytest.approx(0.03 + 0.2)
 
 
-def test_the_scenario_may_say_otherwise() -> None:
+def test_freshness_limits_may_be_set_by_scenario() -> None:
     said = {"joints_s": 0.04, "pose_s": 0.5, "contacts_s": 5.0, "world_s": 0.1, "trajectory_s": 2.0}
     found = limits(run_config(services=SCHEDULE, max_age=said), pose=100.0, contacts=10.0)
     assert found.joints_s == 0.04
@@ -73,7 +73,7 @@ def test_the_scenario_may_say_otherwise() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"pose_s": 0.0}, {"pose_s": -1.0}, {"world_s": 61.0}, {"depth_s": 0.0}, {"imu_s": 1.0}]
 )
-def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
+def test_freshness_invalid_scenario_limits_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError):
         run_config(max_age=wrong)
 

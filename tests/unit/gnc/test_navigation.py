@@ -45,7 +45,7 @@ def test_trajectory_age_is_that_of_its_world_model() -> None:
     assert again.timestamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
 
 
-def test_the_path_ends() -> None:
+def test_navigation_stops_at_the_end_of_path() -> None:
     there = KnownPath(ROUTE, []).update(0, world(10.0), MISSION)
     assert there.finished
     assert there.speed_m_s == 0.0
@@ -98,7 +98,7 @@ def test_a_clock_that_the_sender_heard_first_is_no_future() -> None:
 
 
 @pytest.mark.parametrize("speed_m_s", [10.1, -11.0, 1e5])
-def test_nobody_goes_faster_than_a_mission_may(speed_m_s: float) -> None:
+def test_navigation_intent_speed_is_limited_by_mission(speed_m_s: float) -> None:
     speed, why = desired(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
     assert speed == MISSION_M_S
     assert f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why

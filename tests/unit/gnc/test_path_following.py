@@ -37,7 +37,7 @@ def test_the_reference_moves_with_the_mission_and_stops_with_it():
     assert stopped < 1e-3
 
 
-def test_it_starts_without_a_jump():
+def test_path_following_starts_without_a_jump():
     stage = make_stage()
     observation = stage.observe(0, TAIL_S_M)
     command = make_controller(stage).update(observation)

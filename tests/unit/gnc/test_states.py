@@ -29,7 +29,7 @@ READY = {"usable_push_points": 3, "advanced_m": 0.1}
         ({"silent": "no clock from the HAL for 1 s"}, "PowerOff", "no clock from the HAL for 1 s"),
     ],
 )
-def test_state_and_reason(change, state, word):
+def test_states_have_a_reason(change, state, word):
     found, reason = locomotion_state(**{**READY, **change})
     assert found == state
     assert word in reason

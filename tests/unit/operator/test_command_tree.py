@@ -45,7 +45,7 @@ TREE = make_parser()
 LEAVES = {name_of(leaf): leaf for leaf in walk(TREE)}
 
 
-def test_there_are_few_words_to_begin_with() -> None:
+def test_command_tree_has_few_top_level_words() -> None:
     assert len(TREE.commands.choices) <= MAX_COMMANDS
     listed = [action.dest for _, actions in TREE.commands_by_heading() for action in actions]
     assert sorted(listed) == sorted(TREE.commands.choices), "each has a heading"
@@ -96,7 +96,7 @@ def test_messages_and_pages_name_commands_that_exist() -> None:
         assert TREE.has_command(words.split()) or words in {*TREE.commands.choices, "robot calibrate"}, words
 
 
-def test_the_reference_is_current() -> None:
+def test_command_reference_page_is_current() -> None:
     assert PAGE.read_text(encoding="utf-8") == make_page(), "run `make schemas`"
 
 

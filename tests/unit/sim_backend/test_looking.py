@@ -97,7 +97,7 @@ def test_camera_sees_body_but_not_its_own_link():
     assert inside[60, 80] == pytest.approx(1.0 + 0.095 - 0.05, abs=0.002)
 
 
-def test_what_is_too_near_or_too_far_is_not_measured():
+def test_depth_outside_the_range_is_not_measured():
     for change in ({"range_min_m": 1.1}, {"range_max_m": 0.9}):
         assert np.isnan(metres(seen(looking(POST, kind="depth", **change)))[60, 80])
 

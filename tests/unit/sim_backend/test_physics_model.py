@@ -108,7 +108,7 @@ class Firmware:
     ],
     ids=["flat", "triplet", "hills_mamba"],
 )
-def test_it_starts_as_the_simulated_robot_does(config):
+def test_physics_model_starts_like_the_simulator(config):
     physics_model, state = make_physics_model(config), Run(config).sim.true_state()
     pose = physics_model.pose()
     assert physics_model.angle_rad == pytest.approx(state.angles_rad, abs=1e-4)
@@ -119,7 +119,7 @@ def test_it_starts_as_the_simulated_robot_does(config):
     assert physics_model.data.time == 0.0
 
 
-def test_without_torque_it_stays_where_it_lies():
+def test_physics_model_without_torque_stays_at_rest():
     physics_model: PhysicsModel = make_physics_model(load("triplet").config)
     angles, before = physics_model.angle_rad.copy(), physics_model.pose()
     pass_time(physics_model, seconds=1.0)
@@ -317,7 +317,7 @@ def test_the_pose_is_true_and_of_now():
 # --- the rest -----------------------------------------------------------------------------------------------------
 
 
-def test_a_tether_tows_it():
+def test_physics_model_is_towed_by_a_tether():
     physics_model = make_physics_model(
         make_config(FOUR), tether=Tether(link=4, direction_w=(1.0, 0.0), reel_in_m_s=0.1)
     )

@@ -101,7 +101,7 @@ def actions(frames: list[Frame]) -> list[float]:
 # --- who is there ------------------------------------------------------------------------------------------
 
 
-def test_everybody_is_found_and_only_asked_who_they_are(modules: Modules) -> None:
+def test_bring_up_finds_every_module_with_identity_requests_only(modules: Modules) -> None:
     found = find_modules([modules.bus], 5.0)
     assert [i.node for i in found] == [1, 2, 3, 4]
     assert {i.channel for i in found} == {modules.channel}
@@ -141,7 +141,7 @@ def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None
     assert 2 <= len(actions(modules.heard)) <= 6, "asks again, but not all the time"
 
 
-def test_an_answer_that_is_lost_is_asked_for_again(modules: Modules) -> None:
+def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> None:
     modules.to_host = losing(1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3)
     assert [i.node for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
     assert len(actions(modules.heard)) > 1, "asked again"
@@ -204,7 +204,7 @@ def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[s
         ),
     ],
 )
-def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[ModuleIdentity], words: str) -> None:
+def test_bring_up_error_names_joint_node_and_bus(found: list[ModuleIdentity], words: str) -> None:
     (reported,) = wrong_with(found)
     assert reported.startswith(words)
 
@@ -214,7 +214,7 @@ def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
     assert reported == ["joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"]
 
 
-def test_everything_is_told_at_once() -> None:
+def test_bring_up_lists_all_problems_in_one_error() -> None:
     found = [
         replace(GOOD[0], protocol=3),
         replace(GOOD[0], protocol=3, serial=5),
@@ -256,7 +256,7 @@ def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) ->
 
 
 @pytest.mark.parametrize("way", ["to_modules", "to_host"])
-def test_what_is_lost_is_asked_again(modules: Modules, way: str) -> None:
+def test_bring_up_lost_parameter_answer_is_requested_again(modules: Modules, way: str) -> None:
     setattr(modules, way, losing(5))
     began = time.monotonic()
     in_force = configure_modules([modules.bus], wanted(), 5.0)
@@ -310,7 +310,7 @@ def test_bring_up_unknown_result_code_counts_as_refusal(modules: Modules) -> Non
         configure_modules([modules.bus], wanted(), 5.0)
 
 
-def test_who_does_not_answer_is_told_in_the_end(modules: Modules) -> None:
+def test_bring_up_silent_module_is_named_at_the_end(modules: Modules) -> None:
     modules.to_host = lambda frame: [] if parse_node(frame.id) in (2, 4) else [frame]
     with raises_error(BackendError, code="drive/silent"):
         configure_modules([modules.bus], wanted(), 0.3)

@@ -52,13 +52,13 @@ def test_mocap_reader_after_a_pause_uses_newest_pose_without_jump() -> None:
 
 
 @pytest.mark.parametrize(("late_ms", "why"), [(10.0, "duplicate"), (9.5, "duplicate"), (12.0, "reordered")])
-def test_what_is_not_newer_is_refused(late_ms: float, why: str) -> None:
+def test_mocap_pose_that_is_not_newer_is_refused(late_ms: float, why: str) -> None:
     camera = running()
     assert camera.read(late_ms) == [why]
     assert camera.read(0.0) == [None]
 
 
-def test_what_is_too_late_or_from_the_future_is_refused() -> None:
+def test_mocap_pose_too_old_or_in_future_is_refused() -> None:
     camera = running()
     camera.now_ns += 1000 * MS
     assert camera.read(MAX_LATE_NS / MS + 1) == ["late"]

@@ -63,7 +63,7 @@ def test_an_unknown_state_is_a_fault() -> None:
 # --- who is waited for -------------------------------------------------------------------------------------
 
 
-def test_it_is_complete_when_everybody_has_answered() -> None:
+def test_reading_is_complete_when_every_module_has_answered() -> None:
     made = reading()
     begin(made)
     for node in (1, 2):
@@ -93,7 +93,7 @@ def test_reading_waits_for_forces_only_at_requested_syncs() -> None:
     assert made.complete
 
 
-def test_who_has_not_answered_for_long_is_not_waited_for() -> None:
+def test_reading_does_not_wait_for_a_silent_module() -> None:
     made = reading()
     syncs(made, MAX_LATE_SYNCS, [1, 3])
     begin(made, contacts=True, tail=True)
@@ -107,7 +107,7 @@ def test_who_has_not_answered_for_long_is_not_waited_for() -> None:
     assert made.complete
 
 
-def test_without_the_tail_nobody_waits_for_its_second_link() -> None:
+def test_reading_without_tail_does_not_wait_for_its_link() -> None:
     made = reading()
     syncs(made, MAX_LATE_SYNCS + 1, [2, 3])
     begin(made, contacts=True, tail=True)
@@ -115,7 +115,7 @@ def test_without_the_tail_nobody_waits_for_its_second_link() -> None:
     assert made.contacts_missing == 2
 
 
-def test_who_was_never_heard_is_waited_for() -> None:
+def test_reading_waits_for_a_module_never_received() -> None:
     made = ModuleReports(JOINTS)
     syncs(made, 10, [1, 3])
     begin(made)
@@ -123,7 +123,7 @@ def test_who_was_never_heard_is_waited_for() -> None:
     assert not made.complete
 
 
-def test_who_comes_back_does_not_stand_for_another() -> None:
+def test_reading_returned_module_does_not_replace_another() -> None:
     made = reading()
     syncs(made, 10, [1, 3])
     begin(made, contacts=True)

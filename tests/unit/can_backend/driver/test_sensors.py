@@ -72,7 +72,7 @@ def test_joint_state_age_is_reported_and_valid_for_the_lease() -> None:
         assert joints.angle_rad == pytest.approx([0.6, 0.6, 0.5, 0.6])
 
 
-def test_what_was_never_heard_is_not_valid() -> None:
+def test_joint_state_never_received_is_invalid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
@@ -96,7 +96,7 @@ def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
     assert not any(contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300))
 
 
-def test_nothing_touched_is_an_empty_list() -> None:
+def test_contacts_without_touch_are_an_empty_list() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     begin(reading, contacts=True)
     reading.process_frame(contact(2, reading.sync, touched=False, force_x=9.0))
@@ -105,7 +105,7 @@ def test_nothing_touched_is_an_empty_list() -> None:
     )
 
 
-def test_a_touch_is_told_in_the_frame_of_its_link() -> None:
+def test_contact_is_in_the_frame_of_its_link() -> None:
     run = config(**EVERYTHING)
     reading, sensors = sensors_of(run)
     begin(reading, contacts=True)
@@ -123,7 +123,7 @@ def test_a_touch_is_told_in_the_frame_of_its_link() -> None:
     assert found.tangent_1_l[0] > 0
 
 
-def test_what_is_weaker_than_the_robots_threshold_is_left_out() -> None:
+def test_contact_below_threshold_of_robot_is_omitted() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0))
     begin(reading, contacts=True)
     for node, force in ((1, 0.9), (2, 1.0), (3, -1.05)):
@@ -171,9 +171,7 @@ def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-4, 4), st.floats(0.01, 0.2), st.floats(0.005, 0.1))
-def test_whatever_is_told_is_a_place_on_the_capsule(
-    along_m: float, bearing: float, length_m: float, radius_m: float
-) -> None:
+def test_contact_position_is_on_the_capsule(along_m: float, bearing: float, length_m: float, radius_m: float) -> None:
     outward, point = locate_on_capsule(along_m, bearing, length_m, radius_m)
     assert math.hypot(*outward) == pytest.approx(1.0)
     axis_m = min(max(point[0], 0.0), length_m)

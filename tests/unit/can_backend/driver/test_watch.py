@@ -76,7 +76,7 @@ def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, aft
 
 @pytest.mark.parametrize("speak", [quiet, frozen, miscounting, corrupt, doubled])
 @pytest.mark.parametrize("length", [1, 2])
-def test_glitches_tell_nothing_however_often(speak: Speak, length: int) -> None:
+def test_watch_glitches_report_nothing(speak: Speak, length: int) -> None:
     bench = Bench()
     for _ in range(20):
         assert bench.ticks(length, speak) == []
@@ -84,7 +84,7 @@ def test_glitches_tell_nothing_however_often(speak: Speak, length: int) -> None:
 
 
 @pytest.mark.parametrize("bad", [corrupt, miscounting])
-def test_a_module_that_talks_nonsense_is_not_silent(bad: Speak) -> None:
+def test_watch_module_with_invalid_frames_is_not_silent(bad: Speak) -> None:
     bench = Bench()
     assert bench.ticks(2, bad) == []
     assert bench.tick(quiet) == []

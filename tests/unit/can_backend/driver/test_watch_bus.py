@@ -84,7 +84,7 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
         (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
     ],
 )
-def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
+def test_bus_watch_reports_a_second_host(frame: Frame, what: str, words: str) -> None:
     bench, speak = Bench(), answering(ModuleState.DISARMED, frame)
     (found,) = bench.tick(speak)
     assert found.what == what
@@ -103,7 +103,7 @@ def test_what_another_host_may_have_changed_is_written_anew() -> None:
     assert bench.watch.take_changed() == {0, 1, 2}
 
 
-def test_who_asks_who_is_there_is_no_second_host() -> None:
+def test_bus_watch_identity_request_is_no_second_host() -> None:
     bench = Bench()
     bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
     assert bench.tick() == []

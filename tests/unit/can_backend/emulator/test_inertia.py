@@ -51,7 +51,7 @@ def test_a_whole_number_of_steps_makes_a_period():
     assert steps == pytest.approx(4.0)
 
 
-def test_there_is_no_world():
+def test_inertia_emulator_has_no_world():
     made = physics_model()
     assert made.loads() == []
     assert made.imu() is None

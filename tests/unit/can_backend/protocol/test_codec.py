@@ -90,7 +90,7 @@ def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: S
 
 @each_signal
 @pytest.mark.parametrize("wrong", ["above", "below", math.nan, math.inf, -math.inf])
-def test_what_does_not_fit_is_refused_in_words(layout: MessageLayout, signal: Signal, wrong: float | str) -> None:
+def test_codec_value_out_of_range_is_refused(layout: MessageLayout, signal: Signal, wrong: float | str) -> None:
     step = 1e32 if signal.is_float else signal.scale
     value = {"above": signal.high + step, "below": signal.low - step}[wrong] if isinstance(wrong, str) else wrong
     with pytest.raises(CodecError) as caught:
@@ -144,7 +144,7 @@ def test_a_writer_writes_what_a_reader_reads(layout: MessageLayout, data: st.Dat
 
 
 @each_layout
-def test_what_is_not_named_is_zero(layout: MessageLayout) -> None:
+def test_codec_unnamed_signals_are_zero(layout: MessageLayout) -> None:
     frame = layout.encode(7)
     payload = frame.data[:-1] if layout.opcode in WITH_CHECKSUM else frame.data
     assert not any(payload)

@@ -74,7 +74,7 @@ def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
     assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
 
 
-def test_directions() -> None:
+def test_protocol_messages_have_the_declared_direction() -> None:
     for message in DATABASE.messages:
         host = Opcode(message.frame_id >> NODE_BITS) in FROM_HOST
         assert message.senders == (["Host"] if host else ["Module"]), message.name

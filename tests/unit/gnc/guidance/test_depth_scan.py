@@ -44,7 +44,7 @@ def test_points_lie_on_what_stands_there(ground, eye, median_m, max_m):
 
 @pytest.mark.slow
 @given(st.floats(-0.6, 0.6), st.floats(-0.1, 0.15), st.floats(-0.15, 0.15))
-def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
+def test_depth_scan_points_are_right_with_rotated_head(yaw, pitch, roll):
     scan = look(SCENE, turned(yaw, pitch, roll))
     off = errors_m(scan, SCENE)
     assert len(off) == 0 or (np.median(off) < 0.004 and off.max() < 0.02)
@@ -60,7 +60,7 @@ def test_depth_scan_averages_noise_and_bridges_dropouts():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_hills_are_ground(seed):
+def test_depth_scan_hills_are_ground(seed):
     ground = hills(0.02 + 0.01 * seed, 1.5)
     at = (0.7 * seed, 0.3 * seed)
     scan = look([], turned(0.4 * seed), ground=ground, eye=Eye(0.002, 0.003, 0.01, np.random.default_rng(seed)), at=at)

@@ -35,7 +35,7 @@ def only(map_, now_ns=0) -> Obstacle:
     return reported
 
 
-def test_what_is_seen_again_and_again_is_believed_more():
+def test_map_obstacle_seen_repeatedly_gains_confidence():
     once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
     reported = only(often)
     assert only(once).confidence < 0.65
@@ -72,7 +72,7 @@ def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
     assert len(map_.obstacles(0, 0.0)) == 2
 
 
-def test_what_one_can_see_through_is_dropped():
+def test_map_obstacle_seen_through_is_dropped():
     map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
     for k in range(8):
         map_.add_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k))
@@ -80,7 +80,7 @@ def test_what_one_can_see_through_is_dropped():
     assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
-def test_what_is_hidden_or_out_of_view_is_kept():
+def test_map_obstacle_hidden_or_out_of_view_is_kept():
     map_ = mapped(cylinder("a", 1.2, 0.0))
     for k in range(20):
         map_.add_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
@@ -90,7 +90,7 @@ def test_what_is_hidden_or_out_of_view_is_kept():
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
-def test_what_the_body_passes_through_does_not_exist():
+def test_map_obstacle_inside_the_body_is_dropped():
     map_ = mapped(cylinder("smoke", 0.6, 0.0), cylinder("beside", 0.6, 0.3))
     for k in range(40):
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])

@@ -45,7 +45,7 @@ def test_a_field_is_mapped_to_millimetres():
 
 
 @pytest.mark.slow  # a whole run on hills is in tests/system/physics/test_locomotion.py
-def test_so_it_is_on_hills():
+def test_perceived_field_on_hills_is_mapped():
     total = scored(Drive(random_field(2), ground=hills(0.02, 1.5)), 200)
     assert np.median(total.position_m) < 0.008
     assert total.misses <= 0.1 * total.visible

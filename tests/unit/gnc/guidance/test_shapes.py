@@ -33,7 +33,7 @@ def seen(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
     return track
 
 
-def test_things_apart_are_find_clusters_their_own():
+def test_shapes_of_separate_objects_are_separate_clusters():
     things = [
         cylinder("a", 0.8, 0.3),
         cylinder("b", 0.8, 0.1),

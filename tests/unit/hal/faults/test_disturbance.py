@@ -81,7 +81,7 @@ def test_when_all_is_over_everything_is_as_before(chosen: list[Injection], at: i
     assert way.over
 
 
-def test_the_seed_decides() -> None:
+def test_disturbance_depends_only_on_its_seed() -> None:
     first, again, other = (sent(disturbed(on("drop", 0.5), seed=seed)) for seed in ("1", "1", "2"))
     assert first == again != other
 

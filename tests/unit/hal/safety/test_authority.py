@@ -154,6 +154,20 @@ def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
     assert rig.authority.rejected_counts == {"before_arming": 5}
 
 
+def test_command_under_way_at_arming_is_not_counted_as_rejected() -> None:
+    rig = Rig()
+    rig.tick = 5
+    rig.observe(0.1, tick=5)
+    rig.acquire()
+    rig.send(0.1)
+    rig.arm()
+    rig.tick = 6
+    assert rig.send(0.1, tick=5, arm_session=0) == "before_arming"
+    assert rig.authority.rejected_counts == {}
+    assert rig.send(0.1, tick=6, arm_session=0) == "before_arming"
+    assert rig.authority.rejected_counts == {"before_arming": 1}
+
+
 def test_lease_without_commands_expires_with_a_fault() -> None:
     rig = armed()
     for _ in range(20):

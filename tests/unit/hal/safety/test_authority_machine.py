@@ -360,6 +360,8 @@ class Everything(Model):
             if self.aside:
                 self.aside, self.doubt = set(), None
         self.check(answer, ok)
+        if not ok:
+            assert answer.refusal == "wrong_state"
 
     @rule(who=st.text(min_size=1, max_size=64))
     def estop(self, who: str) -> None:
@@ -416,6 +418,7 @@ class Everything(Model):
             self.ask_for_the_lease("control", "acquire", 100, 0)
         self.end_a_tick(0)
         self.stay()
+        self.now_ns += 1
         self.arm("worm", "lag", "0" * 16)
 
     @precondition(lambda self: self.state == "armed")

@@ -43,7 +43,7 @@ def take(message: type[Message], payload: bytes) -> Message | None:
 @each_message
 @given(data=st.data())
 @settings(max_examples=25)
-def test_round_trip(message: type[Message], data: st.DataObject) -> None:
+def test_codec_round_trip_returns_an_equal_message(message: type[Message], data: st.DataObject) -> None:
     sent = data.draw(messages_of(message))
     payload = encode(sent)
     assert take(message, payload) == sent

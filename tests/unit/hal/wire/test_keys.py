@@ -46,7 +46,7 @@ def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
 
 
 @given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))
-def test_namespaces_split_off(namespace: str, row: keys.KeyRow) -> None:
+def test_keys_split_into_namespace_and_key(namespace: str, row: keys.KeyRow) -> None:
     key = concrete(row.key)
     assert keys.split_namespace(f"{namespace}/{key}") == (namespace, key)
 

@@ -43,6 +43,6 @@ def test_jog_stays_within_travel_and_near_a_blocked_joint() -> None:
     )
 
 
-def test_too_fast_is_refused() -> None:
+def test_jog_speed_above_limit_is_refused() -> None:
     with raises_error(ConfigError, code="command/invalid-option", field="--speed"):
         JogRequest(joint="joint_1", speed_rad_s=2.0)

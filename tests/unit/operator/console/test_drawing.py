@@ -31,7 +31,7 @@ def test_without_joints_there_is_nothing_to_draw():
     assert draw(RobotSnapshot(robot=ROBOT), None) is None
 
 
-def test_forces_and_their_resultant():
+def test_drawing_has_forces_and_their_resultant():
     point = contact((0.0, 10.0, 0.0))
     control = pushing([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
     seen = world([point, point], [])

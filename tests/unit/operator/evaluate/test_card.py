@@ -12,7 +12,7 @@ from snakesim_operator.features.evaluate.suite import Suite, make_cases
 from snakesim_testing.messages import raises_error
 
 
-def test_p_as_tabulated() -> None:
+def test_card_p_value_equals_tables() -> None:
     assert mcnemar(0, 5) == pytest.approx(0.0625)
     assert mcnemar(1, 9) == pytest.approx(22 / 1024)
     assert mcnemar(0, 0) == mcnemar(3, 3) == 1.0

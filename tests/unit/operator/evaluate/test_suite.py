@@ -44,7 +44,7 @@ def config(case: Case) -> RunConfig:
     return msgspec.json.decode(case.config, type=RunConfig)
 
 
-def test_every_row_in_every_combination(tmp_path: Path) -> None:
+def test_suite_contains_every_row_in_every_combination(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
     names = [setting.name for setting in make_settings(suite, source)]
     assert len(names) == 12
@@ -117,7 +117,7 @@ def test_a_wrong_suite_is_told_what_and_where(
     assert not (tmp_path / "out").exists()
 
 
-def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
+def test_suite_has_a_maximum_number_of_cases(tmp_path: Path) -> None:
     suite, source = read(tmp_path, 'scenario = "jam"\n[vary]\nseed = "1:1000:1000"')
     with raises_error(ConfigError, code="command/invalid-option"):
         make_cases(suite, source, [], 300, 1)

@@ -30,7 +30,7 @@ def outcome(advance_m: float, speed_m_s: float = 0.1) -> CaseOutcome:
 @pytest.mark.parametrize(
     ("successes", "trials", "low", "high"), [(8, 10, 0.490, 0.943), (0, 20, 0.0, 0.161), (100, 100, 0.963, 1.0)]
 )
-def test_wilson_as_tabulated(successes: int, trials: int, low: float, high: float) -> None:
+def test_table_wilson_interval_equals_tables(successes: int, trials: int, low: float, high: float) -> None:
     assert wilson_interval(successes, trials) == (pytest.approx(low, abs=5e-4), pytest.approx(high, abs=5e-4))
 
 
@@ -58,14 +58,14 @@ def test_without_a_goal_the_advance_has_an_interval() -> None:
 
 
 @pytest.mark.parametrize(("runs", "quantile"), [(2, 12.706), (4, 3.182), (11, 2.228), (31, 2.042), (1001, 1.962)])
-def test_students_t_as_tabulated(runs: int, quantile: float) -> None:
+def test_table_student_t_equals_tables(runs: int, quantile: float) -> None:
     values = [0.0, 1.0] * (runs // 2) + [0.5] * (runs % 2)
     low, high = mean_interval(values)
     standard_error = float(np.std(values, ddof=1)) / math.sqrt(runs)
     assert (high - low) / 2 / standard_error == pytest.approx(quantile, rel=2e-3)
 
 
-def test_the_worst_come_first() -> None:
+def test_table_lists_worst_cases_first() -> None:
     cases = [case(field) for field in (1, 2, 3, 4)]
     done = {"poal-1-1": outcome(2.0), "poal-1-2": outcome(3.0), "poal-1-3": CaseOutcome(error="no room")}
     done["poal-1-4"] = outcome(0.5)

@@ -47,7 +47,7 @@ def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
 
 
 @pytest.mark.slow
-def test_a_goal_out_of_reach_is_not() -> None:
+def test_advance_goal_out_of_reach_is_not_crossed() -> None:
     reported = ran("path_following", goal="too far").summary
     assert reported.crossed is False
     assert reported.crossed_s is None
@@ -57,7 +57,7 @@ def test_a_goal_out_of_reach_is_not() -> None:
 
 
 @pytest.mark.slow
-def test_the_wrong_way_is_no_advance() -> None:
+def test_advance_backward_is_zero() -> None:
     reported = ran("path_following", goal="backward").summary
     assert reported.crossed is False
     assert reported.advance_m == pytest.approx(0, abs=0.01)
@@ -79,13 +79,13 @@ def test_points_are_passed_by_the_head() -> None:
 
 
 @pytest.mark.slow
-def test_who_stands_has_stalled_all_the_time() -> None:
+def test_advance_of_standing_body_is_all_stalled() -> None:
     reported = ran("hold", goal="heading").summary
     assert reported.stalled_s == pytest.approx(2.5 - 1.0, abs=0.2)
     assert reported.crossed is False
 
 
-def test_without_a_goal_it_is_the_way_ahead() -> None:
+def test_advance_without_goal_is_forward_distance() -> None:
     reported = ran("path_following").summary
     assert reported.goal_m is reported.crossed is None
     assert reported.advance_m == pytest.approx(reported.net_displacement_m, rel=0.02)

@@ -177,7 +177,7 @@ def test_runs_are_aligned_at_their_first_arming_whenever_that_was() -> None:
     assert difference.hand_overs.later_s == pytest.approx([0, 0, 0])
 
 
-def test_the_common_time_alone_counts() -> None:
+def test_compare_uses_only_the_common_time() -> None:
     difference = differ(made_up(seconds=2), made_up(seconds=1))
     assert difference.aligned.time_s[-1] == pytest.approx(0.99)
     assert difference.identical
@@ -185,7 +185,7 @@ def test_the_common_time_alone_counts() -> None:
     assert [one.key for one in difference.settings] == ["duration_s"]
 
 
-def test_a_run_that_is_late_is_seen_so() -> None:
+def test_compare_delayed_run_has_its_delay() -> None:
     a, late = made_up(), 0.05
     since_s = a.time_s[:, None] - a.time_s[0] - late
     b = dataclasses.replace(a, angle_rad=0.3 * np.sin(2 * math.pi * since_s + 0.3 * np.arange(JOINTS)))
@@ -240,7 +240,7 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
     assert for_scripts(difference)["drives"]["joint_1"]["b"] == {"serial": "AE00", "firmware": "1.0"}
 
 
-def test_other_drives_are_named() -> None:
+def test_compare_names_different_drives() -> None:
     a, b = made_up(), made_up()
     of_a = with_serials(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
     of_b = with_serials(a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS)
@@ -294,7 +294,7 @@ def test_distance_is_relative_to_the_first_run(speed_m_s: float, percent: float)
     assert asked.holds
 
 
-def test_nobody_makes_a_percentage_of_standing_still() -> None:
+def test_compare_standing_run_has_no_relative_distance() -> None:
     stood = made_up(speed_m_s=0)
     both, one = differ(stood, made_up(speed_m_s=1e-5)), differ(stood, made_up())
     assert both.advance is not None
@@ -309,7 +309,7 @@ def test_nobody_makes_a_percentage_of_standing_still() -> None:
     shown(one)
 
 
-def test_a_distance_that_nobody_knows_is_not_made_up() -> None:
+def test_compare_unknown_distance_stays_unknown() -> None:
     difference = differ(made_up(), made_up(controller_knows=False))
     assert difference.advance is None
     assert within(difference, 10) is None
@@ -318,7 +318,7 @@ def test_a_distance_that_nobody_knows_is_not_made_up() -> None:
     assert "No distance" in html
 
 
-def test_hand_overs_agree_up_to_where_they_do_not() -> None:
+def test_compare_hand_overs_agree_until_first_difference() -> None:
     b = made_up(propelled=((0.0, 9), (0.7, 8), (1.1, 6), (1.5, 7)))
     difference = differ(made_up(), b)
     both = difference.hand_overs

@@ -74,7 +74,7 @@ def test_a_wrong_pose_can_be_taken_out():
     assert there.position_w[:2] == pytest.approx((x, y))
 
 
-def test_scores_add_up():
+def test_map_scores_can_be_summed():
     total = MapScore()
     for _ in range(2):
         total.add(score([peg("g", 0.5, -0.3)], [peg("a", 0.6, 0.2)], HEAD, 0.0))

@@ -42,7 +42,7 @@ def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, ampl
     assert motion.moving_fraction == (1.0 if moves else 0.0)
 
 
-def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
+def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
     blind = changed(record, position_w=record.position_w * np.nan, worlds=[])
     assert measure_motion(blind) is None
     reported = summarise(blind, "complete")

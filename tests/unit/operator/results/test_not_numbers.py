@@ -146,7 +146,7 @@ def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
 
 @given(cells=spoilt_cells())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, cells: Any) -> None:
+def test_black_box_with_nan_is_summarized(base: RunRecord, tmp_path: Path, cells: Any) -> None:
     corrupted = {name: np.array(getattr(base, name)) for name in SIGNALS}
     for signal, rows, column, value in cells:
         place = corrupted[signal]
@@ -180,7 +180,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 @pytest.mark.slow  # the black box is read with the same checks
 @given(data=st.data())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
+def test_recording_with_nan_is_summarized(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     write_record(tmp_path, base)
     messages = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
     payloads = [(key, msgspec.msgpack.encode(message)) for key, message in messages]

@@ -22,7 +22,7 @@ def record() -> RunRecord:
 
 
 @pytest.mark.slow
-def test_forces_are_told_along_the_body(record: RunRecord) -> None:
+def test_pushing_forces_are_listed_along_the_body(record: RunRecord) -> None:
     reported = pushing(record)
     assert reported is not None
     assert reported.map_errors is None  # the map was known

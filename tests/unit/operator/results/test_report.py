@@ -39,7 +39,7 @@ def page(record: RunRecord) -> Reader:
 # --- a whole run -----------------------------------------------------------------------------------------------
 
 
-def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
+def test_report_verdict_states_distance_and_hand_overs(page: Reader) -> None:
     said = (
         "Moved 0.62 m along the path in 10.0 s; propulsion handed over joint_10 → joint_9 → joint_8 → joint_7 → "
         "joint_6 → joint_5 → joint_4; no fault, 2 commands refused (stale)."
@@ -48,7 +48,7 @@ def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
     assert f"Locomotion ended at 6.3 s of 10.0 s: {LOST}; no three push-points on alternating sides." in page.text
 
 
-def test_what_is_red_says_why(record: RunRecord) -> None:
+def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     late = dataclasses.replace(record, host=msgspec.structs.replace(record.host, answered_ticks=100))
     html = report_page(late, summarise(late, "complete"))
     red = re.findall(r'class="tile alarming">.*?<span>(.*?)</span>(?:<span class="why">(.*?)</span>)?</div>', html)
@@ -206,7 +206,7 @@ def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page
     assert "stale" in page.words
 
 
-def test_the_page_says_how_to_repeat_the_run(page: Reader, record: RunRecord) -> None:
+def test_report_contains_the_command_of_the_run(page: Reader, record: RunRecord) -> None:
     assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page.html
     assert "&#34;amplitude_m&#34;: 0.045" in page.html
 

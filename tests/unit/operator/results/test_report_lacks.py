@@ -29,7 +29,7 @@ MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 # --- runs with something missing -------------------------------------------------------------------------------
 
 
-def test_without_a_recording(record: RunRecord) -> None:
+def test_report_without_recording_has_all_sections(record: RunRecord) -> None:
     page = read(changed(record, control=[], worlds=[]))
     assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
@@ -37,7 +37,7 @@ def test_without_a_recording(record: RunRecord) -> None:
 
 
 @pytest.mark.slow  # the limit of its size holds above, too
-def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
+def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
     """Ten runs a minute, for ten minutes."""
     times = 60
     reported = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
@@ -56,7 +56,7 @@ def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
     assert "handed over 419 times among 7 joints" in page.text
 
 
-def test_without_a_pose(record: RunRecord) -> None:
+def test_report_without_pose_has_all_sections(record: RunRecord) -> None:
     count = len(record.time_s)
     blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
     page = read(blind)
@@ -67,7 +67,7 @@ def test_without_a_pose(record: RunRecord) -> None:
     assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
 
 
-def test_without_a_route(record: RunRecord) -> None:
+def test_report_without_route_has_all_sections(record: RunRecord) -> None:
     scene = msgspec.structs.replace(record.config.scene, route=None, pegs_along_route=[])
     start = Start(on_route=False, position_m=(-5.0, 0.0))
     page = read(changed(record, config=msgspec.structs.replace(record.config, scene=scene, start=start)))
@@ -75,7 +75,7 @@ def test_without_a_route(record: RunRecord) -> None:
     assert "net displacement" in page.text
 
 
-def test_without_ticks(record: RunRecord) -> None:
+def test_report_without_ticks_names_the_end(record: RunRecord) -> None:
     fields = [field.name for field in dataclasses.fields(record)]
     empty = {name: getattr(record, name)[:0] for name in fields if isinstance(getattr(record, name), np.ndarray)}
     host = msgspec.structs.replace(record.host, ticks=0, armed_ticks=0, answered_ticks=0)
@@ -83,14 +83,14 @@ def test_without_ticks(record: RunRecord) -> None:
     assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
 
 
-def test_without_a_contact_sensor(record: RunRecord) -> None:
+def test_report_without_contact_sensor_has_all_sections(record: RunRecord) -> None:
     """Whatever the robot file lists: its drives have none."""
     sensors = [sensor for sensor in record.description.sensors if sensor.key != keys.CONTACTS]
     page = read(changed(record, description=msgspec.structs.replace(record.description, sensors=sensors)))
     assert "No contact forces: the robot has no contact sensor." in page.text
 
 
-def test_a_controller_without_push_points(record: RunRecord) -> None:
+def test_report_of_controller_without_push_points_has_all_sections(record: RunRecord) -> None:
     nothing = {"push_points": [], "desired_force_n": [], "propulsion_joint": None, "propulsion_n": None}
     plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in record.control]
     config_ = msgspec.structs.replace(record.config, controller="hold")
@@ -101,7 +101,7 @@ def test_a_controller_without_push_points(record: RunRecord) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
+def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
     lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
     assert "went on without joint_3, 2 commands refused" in page.text
@@ -129,7 +129,7 @@ def test_report_of_harmless_fault_says_run_continued(record: RunRecord, joint: s
     assert ending.reason is None, "or `snakesim run` ends with exit code 1"
 
 
-def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
+def test_report_of_run_ended_by_fault_explains_it(record: RunRecord) -> None:
     fault = Fault(tick=537, what="diverged", cause="joint_3 at 1e9 rad/s", joint="joint_3")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause)
     assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
@@ -139,14 +139,14 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_that_jammed(record: RunRecord) -> None:
+def test_report_of_jammed_run_says_so(record: RunRecord) -> None:
     page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
     assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
     assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
 
 
 @pytest.mark.slow
-def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
+def test_report_of_run_jammed_later_says_jammed(record: RunRecord) -> None:
     stuck = [
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
         if state.timestamp_ns > (ARMED_S + 6.09) * 1e9
@@ -201,7 +201,7 @@ def test_report_of_rest_at_path_end_is_no_failure(record: RunRecord) -> None:
     assert "Locomotion ended at 4.0 s" in rests.words
 
 
-def test_whether_it_moved_is_measured_whatever_control_reported(record: RunRecord) -> None:
+def test_report_motion_is_measured_despite_control_reports(record: RunRecord) -> None:
     """State and share of time are the same for a controller that reports nothing, falls silent, or claims to stand."""
     whole = summarise(record, "complete")
     assert whole.locomoting_fraction == pytest.approx(0.63, abs=0.01)
@@ -216,7 +216,7 @@ def test_whether_it_moved_is_measured_whatever_control_reported(record: RunRecor
     assert moving.reported_state is None
 
 
-def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
+def test_report_of_standing_run_contradicts_its_controller(record: RunRecord) -> None:
     stands = stopped_at(record, 0.0, state="Locomoting", reason="moving")
     found = judged(stands)
     assert "Did not locomote: standing still: less than 20 mm in 1 s." in found.words
@@ -227,7 +227,7 @@ def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None
     assert reported.stalled_s == pytest.approx(9.0, abs=0.2)
 
 
-def test_a_controller_that_says_it_stands_and_moves(record: RunRecord) -> None:
+def test_report_of_moving_run_contradicts_its_controller(record: RunRecord) -> None:
     """The verdict is that of the motion; what control reported is beside it, as a report."""
     since_ns = (ARMED_S + 2.2) * 1e9
     lost = [
@@ -245,7 +245,7 @@ def test_a_controller_that_says_it_stands_and_moves(record: RunRecord) -> None:
     assert float(said[1]) == pytest.approx(6.3 - 2.2, abs=0.15)
 
 
-def test_a_run_that_moves_to_its_end_says_so(record: RunRecord) -> None:
+def test_report_of_run_moving_to_its_end_says_so(record: RunRecord) -> None:
     rows = slice(0, 500)
     fields = [field.name for field in dataclasses.fields(record)]
     short = {name: getattr(record, name)[rows] for name in fields if isinstance(getattr(record, name), np.ndarray)}
@@ -256,7 +256,7 @@ def test_a_run_that_moves_to_its_end_says_so(record: RunRecord) -> None:
     assert summarise(cut, "complete").locomoting_fraction == 1.0
 
 
-def test_text_from_outside_is_escaped(record: RunRecord) -> None:
+def test_report_escapes_text_of_the_run(record: RunRecord) -> None:
     nasty = '<script>alert("x")</script>&'
     config_ = msgspec.structs.replace(record.config, title=nasty)
     reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
@@ -268,7 +268,7 @@ def test_text_from_outside_is_escaped(record: RunRecord) -> None:
     assert nasty in Reader(page).text
 
 
-def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecord) -> None:
+def test_report_escapes_names_and_direction_marks(record: RunRecord) -> None:
     nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
     encoded = msgspec.json.encode(record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
     reported = [
@@ -289,7 +289,7 @@ def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecor
     assert "\\u202e\\u009b31m" in page
 
 
-def test_a_snake_that_lies_upwards_is_turned(record: RunRecord) -> None:
+def test_report_map_of_upward_snake_is_rotated(record: RunRecord) -> None:
     count = len(record.time_s)
     up = changed(
         record,

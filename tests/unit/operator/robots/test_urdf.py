@@ -66,7 +66,7 @@ def simulated(robot: Path) -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize("name", list_shipped("robots"))
-def test_every_shipped_robot_comes_back_as_it_was(name: str, tmp_path: Path) -> None:
+def test_urdf_round_trip_keeps_every_shipped_robot(name: str, tmp_path: Path) -> None:
     file, back = tmp_path / "robot.urdf", tmp_path / "robot.toml"
     export_robot(name, file)
     import_robot(file, ImportOptions(), back)
@@ -155,7 +155,7 @@ def test_urdf_import_alternating_millimeter_snake_has_inertia_of_mujoco(tmp_path
         (HEXA, HEXA_ORDER, "mamba_hills", "lateral_undulation"),
     ],
 )
-def test_snakes_from_elsewhere_run(
+def test_urdf_import_of_foreign_snakes_can_run(
     file: Path, order: ImportOptions, scenario: str, controller: str, tmp_path: Path
 ) -> None:
     robot = tmp_path / "robot.toml"
@@ -169,7 +169,7 @@ def test_snakes_from_elsewhere_run(
     assert robot_at(again) == robot_at(robot)
 
 
-def test_what_cannot_be_carried_over_is_named_with_its_lines() -> None:
+def test_urdf_import_names_values_it_cannot_express() -> None:
     slider, hexa = import_urdf(SLIDER, ImportOptions()), import_urdf(HEXA, HEXA_ORDER)
     left_out, changed = "\n".join(slider.left_out + hexa.left_out), "\n".join(slider.changed + hexa.changed)
     for words in (
@@ -224,7 +224,7 @@ def test_urdf_import_of_other_robot_is_refused_with_place(case: str, tmp_path: P
         import_urdf(file, ImportOptions())
 
 
-def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_urdf_import_report_is_available_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
     assert reported["file"] == str(tmp_path / "a.toml")

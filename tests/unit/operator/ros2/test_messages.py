@@ -42,7 +42,7 @@ def test_type_hashes_are_those_of_later_distributions(store: Stores) -> None:
 
 @FEW
 @given(messages_of(m.JointState))
-def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
+def test_ros_joint_states_omit_invalid_joints(joints: m.JointState) -> None:
     count = min(map(len, (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid)))
     joints = m.JointState(
         tick=0,
@@ -63,7 +63,7 @@ def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
         assert np.array_equal(getattr(seen, theirs), np.array(getattr(joints, ours), dtype=float)[kept])
 
 
-def test_transforms() -> None:
+def test_ros_transforms_match_kinematics() -> None:
     sent = [
         Transform("odom", "base_link", (1, 2, 3), (0.5, 0.1, 0.2, 0.3)),
         Transform("a", "bc", (4, 5, 6), (1, 0, 0, 0)),
@@ -150,7 +150,7 @@ def test_depth_in_millimetres_or_metres() -> None:
     assert np.allclose(metres[1:], 0.01 * np.arange(1, 12))
 
 
-def test_colour_and_intrinsics() -> None:
+def test_ros_color_image_has_intrinsics() -> None:
     sent = image(m.ColorImage)
     seen = read(ros.IMAGE, robot_in_ros.encode_color_image(STAMP_NS, "f", sent))
     assert seen.encoding == "rgb8"
@@ -204,7 +204,7 @@ def test_an_imu_has_no_orientation() -> None:
 
 @FEW
 @given(messages_of(m.Ranges))
-def test_scans(sent: m.Ranges) -> None:
+def test_ros_scan_contains_the_ranges(sent: m.Ranges) -> None:
     seen = read(ros.LASER_SCAN, robot_in_ros.encode_laser_scan(STAMP_NS, "f", sent))
     expected = [np.inf if range_m is None else np.float32(range_m) for range_m in sent.range_m]
     assert seen.ranges.tolist() == expected
@@ -228,7 +228,7 @@ def test_custom_sensor_numbers_have_field_and_unit() -> None:
 
 @FEW
 @given(messages_of(m.Status))
-def test_diagnostics(status: m.Status) -> None:
+def test_ros_diagnostics_contain_the_status(status: m.Status) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
     assert seen.name == status.robot
@@ -258,7 +258,7 @@ class TestSteering:
         sent = kind["Twist"](kind["Vector3"](x, 0.0, 0.0), kind["Vector3"](0.0, 0.0, turn))
         return bytes(JAZZY.serialize_cdr(sent, ros.TWIST.name))
 
-    def test_speed_and_direction(self) -> None:
+    def test_ros_twist_gives_speed_and_direction(self) -> None:
         steering = CmdVelSteering()
         first = steering.make_intent(self.twist(0.2, 1.0), 10**9, 0.5)
         assert first is not None
@@ -306,13 +306,13 @@ class TestSteering:
         assert anew.heading_w_rad == 2.0
 
     @pytest.mark.parametrize("bad", [b"", b"\0\1\0\0", b"\0\7\0\0" + bytes(48)])
-    def test_noise_is_counted(self, bad: bytes) -> None:
+    def test_ros_invalid_payload_is_counted(self, bad: bytes) -> None:
         steering = CmdVelSteering()
         assert steering.make_intent(bad, 0, 0.0) is None
         assert steering.rejected == 1
 
     @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
-    def test_what_no_snake_does_is_rejected(self, x: float, turn: float) -> None:
+    def test_ros_twist_impossible_for_a_snake_is_rejected(self, x: float, turn: float) -> None:
         steering = CmdVelSteering()
         assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None
         assert steering.rejected == 1

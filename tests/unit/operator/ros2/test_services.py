@@ -96,7 +96,7 @@ class TestJointTargets:
         assert set(points.target[4:]) == {0.1}
         assert set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
 
-    def test_silence_stops_where_the_joint_is(self) -> None:
+    def test_ros_joint_commands_that_stop_hold_the_joint(self) -> None:
         targets = RosJointTargets(self.robot)
         targets.accept(self.said(["joint_3"], velocity=[1.0]), 0)
         targets.make_setpoints(self.clock(VALID_NS), self.joints(0.3))

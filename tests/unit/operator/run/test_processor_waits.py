@@ -49,13 +49,13 @@ def test_short_waits_at_any_time_are_nothing() -> None:
     assert seen(waits(*((0.1 * i, 0.02 * i) for i in range(40)))).find_longest() is None
 
 
-def test_what_was_long_ago_is_no_cause() -> None:
+def test_processor_wait_long_ago_is_no_cause() -> None:
     rows = waits(*((0.1 * i, min(0.1 * i, 0.5)) for i in range(60)))
     assert seen(rows[:10]).find_longest() is not None
     assert seen(rows).find_longest() is None
 
 
-def test_rare_looks_are_enough() -> None:
+def test_processor_waits_are_found_by_rare_sampling() -> None:
     """On a slow computer whoever looks is late, too."""
     assert seen(waits((0.0, 0.0), (3.0, 2.9))).find_longest() == pytest.approx(("control", 2.9, 3.0))
 
@@ -68,7 +68,7 @@ def test_where_the_kernel_does_not_tell_nothing_is_said() -> None:
     assert read_usages(-1) == {}
 
 
-def test_the_kernel_is_asked() -> None:
+def test_processor_waits_come_from_the_kernel() -> None:
     ours = read_usages(os.getpid())[threading.get_native_id()]
     assert ours.ran_s > 0
     assert ours.ready

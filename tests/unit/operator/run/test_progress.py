@@ -32,7 +32,7 @@ def test_only_armed_time_counts_and_never_more_than_all(capsys: pytest.CaptureFi
     assert line.startswith("3.00 of 3 s")
 
 
-def test_a_new_host_begins_anew(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_restarts_with_a_new_host(capsys: pytest.CaptureFixture[str]) -> None:
     progress = Progress(run_config(duration_s=3.0))
     for tick in (100, 200):
         shown(progress, at(tick), capsys)

@@ -129,7 +129,7 @@ def test_what_comes_too_fast_for_a_slow_disk_is_told(
     assert [int(line) for line in kept] == list(range(100))
 
 
-def test_without_a_folder_nothing_is_kept() -> None:
+def test_run_files_without_folder_are_not_kept() -> None:
     files = RunFiles(None, pytest.fail)
     files.append("a.log", b"x")
     files.put("whole.json", b"{}")

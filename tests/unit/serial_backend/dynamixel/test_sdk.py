@@ -93,7 +93,7 @@ def bench() -> Iterator[Bench]:
     one.close()
 
 
-def test_ping_and_broadcast_ping(bench: Bench) -> None:
+def test_sdk_ping_and_broadcast_ping_are_answered(bench: Bench) -> None:
     assert SDK.ping(bench.port, 2) == (MODEL, COMM_SUCCESS, 0)
     assert SDK.ping(bench.port, 9)[1] == COMM_RX_TIMEOUT
     found, result = SDK.broadcastPing(bench.port)
@@ -119,7 +119,7 @@ def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench)
         assert moved == pytest.approx([100, 200, 300], abs=15)
 
 
-def test_whoever_is_silent_silences_all_behind_it(bench: Bench) -> None:
+def test_sdk_fast_read_ends_at_a_silent_servo(bench: Bench) -> None:
     bench.emulator.inject(parse_injection("mute:joint_2@0-9"), begins=True)
     read = GroupSyncRead(bench.port, SDK, at.PRESENT, 10)
     for servo in (1, 2, 3):
@@ -129,7 +129,7 @@ def test_whoever_is_silent_silences_all_behind_it(bench: Bench) -> None:
     assert not read.data_dict[3]
 
 
-def test_refusals(bench: Bench) -> None:
+def test_sdk_and_servo_refuse_the_same_writes(bench: Bench) -> None:
     port = bench.port
     assert SDK.write2ByteTxRx(port, 1, at.MODEL, 7) == (COMM_SUCCESS, Refusal.ACCESS)
     assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (COMM_SUCCESS, Refusal.RANGE)
