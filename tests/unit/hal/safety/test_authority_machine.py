@@ -459,6 +459,13 @@ class Everything(Model):
     def finish_while_armed(self) -> None:
         self.ask_for_less("finish")
 
+    @precondition(lambda self: self.state == "armed")
+    @rule()
+    def disarm_and_arm_without_a_command(self) -> None:
+        self.ask_for_less("disarm")
+        self.end_a_tick(0)
+        self.arm("worm", "lag", "0" * 16)
+
     @precondition(lambda self: self.state == "armed" and self.live)
     @rule(later=st.integers(0, 1))
     def send_for_the_arm_session_before(self, later: int) -> None:
