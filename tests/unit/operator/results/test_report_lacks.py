@@ -21,7 +21,22 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
-from snakesim_testing.operator.recorded_triplet import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
+from snakesim_testing.operator.recorded_triplet import (
+    ARMED_S,
+    LOST,
+    RATE_HZ,
+    SECONDS,
+    Reader,
+    changed,
+    first_seconds,
+    read,
+)
+
+
+@pytest.fixture(scope="module")
+def short_record(record: RunRecord) -> RunRecord:
+    return first_seconds(record, 2.0)
+
 
 MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 
@@ -29,8 +44,8 @@ MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 # --- runs with something missing -------------------------------------------------------------------------------
 
 
-def test_report_without_recording_has_all_sections(record: RunRecord) -> None:
-    page = read(changed(record, control=[], worlds=[]))
+def test_report_without_recording_has_all_sections(short_record: RunRecord) -> None:
+    page = read(changed(short_record, control=[], worlds=[]))
     assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
     assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
@@ -56,9 +71,9 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
     assert "handed over 419 times among 7 joints" in page.text
 
 
-def test_report_without_pose_has_all_sections(record: RunRecord) -> None:
-    count = len(record.time_s)
-    blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
+def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
+    count = len(short_record.time_s)
+    blind = changed(short_record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
     page = read(blind)
     assert "No playback: no valid pose was recorded." in page.text
     assert "pose sensor" not in page.text
@@ -67,34 +82,36 @@ def test_report_without_pose_has_all_sections(record: RunRecord) -> None:
     assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
 
 
-def test_report_without_route_has_all_sections(record: RunRecord) -> None:
-    scene = msgspec.structs.replace(record.config.scene, route=None, pegs_along_route=[])
+def test_report_without_route_has_all_sections(short_record: RunRecord) -> None:
+    scene = msgspec.structs.replace(short_record.config.scene, route=None, pegs_along_route=[])
     start = Start(on_route=False, position_m=(-5.0, 0.0))
-    page = read(changed(record, config=msgspec.structs.replace(record.config, scene=scene, start=start)))
+    page = read(changed(short_record, config=msgspec.structs.replace(short_record.config, scene=scene, start=start)))
     assert "distance of the tail end" in page.text
     assert "net displacement" in page.text
 
 
-def test_report_without_ticks_names_the_end(record: RunRecord) -> None:
-    fields = [field.name for field in dataclasses.fields(record)]
-    empty = {name: getattr(record, name)[:0] for name in fields if isinstance(getattr(record, name), np.ndarray)}
-    host = msgspec.structs.replace(record.host, ticks=0, armed_ticks=0, answered_ticks=0)
-    page = read(changed(record, control=[], worlds=[], host=host, **empty), "the host never became ready")
+def test_report_without_ticks_names_the_end(short_record: RunRecord) -> None:
+    fields = [field.name for field in dataclasses.fields(short_record)]
+    empty = {
+        name: getattr(short_record, name)[:0] for name in fields if isinstance(getattr(short_record, name), np.ndarray)
+    }
+    host = msgspec.structs.replace(short_record.host, ticks=0, armed_ticks=0, answered_ticks=0)
+    page = read(changed(short_record, control=[], worlds=[], host=host, **empty), "the host never became ready")
     assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
 
 
-def test_report_without_contact_sensor_has_all_sections(record: RunRecord) -> None:
+def test_report_without_contact_sensor_has_all_sections(short_record: RunRecord) -> None:
     """Whatever the robot file lists: its drives have none."""
-    sensors = [sensor for sensor in record.description.sensors if sensor.key != keys.CONTACTS]
-    page = read(changed(record, description=msgspec.structs.replace(record.description, sensors=sensors)))
+    sensors = [sensor for sensor in short_record.description.sensors if sensor.key != keys.CONTACTS]
+    page = read(changed(short_record, description=msgspec.structs.replace(short_record.description, sensors=sensors)))
     assert "No contact forces: the robot has no contact sensor." in page.text
 
 
-def test_report_of_controller_without_push_points_has_all_sections(record: RunRecord) -> None:
+def test_report_of_controller_without_push_points_has_all_sections(short_record: RunRecord) -> None:
     nothing = {"push_points": [], "desired_force_n": [], "propulsion_joint": None, "propulsion_n": None}
-    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in record.control]
-    config_ = msgspec.structs.replace(record.config, controller="hold")
-    page = read(changed(record, control=plain, config=config_))
+    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in short_record.control]
+    config_ = msgspec.structs.replace(short_record.config, controller="hold")
+    page = read(changed(short_record, control=plain, config=config_))
     assert "controller hold solved for no push-points" in page.text
     assert "controller hold named no propulsion joint" in page.text
     assert re.search("measured contacts?, in sum", page.text)
@@ -113,19 +130,19 @@ def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
 
 
 @pytest.mark.parametrize("joint", [None, "joint_3"])
-def test_report_of_harmless_fault_says_run_continued(record: RunRecord, joint: str | None) -> None:
+def test_report_of_harmless_fault_says_run_continued(short_record: RunRecord, joint: str | None) -> None:
     """The host noted it before the first arming; the run was complete."""
-    noting = Authority(record.description)
+    noting = Authority(short_record.description)
     noting.record_fault(
         Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint)
     )
-    host = msgspec.structs.replace(record.host, faults=noting.faults, ended="complete")
-    page = read(changed(record, host=host))
+    host = msgspec.structs.replace(short_record.host, faults=noting.faults, ended="complete")
+    page = read(changed(short_record, host=host))
     assert "Stopped by a fault" not in page.text
     assert "went on without" not in page.text
     assert "a fault (supply and heat are unknown, and ignored), 2 commands refused" in page.text
     ending = Ending()
-    note_reasons(ending, host, record.config)
+    note_reasons(ending, host, short_record.config)
     assert ending.reason is None, "or `snakesim run` ends with exit code 1"
 
 
@@ -256,31 +273,35 @@ def test_report_of_run_moving_to_its_end_says_so(record: RunRecord) -> None:
     assert summarise(cut, "complete").locomoting_fraction == 1.0
 
 
-def test_report_escapes_text_of_the_run(record: RunRecord) -> None:
+def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
     nasty = '<script>alert("x")</script>&'
-    config_ = msgspec.structs.replace(record.config, title=nasty)
-    reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
-    host = msgspec.structs.replace(record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
-    hurt = changed(record, config=config_, control=reported, host=host)
+    config_ = msgspec.structs.replace(short_record.config, title=nasty)
+    reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in short_record.control]
+    host = msgspec.structs.replace(short_record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
+    hurt = changed(short_record, config=config_, control=reported, host=host)
     page = report_page(hurt, summarise(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
     assert nasty in Reader(page).text
 
 
-def test_report_escapes_names_and_direction_marks(record: RunRecord) -> None:
+def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> None:
     nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
-    encoded = msgspec.json.encode(record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
+    encoded = msgspec.json.encode(short_record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
     reported = [
         msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
         if one.propulsion_joint
         else one
-        for one in record.control
+        for one in short_record.control
     ]
-    pegs_ = [msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(record.config.scene.cylinder)]
-    scene = msgspec.structs.replace(record.config.scene, cylinder=pegs_)
-    config_ = msgspec.structs.replace(record.config, scene=scene)
-    hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_)
+    pegs_ = [
+        msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(short_record.config.scene.cylinder)
+    ]
+    scene = msgspec.structs.replace(short_record.config.scene, cylinder=pegs_)
+    config_ = msgspec.structs.replace(short_record.config, scene=scene)
+    hurt = changed(
+        short_record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_
+    )
     page = report_page(hurt, summarise(hurt, "complete"))
     assert find_propulsion_intervals(hurt)
     assert "<script>alert" not in page
@@ -289,11 +310,11 @@ def test_report_escapes_names_and_direction_marks(record: RunRecord) -> None:
     assert "\\u202e\\u009b31m" in page
 
 
-def test_report_map_of_upward_snake_is_rotated(record: RunRecord) -> None:
-    count = len(record.time_s)
+def test_report_map_of_upward_snake_is_rotated(short_record: RunRecord) -> None:
+    count = len(short_record.time_s)
     up = changed(
-        record,
-        position_w=record.position_w[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
+        short_record,
+        position_w=short_record.position_w[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
         orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
         worlds=[],
         control=[],
