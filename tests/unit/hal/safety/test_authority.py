@@ -9,7 +9,7 @@ from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, Mode, SensorDescription
+from snakesim_hal.wire.messages import Fault, LeaseRequest, Mode, SensorDescription
 from snakesim_testing.hal.authority_rig import (
     ARM,
     CLEAR,
@@ -109,6 +109,26 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
     assert "have not received the stop" in answer.reason
     rig.authority.decide()
     assert rig.arm().ok
+
+
+def test_arming_for_the_first_time_waits_for_no_stop() -> None:
+    rig = Rig()
+    rig.authority.fault(HOT)
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    assert rig.arm().ok
+
+
+def test_arming_after_commands_ended_is_refused_despite_renewals() -> None:
+    rig = commanded()
+    renewal = LeaseRequest(action="renew", holder="control", priority=100, epoch=1)
+    rig.now_ns = LEASE_NS
+    assert rig.authority.on_lease(renewal, rig.now_ns).ok
+    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
+    rig.now_ns += 1
+    assert rig.arm().reason == "no commands from control any more"
 
 
 def test_arming_unchecked_robot_needs_explicit_request() -> None:

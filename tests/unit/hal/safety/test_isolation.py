@@ -222,3 +222,15 @@ def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None
         assert len(log.kept) <= MAX_FAULTS_KEPT
         assert len(log.kept) + log.left_out == before + 1 + tick - 1999
     assert [fault.tick for fault in log.kept] == sorted(fault.tick for fault in log.kept)
+
+
+def test_isolation_fault_in_a_full_log_is_dropped_like_others() -> None:
+    """Only the fault that stopped the robot is always kept."""
+    rig = armed(safety__max_isolated_joints=1)
+    for tick in range(16):
+        rig.authority.record_fault(Fault(tick=tick, what="noted", cause=""))
+    rig.authority.fault(Fault(tick=16, what="module_frozen", cause="", joint="joint_2", reach="joint"))
+    assert rig.authority.isolated_joints == ["joint_2"]
+    for tick in range(17, 100):
+        rig.authority.record_fault(Fault(tick=tick, what="noted", cause=""))
+    assert 16 not in [fault.tick for fault in rig.authority.faults]
