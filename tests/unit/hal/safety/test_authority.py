@@ -221,6 +221,14 @@ def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None
     assert rig.arm().ok
 
 
+def test_lease_taken_while_disarmed_forgets_the_old_commands() -> None:
+    rig = commanded()
+    rig.acquire("teleop", priority=200)
+    assert rig.arm().reason == "no commands from teleop yet"
+    assert rig.send(0.1, sequence=0) is None
+    assert rig.arm().ok
+
+
 def test_holder_gone_while_armed_keeps_the_lease() -> None:
     rig = armed()
     rig.authority.on_holder_gone("control is gone")
