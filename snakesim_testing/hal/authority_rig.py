@@ -80,5 +80,5 @@ def modes(decision: TickDecision) -> set[Mode]:
     return set(decision.setpoints.mode)
 
 
-def receive(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
+def report_power(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
     rig.authority.observe_power(power(motor_c, volts, valid=valid or True), rig.now_ns)

@@ -20,7 +20,7 @@ from snakesim_testing.hal.authority_rig import (
     armed,
     commanded,
     modes,
-    receive,
+    report_power,
 )
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, state
 
@@ -89,7 +89,7 @@ def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> Non
 
 @pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])
 def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
-    """Reset and armed again within one period, the backend would never receive the stop."""
+    """Reset and armed again within one period, the backend would never report_power the stop."""
     rig = armed()
     rig.tick_with(0.1)
     match stop:
@@ -100,7 +100,7 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
         case _:
             rig.authority.on_lifecycle(DISARM, rig.now_ns)
     if stop != "disarm":
-        rig.pass_tick()  # the motors receive the stop, but not yet its reset
+        rig.pass_tick()  # the motors report_power the stop, but not yet its reset
         rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     rig.acquire()
     rig.send(0.1)
@@ -363,12 +363,12 @@ def test_faults_since_start_survive_a_reset() -> None:
 
 def test_heat_derates_then_stops_then_blocks_arming() -> None:
     rig = armed()
-    receive(rig, [20.0, 92.5, 20.0])
+    report_power(rig, [20.0, 92.5, 20.0])
     derated = rig.tick_with(0.1)
     assert derated.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
     assert derated.limited == {1: "thermal"}
     assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
-    receive(rig, [20.0, 110.0, 20.0])
+    report_power(rig, [20.0, 110.0, 20.0])
     stopped = rig.pass_tick()
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
     assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also while stopping
@@ -376,7 +376,7 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
     rig.acquire()
     rig.tick_with(0.1)
     assert "joint_2 is at 110" in rig.arm().reason
-    receive(rig, [20.0, 70.0, 20.0])
+    report_power(rig, [20.0, 70.0, 20.0])
     rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok
@@ -385,7 +385,7 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
 def test_weak_supply_blocks_arming_with_one_explanation() -> None:
     rig = Rig()
     for _ in range(7):
-        receive(rig, [20.0] * JOINTS, volts=12.0)
+        report_power(rig, [20.0] * JOINTS, volts=12.0)
         rig.pass_tick()
     rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     answer = rig.arm()

@@ -6,12 +6,12 @@ import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire.messages import Fault, Mode
-from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
+from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, report_power
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
 
 
-def lame(**robot: Any) -> Rig:
+def armed_without_joint_2(**robot: Any) -> Rig:
     """An armed robot that has lost joint_2."""
     rig = armed(safety__max_isolated_joints=1, **robot)
     rig.observe(0.1, valid=SAYS_NO)
@@ -21,7 +21,7 @@ def lame(**robot: Any) -> Rig:
     return rig
 
 
-def broken(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
+def fault_in(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
     return Fault(tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, reach=reach)
 
 
@@ -37,7 +37,7 @@ def test_by_default_one_joint_stops_the_robot() -> None:
 
 
 def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     (fault,) = rig.authority.faults
     assert fault.what == "state_invalid"
     assert fault.joint == "joint_2"
@@ -59,15 +59,15 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
 
 
 def test_nothing_is_limited_where_nothing_is_asked() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     assert rig.tick_with([0.1, 0.0, 0.1], [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]).limited == {}
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_one_joint_too_many_stops_the_robot(known: bool) -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     if known:
-        rig.authority.fault(broken("joint_3"))
+        rig.authority.fault(fault_in("joint_3"))
     else:
         rig.observe(0.1, valid=[True, False, False])
         rig.pass_tick()
@@ -92,7 +92,9 @@ def test_two_that_fail_at_once_are_two() -> None:
 
 
 @pytest.mark.parametrize(
-    "fault", [broken(reach="robot"), broken(joint=None), broken(joint="joint_9")], ids=["robot", "nobody", "unknown"]
+    "fault",
+    [fault_in(reach="robot"), fault_in(joint=None), fault_in(joint="joint_9")],
+    ids=["robot", "nobody", "unknown"],
 )
 def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
     rig = armed(safety__max_isolated_joints=3)
@@ -109,10 +111,10 @@ def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
 
 
 def test_what_a_lost_joint_complains_of_is_no_news() -> None:
-    rig = lame()
-    rig.authority.fault(broken())
+    rig = armed_without_joint_2()
+    rig.authority.fault(fault_in())
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
-    rig.authority.fault(broken())
+    rig.authority.fault(fault_in())
     assert rig.authority.state == "disarmed"
     assert len(rig.authority.faults) == 1
 
@@ -125,13 +127,13 @@ def test_while_disarmed_no_joint_is_set_aside() -> None:
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert "joint_2" in answer.reason
-    rig.authority.fault(broken())
+    rig.authority.fault(fault_in())
     assert rig.authority.state == "fault"
     assert rig.authority.isolated_joints == []
 
 
 def test_it_may_be_armed_again_without_the_joint() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.observe(0.1, valid=SAYS_NO)
@@ -141,7 +143,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
 
 
 def test_isolation_ends_after_reset_and_a_new_state() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)  # not while it moves
     assert answer.refusal == "wrong_state"
     assert answer.reason == "nothing to reset in state armed; disarm first, then a reset ends the isolation of joint_2"
@@ -160,7 +162,7 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
 
 @pytest.mark.parametrize("action", ["passive", "damp", "hold"])
 def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
-    rig = lame(safety__action=action)
+    rig = armed_without_joint_2(safety__action=action)
     rig.pass_tick(6)
     assert rig.authority.state == "fault"
     points = rig.pass_tick().setpoints
@@ -172,7 +174,7 @@ def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
 
 
 def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     rig.authority.on_estop(ESTOP, rig.tick)
     assert rig.authority.isolated_joints == ["joint_2"]
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
@@ -181,14 +183,14 @@ def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
 
 def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     rig = armed(safety__max_isolated_joints=1)
-    receive(rig, [20.0, 110.0, 20.0])
+    report_power(rig, [20.0, 110.0, 20.0])
     assert rig.tick_with(0.1).setpoints.isolated == {1}
     assert rig.authority.state == "armed"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok  # it stays hot, and is not asked
-    receive(rig, [20.0, 110.0, 20.0], volts=12.0)
+    report_power(rig, [20.0, 110.0, 20.0], volts=12.0)
     for _ in range(7):
         rig.tick_with(0.1)
     assert rig.authority.state == "fault"
@@ -196,11 +198,11 @@ def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
 
 
 def test_isolation_silent_health_of_lost_joint_is_not_recorded() -> None:
-    rig = lame()
-    receive(rig, [20.0] * JOINTS)
+    rig = armed_without_joint_2()
+    report_power(rig, [20.0] * JOINTS)
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick(250)
-    receive(rig, [20.0] * JOINTS, valid=[True, False, True])
+    report_power(rig, [20.0] * JOINTS, valid=[True, False, True])
     rig.pass_tick(100)
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
     rig.pass_tick(250)

@@ -14,7 +14,7 @@ HEADING = {"kind": "heading", "distance_m": 0.3}
 
 
 @cache
-def ran(controller: str, duration_s: float = 2.5, goal: str = "") -> Result:
+def simulate_run(controller: str, duration_s: float = 2.5, goal: str = "") -> Result:
     goals = {
         "heading": HEADING,
         "too far": {**HEADING, "distance_m": 50.0},
@@ -33,7 +33,7 @@ def center_m(result: Result, row: int) -> float:
 
 
 def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
-    result = ran("path_following", goal="heading")
+    result = simulate_run("path_following", goal="heading")
     reported, record = result.summary, result.record
     assert reported.crossed is True
     assert reported.goal_m == reported.advance_m == 0.3
@@ -48,7 +48,7 @@ def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
 
 @pytest.mark.slow
 def test_advance_goal_out_of_reach_is_not_crossed() -> None:
-    reported = ran("path_following", goal="too far").summary
+    reported = simulate_run("path_following", goal="too far").summary
     assert reported.crossed is False
     assert reported.crossed_s is None
     assert reported.goal_m == 50
@@ -58,7 +58,7 @@ def test_advance_goal_out_of_reach_is_not_crossed() -> None:
 
 @pytest.mark.slow
 def test_advance_backward_is_zero() -> None:
-    reported = ran("path_following", goal="backward").summary
+    reported = simulate_run("path_following", goal="backward").summary
     assert reported.crossed is False
     assert reported.advance_m == pytest.approx(0, abs=0.01)
     assert reported.energy_j_per_m is None
@@ -66,7 +66,7 @@ def test_advance_backward_is_zero() -> None:
 
 @pytest.mark.slow
 def test_points_are_passed_by_the_head() -> None:
-    result = ran("path_following", goal="points")
+    result = simulate_run("path_following", goal="points")
     reported, nodes = result.summary, result.record.nodes_w(0)
     assert nodes is not None
     head = nodes[-1, :2]
@@ -80,19 +80,19 @@ def test_points_are_passed_by_the_head() -> None:
 
 @pytest.mark.slow
 def test_advance_of_standing_body_is_all_stalled() -> None:
-    reported = ran("hold", goal="heading").summary
+    reported = simulate_run("hold", goal="heading").summary
     assert reported.stalled_s == pytest.approx(2.5 - 1.0, abs=0.2)
     assert reported.crossed is False
 
 
 def test_advance_without_goal_is_forward_distance() -> None:
-    reported = ran("path_following").summary
+    reported = simulate_run("path_following").summary
     assert reported.goal_m is reported.crossed is None
     assert reported.advance_m == pytest.approx(reported.net_displacement_m, rel=0.02)
 
 
 def test_the_work_of_torque_joints_is_told_apart() -> None:
-    pushed, followed = ran("obstacle_triplet").summary, ran("path_following").summary
+    pushed, followed = simulate_run("obstacle_triplet").summary, simulate_run("path_following").summary
     assert followed.torque_joints_j == 0
     assert followed.position_joints_j
     assert pushed.torque_joints_j is not None
@@ -103,7 +103,7 @@ def test_the_work_of_torque_joints_is_told_apart() -> None:
 
 @pytest.mark.slow
 def test_advance_of_run_ending_at_goal_keeps_its_numbers() -> None:
-    whole = ran("path_following", goal="heading")
+    whole = simulate_run("path_following", goal="heading")
     short = simulate(whole.record.config, until_goal=True)
     assert short.summary.ended == "complete"
     assert len(short.record.time_s) < len(whole.record.time_s)
@@ -113,7 +113,7 @@ def test_advance_of_run_ending_at_goal_keeps_its_numbers() -> None:
 
 def test_advance_of_sideways_travel_has_metrics_along_both_directions() -> None:
     """Along its first heading it hardly advances, and per metre of that its energy says nothing."""
-    straight = ran("path_following")
+    straight = simulate_run("path_following")
     record = straight.record
     turned = record.position_w[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]  # as if it had gone to its left, by a quarter of a turn
     sideways = summarise(dataclasses.replace(record, position_w=turned), "complete")
