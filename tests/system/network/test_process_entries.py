@@ -34,7 +34,8 @@ def test_a_difference_is_told_with_both_places(change: str, named: str, sessions
     wait_until(lambda: bool(entries.find_problems(own, ["control"])), "an entry", 5.0)
     wait_until(lambda: named in entries.find_problems(own, ["control"])[0], named, 5.0)
     (reported,) = entries.find_problems(own, ["control"])
-    assert f"(control, process {own.pid})" in reported and f"(host, process {own.pid})" in reported
+    assert f"(control, process {own.pid})" in reported
+    assert f"(host, process {own.pid})" in reported
     assert entries.find_problems(own, ["guidance"]) == []
 
 

@@ -14,7 +14,8 @@ CHECKER = Path(__file__).parents[3] / "docs" / "style" / "check_prose.py"
 @pytest.fixture(scope="module")
 def checker() -> ModuleType:
     specification = importlib.util.spec_from_file_location("check_prose", CHECKER)
-    assert specification is not None and specification.loader is not None
+    assert specification is not None
+    assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)
     sys.modules["check_prose"] = module
     specification.loader.exec_module(module)

@@ -38,10 +38,11 @@ def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> N
 def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, amplitude_m: float, moves: bool) -> None:
     time_s = record.time_s - record.time_s[0]
     motion = measure_motion(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
-    assert motion is not None and motion.moving_fraction == (1.0 if moves else 0.0)
+    assert motion is not None
+    assert motion.moving_fraction == (1.0 if moves else 0.0)
 
 
-def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
+def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
     blind = changed(record, position_w=record.position_w * np.nan, worlds=[])
     assert measure_motion(blind) is None
     reported = summarise(blind, "complete")
@@ -70,7 +71,8 @@ def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.C
     print_summary(summary)
     printed = re.search(r"\((\d+) hand-overs in all\)", capsys.readouterr().out)
     said = re.search(r"handed over (\d+) times among 3 joints", verdict(many, summary).words)
-    assert printed is not None and said is not None
+    assert printed is not None
+    assert said is not None
     assert int(printed[1]) == int(said[1]) == summary.hand_overs == len(summary.propulsion_joints or []) - 1 > 30
 
 

@@ -25,13 +25,14 @@ def test_only_armed_time_counts_and_never_more_than_all(capsys: pytest.CaptureFi
     assert line.startswith("2.00 of 3 s")
     for tick in range(320, 2001, 20):  # seventeen seconds in which a person looks at the fault
         line = shown(progress, at(tick, "fault"), capsys)
-    assert line.startswith("2.20 of 3 s") and "fault: fault" in line
+    assert line.startswith("2.20 of 3 s")
+    assert "fault: fault" in line
     for tick in range(2020, 2200, 20):
         line = shown(progress, at(tick), capsys)
     assert line.startswith("3.00 of 3 s")
 
 
-def test_a_new_host_begins_anew(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_restarts_with_a_new_host(capsys: pytest.CaptureFixture[str]) -> None:
     progress = Progress(run_config(duration_s=3.0))
     for tick in (100, 200):
         shown(progress, at(tick), capsys)
