@@ -27,7 +27,7 @@ packages := snakesim $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs release lock clean FORCE
+.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs wheels release lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -130,6 +130,9 @@ schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key sp
 
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py
+
+wheels: $(stamp) ## Build wheels with compiled C libraries for x86-64 and aarch64, into build/wheels
+	$(bin)/python deploy/wheels.py
 
 release: $(stamp) ## Build and check what a release publishes, into build/release
 	$(bin)/python deploy/release.py $(ARGS)
