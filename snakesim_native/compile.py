@@ -36,7 +36,7 @@ NO_COMPILER = "no C compiler was found (install gcc, or `pip install ziglang`)"
 
 
 class CannotCompileError(Exception):
-    """A library cannot be compiled here; the text says why and what to do."""
+    """A library cannot be compiled here; the text explains why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def compile_all(folder: Path) -> list[str]:
         try:
             compile_library(library, folder)
         except CannotCompileError as error:
-            sentences.append(f"{library.name} runs in Python: {library.python_cost}. Reason: {error}")
+            sentences.append(f"without the C library `{library.name}` {library.python_cost}: {error}")
     return sentences
 
 
