@@ -141,7 +141,7 @@ lock: ## Resolve the lock files again (UPGRADE=1 for newer versions)
 	$(bootstrap) lock $(if $(UPGRADE),--upgrade)
 
 clean: ## Remove what setup, builds and caches left; recordings in runs/ stay
-	rm -rf .venv .tools build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .tools build dist *.egg-info snakesim_native/compiled .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Setup runs again after a change of its inputs, in a folder that was moved, when the environment's Python is gone,
