@@ -1,173 +1,35 @@
-"""Grows the paths of a beam search in C, with the results of `path_growth` to the last bit.
+"""Grows the paths of a beam search in C, with the results of `specified_growth` to the last bit.
 
-The structures and arrays here are laid out as in `snakesim_native/planner/search.h`, whose fields are explained there.
 The C functions trust the sizes, so this module checks every array before it passes an address. All memory belongs to
 this module; the C functions allocate none.
 """
 
 import ctypes
-from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.navigation import margin, obstacle_grid, path_growth
+from snakesim_gnc.navigation import obstacle_grid
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_growth import SearchedPath, SearchTask, count_body_arcs
-from snakesim_gnc.navigation.search_arcs import STEP_M, ArcTable
-from snakesim_gnc.navigation.search_nodes import MAX_CONTACTS, NodeLayer
-from snakesim_gnc.navigation.search_parameters import SearchParameters
-from snakesim_native.libraries import PLANNER
-from snakesim_native.load import load
+from snakesim_gnc.navigation.path_search import margin, search_parameters
+from snakesim_gnc.navigation.path_search.native_library import (
+    INTEGER,
+    NO_LAYER_ROOM,
+    NODE,
+    NUMBER,
+    NativeGrowthError,
+    NativeLayout,
+    NativeSearch,
+    explain_absence,
+    load_library,
+)
+from snakesim_gnc.navigation.path_search.search_arcs import ArcTable
+from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_body_arcs
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 
 Array = NDArray[Any]
-
-INTEGER = np.dtype(np.int64)
-NUMBER = np.dtype(np.float64)
-CONTACT = np.dtype([("obstacle", INTEGER), ("s_m", NUMBER), ("gap_m", NUMBER), ("wrench", NUMBER, 3)])
-NODE = np.dtype(
-    [
-        ("x_m", NUMBER),
-        ("y_m", NUMBER),
-        ("heading_rad", NUMBER),
-        ("curvature_per_m", NUMBER),
-        ("cost_m", NUMBER),
-        ("drag_m", NUMBER, 3),
-        ("contacts", CONTACT, MAX_CONTACTS),
-    ]
-)
-NO_LAYER_ROOM = -1  # what `snakesim_planner_expand` returns then
-
-
-class NativeGrowthError(Exception):
-    """The C library and this module do not fit each other, or an array has a wrong size."""
-
-
-def _numbers(*names: str) -> list[tuple[str, Any]]:
-    return [(name, ctypes.c_double) for name in names]
-
-
-def _integers(*names: str) -> list[tuple[str, Any]]:
-    return [(name, ctypes.c_int64) for name in names]
-
-
-def _addresses(*names: str) -> list[tuple[str, Any]]:
-    return [(name, ctypes.c_void_p) for name in names]
-
-
-class _Grid(ctypes.Structure):
-    _fields_ = [
-        *_numbers("low_x_m", "low_y_m", "cell_m", "cell_error_m", "max_distance_m"),
-        *_integers("columns", "rows"),
-        *_addresses("nearest", "distance_m", "center_m", "direction", "half_size_m", "rounding_m"),
-    ]
-
-
-class _ArcTable(ctypes.Structure):
-    _fields_ = [
-        *_integers("count"),
-        *_addresses("curvature_per_m", "turn_rad", "half_turn_rad"),
-        *_addresses("end_ahead_m", "end_left_m", "middle_ahead_m", "middle_left_m"),
-        *_addresses("needed_inside_m", "surely_clear_m"),
-        *_numbers("needed_m", "surely_blocked_m"),
-    ]
-
-
-class _Parameters(ctypes.Structure):
-    _fields_ = [
-        *_numbers("step_m", "body_length_m", "radius_m", "contact_distance_m", "max_frontal", "min_push"),
-        *_numbers("obstacle_friction", "unused_tail_m", "unused_head_m", "wanted_margin_n"),
-        *_numbers("max_heading_error_rad", "near_m"),
-        *_numbers("push_reward", "push_reward_of_body", "brake_cost", "progress_reward", "curvature_change_cost_m2"),
-        *_numbers("weak_margin_cost_m", "weak_margin_cost_near_m", "failed_path_cost_m", "sideways_cost_m"),
-        *_numbers("failed_path_m"),
-        *_numbers("max_contact_force_n", "min_determinant", "moment_scale", "min_force_per_n"),
-        *_numbers("cell_m", "cell_rad", "wide_cell_m", "wide_cell_rad"),
-        *_integers("max_candidates", "kept_nodes", "kept_per_wide_cell", "body_arcs"),
-    ]
-
-
-class _Task(ctypes.Structure):
-    _fields_ = [
-        *_numbers("origin_x_m", "origin_y_m", "goal_rad", "goal_x", "goal_y"),
-        *_addresses("lying_drag_m"),
-        *_integers("is_relaid", "lying_count"),
-        *_addresses("lying_m"),
-        *_numbers("max_sideways_m"),
-        *_integers("failed_count"),
-        *_addresses("failed_m"),
-    ]
-
-
-class _Layers(ctypes.Structure):
-    _fields_ = [
-        *_integers("layer_count", "layer_room", "node_room", "node_count"),
-        *_numbers("s_m"),
-        *_addresses("parents", "children"),
-        *_addresses("parent", "x_m", "y_m", "margin_n", "arc_drag_m"),
-    ]
-
-
-class _Scratch(ctypes.Structure):
-    _fields_ = [
-        *_integers("entry_room"),
-        ("stamp", ctypes.c_int32),
-        *_addresses("arcs", "keys", "spare_keys", "candidates", "entries", "tail_nodes", "near_failed_m"),
-    ]
-
-
-class _Search(ctypes.Structure):
-    _fields_ = [
-        ("grid", _Grid),
-        ("arc_table", _ArcTable),
-        ("parameters", _Parameters),
-        ("task", _Task),
-        ("layers", _Layers),
-        ("scratch", _Scratch),
-    ]
-
-
-class _Layout(ctypes.Structure):
-    _fields_ = _integers("search", "node", "contact", "arc", "sort_key", "candidate", "cell_entry")
-
-
-@dataclass(frozen=True)
-class _Library:
-    """The functions of the C library, and the sizes of its structures in bytes."""
-
-    expand: Any  # int64 expand(Search*)
-    layout: _Layout
-
-
-@cache
-def load_library() -> _Library | None:
-    """Return the C library; None if it is not installed here.
-
-    Raises:
-        NativeGrowthError: its structures have other sizes than those of this module.
-    """
-    handle = load(PLANNER).handle
-    if handle is None:
-        return None
-    layout = _Layout()
-    handle.snakesim_planner_layout.restype = None
-    handle.snakesim_planner_layout.argtypes = [ctypes.POINTER(_Layout)]
-    handle.snakesim_planner_layout(ctypes.byref(layout))
-    here = (ctypes.sizeof(_Search), NODE.itemsize, CONTACT.itemsize)
-    there = (layout.search, layout.node, layout.contact)
-    if here != there:
-        raise NativeGrowthError(f"search, node and contact have {there} bytes in the C library, and {here} in Python")
-    expand = handle.snakesim_planner_expand
-    expand.restype = ctypes.c_int64
-    expand.argtypes = [ctypes.POINTER(_Search)]
-    return _Library(expand, layout)
-
-
-def is_native_available() -> bool:
-    """Return whether the C library can be loaded here."""
-    return load_library() is not None
 
 
 class NativeGrowth:
@@ -190,13 +52,13 @@ class NativeGrowth:
         """
         library = load_library()
         if library is None:
-            raise NativeGrowthError(f"there is no C library of the planner: {load(PLANNER).problem}")
+            raise NativeGrowthError(f"there is no C library of the planner: {explain_absence()}")
         self._expand = library.expand
         self._node_room = max(parameters.kept_nodes, len(start.x_m))
         self._layer_room = steps + 1
         self._arrays: list[Array] = []  # keeps the memory alive, as the structures hold only addresses
 
-        self._search = _Search()
+        self._search = NativeSearch()
         self._fill_grid(obstacles)
         self._fill_arc_table(ArcTable(parameters))
         self._fill_parameters(parameters)
@@ -296,11 +158,11 @@ class NativeGrowth:
         parameters.body_arcs = count_body_arcs(given)
         parameters.radius_m = given.radius_m
         parameters.contact_distance_m = given.contact_distance_m
-        parameters.max_frontal = path_growth.MAX_FRONTAL
-        parameters.min_push = path_growth.MIN_PUSH
+        parameters.max_frontal = search_parameters.MAX_FRONTAL
+        parameters.min_push = search_parameters.MIN_PUSH
         parameters.obstacle_friction = given.assumed_obstacle_friction
-        parameters.max_heading_error_rad = path_growth.MAX_HEADING_ERROR_RAD
-        # Costs; the products are those that `path_growth` computes first.
+        parameters.max_heading_error_rad = search_parameters.MAX_HEADING_ERROR_RAD
+        # Costs; the products are those that `specified_growth` computes first.
         parameters.push_reward = given.push_reward
         parameters.push_reward_of_body = given.push_reward_of_body
         parameters.brake_cost = given.brake_cost
@@ -310,7 +172,7 @@ class NativeGrowth:
         parameters.weak_margin_cost_near_m = STEP_M * given.weak_margin_cost_near
         parameters.near_m = given.near_m
         parameters.failed_path_cost_m = STEP_M * given.failed_path_cost
-        parameters.failed_path_m = path_growth.FAILED_PATH_M
+        parameters.failed_path_m = search_parameters.FAILED_PATH_M
         parameters.sideways_cost_m = STEP_M * given.sideways_cost
         # The propulsion margin.
         parameters.unused_tail_m = given.unused_tail_m
@@ -321,11 +183,11 @@ class NativeGrowth:
         parameters.moment_scale = margin.WRENCH_SCALE[2]
         parameters.min_force_per_n = margin.MIN_FORCE_PER_N
         # Nodes that are kept.
-        parameters.cell_m = path_growth.CELL_M
-        parameters.cell_rad = path_growth.CELL_RAD
-        parameters.wide_cell_m = path_growth.WIDE_CELL_M
-        parameters.wide_cell_rad = path_growth.WIDE_CELL_RAD
-        parameters.max_candidates = path_growth.CANDIDATES_PER_KEPT_NODE * given.kept_nodes
+        parameters.cell_m = search_parameters.CELL_M
+        parameters.cell_rad = search_parameters.CELL_RAD
+        parameters.wide_cell_m = search_parameters.WIDE_CELL_M
+        parameters.wide_cell_rad = search_parameters.WIDE_CELL_RAD
+        parameters.max_candidates = search_parameters.CANDIDATES_PER_KEPT_NODE * given.kept_nodes
         parameters.kept_nodes = given.kept_nodes
         parameters.kept_per_wide_cell = given.kept_per_wide_cell
 
@@ -376,7 +238,7 @@ class NativeGrowth:
         layers.margin_n = self._pass("the history of margins", self._margin_n, history)
         layers.arc_drag_m = self._pass("the history of drag", arc_drag_m, (*history, 3))
 
-    def _fill_scratch(self, layout: _Layout, curvature_count: int) -> None:
+    def _fill_scratch(self, layout: NativeLayout, curvature_count: int) -> None:
         scratch = self._search.scratch
         arc_room = self._node_room * curvature_count
         entry_room = 1 << (arc_room * 5 // 4).bit_length()  # a power of two; the table is at most 80 % full
