@@ -99,13 +99,21 @@ typedef struct {
     double max_distance_m; // of cells without an obstacle, and outside of the grid
     int64_t columns;
     int64_t rows;
-    const int64_t* nearest;    // (columns, rows) index of the obstacle, or NO_OBSTACLE
-    const double* distance_m;  // (columns, rows)
+    int64_t* nearest;          // (columns, rows) index of the obstacle, or NO_OBSTACLE
+    double* distance_m;        // (columns, rows)
     const double* center_m;    // (m, 2)
     const double* direction;   // (m, 2) cosine and sine of the yaw
     const double* half_size_m; // (m, 2)
     const double* rounding_m;  // (m)
 } Grid;
+
+// A rectangle of cells; the last ones are not in it.
+typedef struct {
+    int64_t first_column;
+    int64_t last_column;
+    int64_t first_row;
+    int64_t last_row;
+} Window;
 
 // The arcs of all curvatures, as in `search_arcs.py`. Each array has c numbers.
 typedef struct {

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.navigation import obstacle_grid
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search import margin, search_parameters
 from snakesim_gnc.navigation.path_search.native_library import (
@@ -20,6 +19,7 @@ from snakesim_gnc.navigation.path_search.native_library import (
     NUMBER,
     NativeGrowthError,
     NativeLayout,
+    NativeMemory,
     NativeSearch,
     explain_absence,
     load_library,
@@ -56,10 +56,10 @@ class NativeGrowth:
         self._expand = library.expand
         self._node_room = max(parameters.kept_nodes, len(start.x_m))
         self._layer_room = steps + 1
-        self._arrays: list[Array] = []  # keeps the memory alive, as the structures hold only addresses
+        self._memory = NativeMemory()
 
         self._search = NativeSearch()
-        self._fill_grid(obstacles)
+        self._search.grid = obstacles.make_native_grid(self._memory)
         self._fill_arc_table(ArcTable(parameters))
         self._fill_parameters(parameters)
         self._fill_task(task, parameters)
@@ -98,55 +98,20 @@ class NativeGrowth:
             row = int(self._parent[layer, row])
         return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
 
-    def _pass(self, name: str, array: Array, shape: tuple[int, ...], dtype: np.dtype[Any] = NUMBER) -> int:
-        """Return the address of an array, which stays alive as long as this object.
-
-        Args:
-            name: of the array, for the error.
-            array: the values; they are copied if they are not contiguous or have another type.
-            shape: that the C functions expect.
-            dtype: that they expect.
-
-        Raises:
-            NativeGrowthError: the array has another shape.
-        """
-        if array.shape != shape:
-            raise NativeGrowthError(f"{name} has the shape {array.shape}, the C library of the planner expects {shape}")
-        contiguous = np.ascontiguousarray(array, dtype=dtype)
-        self._arrays.append(contiguous)
-        return contiguous.ctypes.data
-
-    def _fill_grid(self, obstacles: ObstacleGrid) -> None:
-        grid = self._search.grid
-        outlines = obstacles.outlines
-        count = len(outlines)
-        grid.low_x_m, grid.low_y_m = obstacles.low_w
-        grid.columns, grid.rows = obstacles.shape
-        grid.cell_m = obstacle_grid.CELL_M
-        grid.cell_error_m = obstacle_grid.CELL_ERROR_M
-        grid.max_distance_m = obstacle_grid.MAX_DISTANCE_M
-        cells = (grid.columns * grid.rows,)
-        grid.nearest = self._pass("the nearest obstacle of each cell", obstacles.cell_nearest, cells, INTEGER)
-        grid.distance_m = self._pass("the distance of each cell", obstacles.cell_distance_m, cells)
-        grid.center_m = self._pass("the centers of the obstacles", outlines.center_w, (count, 2))
-        grid.direction = self._pass("the directions of the obstacles", outlines.direction, (count, 2))
-        grid.half_size_m = self._pass("the half sizes of the obstacles", outlines.half_m, (count, 2))
-        grid.rounding_m = self._pass("the roundings of the obstacles", outlines.rounding_m, (count,))
-
     def _fill_arc_table(self, arcs: ArcTable) -> None:
         table = self._search.arc_table
         curvatures_per_m = arcs.curvatures_per_m
         shape = (len(curvatures_per_m),)
         table.count = len(curvatures_per_m)
-        table.curvature_per_m = self._pass("the curvatures", curvatures_per_m, shape)
-        table.turn_rad = self._pass("the turns", curvatures_per_m * STEP_M, shape)
-        table.half_turn_rad = self._pass("the half turns", 0.5 * curvatures_per_m * STEP_M, shape)
-        table.end_ahead_m = self._pass("the ends of the arcs", arcs.end_m[0], shape)
-        table.end_left_m = self._pass("the ends of the arcs", arcs.end_m[1], shape)
-        table.middle_ahead_m = self._pass("the middles of the arcs", arcs.middle_m[0], shape)
-        table.middle_left_m = self._pass("the middles of the arcs", arcs.middle_m[1], shape)
-        table.needed_inside_m = self._pass("the needed distances", arcs.needed_inside_m, shape)
-        table.surely_clear_m = self._pass("the clear distances", arcs.surely_clear_m, shape)
+        table.curvature_per_m = self._memory.pass_array("the curvatures", curvatures_per_m, shape)
+        table.turn_rad = self._memory.pass_array("the turns", curvatures_per_m * STEP_M, shape)
+        table.half_turn_rad = self._memory.pass_array("the half turns", 0.5 * curvatures_per_m * STEP_M, shape)
+        table.end_ahead_m = self._memory.pass_array("the ends of the arcs", arcs.end_m[0], shape)
+        table.end_left_m = self._memory.pass_array("the ends of the arcs", arcs.end_m[1], shape)
+        table.middle_ahead_m = self._memory.pass_array("the middles of the arcs", arcs.middle_m[0], shape)
+        table.middle_left_m = self._memory.pass_array("the middles of the arcs", arcs.middle_m[1], shape)
+        table.needed_inside_m = self._memory.pass_array("the needed distances", arcs.needed_inside_m, shape)
+        table.surely_clear_m = self._memory.pass_array("the clear distances", arcs.surely_clear_m, shape)
         table.needed_m = arcs.needed_m
         table.surely_blocked_m = arcs.surely_blocked_m
 
@@ -197,15 +162,15 @@ class NativeGrowth:
         task.goal_rad = given.goal_rad
         task.goal_x, task.goal_y = given.goal_w
         body_arcs = count_body_arcs(parameters)
-        task.lying_drag_m = self._pass("the drag of the lying body", given.lying_drag_m, (body_arcs, 3))
+        task.lying_drag_m = self._memory.pass_array("the drag of the lying body", given.lying_drag_m, (body_arcs, 3))
         task.is_relaid = given.lying_w is not None
         if given.lying_w is not None:
             task.lying_count = len(given.lying_w)
-            task.lying_m = self._pass("the lying body", given.lying_w, (body_arcs + 1, 2))
+            task.lying_m = self._memory.pass_array("the lying body", given.lying_w, (body_arcs + 1, 2))
         task.max_sideways_m = given.max_sideways_m
         if given.failed_w is not None:
             task.failed_count = len(given.failed_w)
-            task.failed_m = self._pass("the failed paths", given.failed_w, (len(given.failed_w), 2))
+            task.failed_m = self._memory.pass_array("the failed paths", given.failed_w, (len(given.failed_w), 2))
 
     def _fill_layers(self, start: NodeLayer) -> None:
         count = len(start.x_m)
@@ -230,13 +195,13 @@ class NativeGrowth:
         layers.node_room = self._node_room
         layers.node_count = count
         layers.s_m = start.s_m
-        layers.parents = self._pass("the parents", self._node_pair[0], (self._node_room,), NODE)
-        layers.children = self._pass("the children", self._node_pair[1], (self._node_room,), NODE)
-        layers.parent = self._pass("the rows of the parents", self._parent, history, INTEGER)
-        layers.x_m = self._pass("the history of x", self._x_m, history)
-        layers.y_m = self._pass("the history of y", self._y_m, history)
-        layers.margin_n = self._pass("the history of margins", self._margin_n, history)
-        layers.arc_drag_m = self._pass("the history of drag", arc_drag_m, (*history, 3))
+        layers.parents = self._memory.pass_array("the parents", self._node_pair[0], (self._node_room,), NODE)
+        layers.children = self._memory.pass_array("the children", self._node_pair[1], (self._node_room,), NODE)
+        layers.parent = self._memory.pass_array("the rows of the parents", self._parent, history, INTEGER)
+        layers.x_m = self._memory.pass_array("the history of x", self._x_m, history)
+        layers.y_m = self._memory.pass_array("the history of y", self._y_m, history)
+        layers.margin_n = self._memory.pass_array("the history of margins", self._margin_n, history)
+        layers.arc_drag_m = self._memory.pass_array("the history of drag", arc_drag_m, (*history, 3))
 
     def _fill_scratch(self, layout: NativeLayout, curvature_count: int) -> None:
         scratch = self._search.scratch
@@ -244,19 +209,13 @@ class NativeGrowth:
         entry_room = 1 << (arc_room * 5 // 4).bit_length()  # a power of two; the table is at most 80 % full
         scratch.entry_room = entry_room
         scratch.stamp = 0
-        scratch.arcs = self._provide(arc_room * layout.arc)
-        scratch.keys = self._provide(arc_room * layout.sort_key)
-        scratch.spare_keys = self._provide(arc_room * layout.sort_key)
-        scratch.candidates = self._provide(arc_room * layout.candidate)
-        scratch.entries = self._provide(entry_room * layout.cell_entry)
-        scratch.tail_nodes = self._provide(self._node_room * INTEGER.itemsize)
-        scratch.near_failed_m = self._provide(max(self._search.task.failed_count, 1) * 2 * NUMBER.itemsize)
-
-    def _provide(self, size_bytes: int) -> int:
-        """Return the address of new memory, which is zero and stays alive as long as this object."""
-        memory = np.zeros(-(-size_bytes // NUMBER.itemsize))
-        self._arrays.append(memory)
-        return memory.ctypes.data
+        scratch.arcs = self._memory.provide(arc_room * layout.arc)
+        scratch.keys = self._memory.provide(arc_room * layout.sort_key)
+        scratch.spare_keys = self._memory.provide(arc_room * layout.sort_key)
+        scratch.candidates = self._memory.provide(arc_room * layout.candidate)
+        scratch.entries = self._memory.provide(entry_room * layout.cell_entry)
+        scratch.tail_nodes = self._memory.provide(self._node_room * INTEGER.itemsize)
+        scratch.near_failed_m = self._memory.provide(max(self._search.task.failed_count, 1) * 2 * NUMBER.itemsize)
 
 
 def _make_nodes(layer: NodeLayer, room: int) -> Array:

@@ -9,10 +9,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from snakesim_gnc.navigation.path_search.search_nodes import MAX_CONTACTS
+from snakesim_gnc.navigation.path_search.search_parameters import MAX_CONTACTS
 from snakesim_native.libraries import PLANNER
 from snakesim_native.load import load
+
+Array = NDArray[Any]
 
 INTEGER = np.dtype(np.int64)
 NUMBER = np.dtype(np.float64)
@@ -45,6 +48,43 @@ def _integers(*names: str) -> list[tuple[str, Any]]:
 
 def _addresses(*names: str) -> list[tuple[str, Any]]:
     return [(name, ctypes.c_void_p) for name in names]
+
+
+class NativeMemory:
+    """Arrays whose addresses C functions have. They stay alive as long as this object."""
+
+    def __init__(self) -> None:
+        self._arrays: list[Array] = []
+
+    def pass_array(self, name: str, array: Array, shape: tuple[int, ...], dtype: np.dtype[Any] = NUMBER) -> int:
+        """Return the address of an array that C functions may read and write.
+
+        Args:
+            name: of the array, for the error.
+            array: the values. They are copied if they are not contiguous or have another type.
+            shape: that the C functions expect.
+            dtype: that they expect.
+
+        Raises:
+            NativeGrowthError: the array has another shape.
+        """
+        if array.shape != shape:
+            raise NativeGrowthError(f"{name} has the shape {array.shape}, the C library of the planner expects {shape}")
+        contiguous = np.ascontiguousarray(array, dtype=dtype)
+        self._arrays.append(contiguous)
+        return contiguous.ctypes.data
+
+    def provide(self, size_bytes: int) -> int:
+        """Return the address of new memory, which is zero."""
+        memory = np.zeros(-(-size_bytes // NUMBER.itemsize))
+        self._arrays.append(memory)
+        return memory.ctypes.data
+
+
+class NativeWindow(ctypes.Structure):
+    """A rectangle of cells; the last ones are not in it."""
+
+    _fields_ = _integers("first_column", "last_column", "first_row", "last_row")
 
 
 class NativeGrid(ctypes.Structure):
@@ -144,6 +184,7 @@ class PlannerLibrary:
     """The functions of the C library, and the sizes of its structures in bytes."""
 
     expand: Any  # int64 expand(Search*)
+    mark_obstacle: Any  # void mark_obstacle(const Grid*, const Window*, int64 obstacle)
     layout: NativeLayout
 
 
@@ -168,7 +209,10 @@ def load_library() -> PlannerLibrary | None:
     expand = handle.snakesim_planner_expand
     expand.restype = ctypes.c_int64
     expand.argtypes = [ctypes.POINTER(NativeSearch)]
-    return PlannerLibrary(expand, layout)
+    mark_obstacle = handle.snakesim_planner_mark_obstacle
+    mark_obstacle.restype = None
+    mark_obstacle.argtypes = [ctypes.POINTER(NativeGrid), ctypes.POINTER(NativeWindow), ctypes.c_int64]
+    return PlannerLibrary(expand, mark_obstacle, layout)
 
 
 def is_native_available() -> bool:

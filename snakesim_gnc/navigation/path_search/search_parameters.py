@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 STEP_M = 0.05  # length of an arc
+MAX_CONTACTS = 8  # of one body that a node stores, the newest
 MAX_HEADING_ERROR_RAD = 1.75  # a path heads no farther away from the goal
 
 # Of the nodes in one narrow cell only the cheapest is kept: they are the same for the robot.

@@ -1,4 +1,4 @@
-"""The path search in C gives the paths of its specification in Python, to the last bit."""
+"""The path search in C gives the grids and paths of its specification in Python, to the last bit."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -177,6 +177,18 @@ def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     load_library.cache_clear()
     yield
     load_library.cache_clear()
+
+
+@needs_library
+def test_the_grid_of_obstacles_is_the_same_without_the_library(request: pytest.FixtureRequest) -> None:
+    random = np.random.default_rng(5)
+    obstacles = make_obstacles(random, make_body(random))
+    native = ObstacleGrid(obstacles)
+    request.getfixturevalue("no_library")
+    specified = ObstacleGrid(obstacles)
+    assert native.cell_nearest.tobytes() == specified.cell_nearest.tobytes()
+    assert native.cell_distance_m.tobytes() == specified.cell_distance_m.tobytes()
+    assert len(np.unique(native.cell_nearest)) > len(obstacles) // 2
 
 
 @pytest.mark.usefixtures("no_library")
