@@ -19,8 +19,9 @@ import numpy as np
 
 from snakesim_gnc.geometry.planar import space_evenly
 from snakesim_gnc.navigation.intents import DesiredMotion
-from snakesim_gnc.navigation.native_growth import is_native_available
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
+from snakesim_gnc.navigation.path_search.native_library import is_native_available
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters
 from snakesim_gnc.navigation.plan import (
     BACKED_OUT,
     COMMITTED_M,
@@ -40,8 +41,6 @@ from snakesim_gnc.navigation.plan import (
     make_plan,
 )
 from snakesim_gnc.navigation.planning_goal import PlanningGoal
-from snakesim_gnc.navigation.search_arcs import STEP_M
-from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.geometry.body_on_path import chain_nodes
-from snakesim_gnc.navigation.beam import BeamSearch, PathSearch, SearchedPath
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, ObstacleGrid
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, find_start_pose, load, parse_set, place_obstacles

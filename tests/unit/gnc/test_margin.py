@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.push import Touches, find_touches, push_forward
 from snakesim_gnc.geometry.planar import wrenches
-from snakesim_gnc.navigation.margin import MAX_CONTACT_FORCE_N, compute_margins_n
+from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, compute_margins_n
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
