@@ -74,7 +74,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 def test_injected_plan_that_fails_is_a_fault_of_the_run() -> None:
     with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.faults_since_start
-        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.kept), "a word about it")
+        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.stored), "a word about it")
         assert "is refused: backend 'lag' cannot do leak" in run.host.faults.notes[0]
 
 

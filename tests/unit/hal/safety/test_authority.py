@@ -355,7 +355,7 @@ def test_faults_since_start_survive_a_reset() -> None:
     rig.authority.fault(HOT)
     rig.authority.on_lifecycle(CLEAR, rig.now_ns)
     assert rig.authority.faults == []
-    assert [fault.what for fault in rig.authority.faults_since_start.kept] == ["hot"]
+    assert [fault.what for fault in rig.authority.faults_since_start.stored] == ["hot"]
 
 
 # --- heat, supply and measured states --------------------------------------------------------------------------
