@@ -309,7 +309,7 @@ def _frames(episode: Episode, content: _Content, rows: NDArray[np.int64]) -> Fra
     """Return the values of the features that an episode has by itself, (n, width) or (n,), without pictures."""
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]
-    state += [record.position_w, record.orientation_wxyz] if content.posed else []
+    state += [record.position_w_m, record.orientation_wxyz] if content.posed else []
     done = np.arange(len(rows)) == len(rows) - 1
     frames: Frames = {
         "observation.state": np.hstack(state)[rows].astype(np.float32),

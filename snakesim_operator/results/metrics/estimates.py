@@ -59,7 +59,7 @@ def _position_error_m(record: RunRecord, world: World) -> float | None:
     row = record.row_at(world.timestamp_ns * 1e-9)
     if not record.posed[row]:
         return None
-    x, y, _ = record.position_w[row].tolist()
+    x, y, _ = record.position_w_m[row].tolist()
     return math.dist((x, y), world.base_position_w[:2])
 
 

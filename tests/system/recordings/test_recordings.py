@@ -99,7 +99,7 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["target.joint_3"]) for row in rows] == record.target[:, 2].tolist()
-    assert [float(row["position_w_m.y"]) for row in rows] == record.position_w[:, 1].tolist()
+    assert [float(row["position_w_m.y"]) for row in rows] == record.position_w_m[:, 1].tolist()
     assert np.array_equal(RunRecord.load(tmp_path / "a.mcap").angle_rad, record.angle_rad)
     again = snakesim("recording", "export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path)
     assert again.code == 2

@@ -59,4 +59,4 @@ def test_control_without_stream_holds_and_continues_when_it_returns(tmp_path: Pa
     late = (time_s > FROM_S + limit_s + FADED_S) & (time_s < TO_S)
     if late.any():  # nothing moves any more, and no target moves
         assert np.ptp(record.target[late], axis=0).max() < 0.02
-        assert np.ptp(record.position_w[late][:, 0]) < 0.01
+        assert np.ptp(record.position_w_m[late][:, 0]) < 0.01

@@ -91,7 +91,7 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
     record = RunRecord.load(tmp_path / "run")
     reached_s = next(state.timestamp_ns * 1e-9 for state in record.control if "the goal is reached" in state.reason)
     assert 1.0 < reached_s < 4.0
-    after = record.position_w[record.time_s > reached_s + 0.5, :2]
+    after = record.position_w_m[record.time_s > reached_s + 0.5, :2]
     assert np.ptp(after, axis=0).max() < 0.005
     assert np.abs(record.torque_nm[-1]).max() < 0.5
 

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority
+from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority, TickDecision
 from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.wire import keys
@@ -265,10 +265,12 @@ def test_decision_in_lockstep_uses_the_command_of_its_tick() -> None:
 def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
     """The pose at arming would be a jump that no limiter has limited."""
     rig = armed()
+    decisions: list[TickDecision] = []
     for tick in range(5):
         rig.tick = tick
         rig.send(0.3)
-        before = rig.authority.decide(tick)
+        decisions.append(rig.authority.decide(tick))
+    before = decisions[-1]
     rig.tick = 5
     for _ in range(COMMANDS_KEPT + 1):
         rig.send(0.1)

@@ -74,7 +74,7 @@ def made_up(
         mode=np.full((count, JOINTS), Mode.POSITION, dtype=np.int8),
         target=0.3 * np.sin(phase) + 0.01,
         torque_limit_nm=np.full((count, JOINTS), 7.0),
-        position_w=np.full((count, 3), np.nan),
+        position_w_m=np.full((count, 3), np.nan),
         orientation_wxyz=np.full((count, 4), np.nan),
         contact_peak_n=np.zeros(count),
         contact_count=np.zeros(count),
@@ -132,7 +132,7 @@ ODD: dict[str, dict[str, Any]] = {
     "texts": {"target": np.full((200, JOINTS), "x")},
     "complex": {"velocity_rad_s": np.zeros((200, JOINTS), dtype=complex)},
     "a number": {"mode": np.zeros(())},
-    "positions in a plane": {"position_w": np.zeros((200, 2))},
+    "positions in a plane": {"position_w_m": np.zeros((200, 2))},
     "time that stands": {"time_s": np.zeros(200)},
     "time that is not a number": {"time_s": np.full(200, np.nan)},
 }

@@ -16,7 +16,7 @@ from snakesim_testing.operator.recorded_triplet import SECONDS, changed
 
 def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
     """The same body, which goes along x like this and does not bend."""
-    position = np.repeat(record.position_w[:1], len(x_m), axis=0)
+    position = np.repeat(record.position_w_m[:1], len(x_m), axis=0)
     position[:, 0] += x_m
     still = {name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0) for name in ("orientation_wxyz", "angle_rad")}
     return changed(record, position_w=position, **still)
@@ -43,7 +43,7 @@ def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, ampl
 
 
 def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
-    blind = changed(record, position_w=record.position_w * np.nan, worlds=[])
+    blind = changed(record, position_w_m=record.position_w_m * np.nan, worlds=[])
     assert measure_motion(blind) is None
     reported = summarise(blind, "complete")
     assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
@@ -52,7 +52,7 @@ def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
 
 def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> None:
     """The black box has no pose then; guidance's world model has."""
-    blind = changed(record, position_w=record.position_w * np.nan)
+    blind = changed(record, position_w_m=record.position_w_m * np.nan)
     for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):
         worlds = [msgspec.structs.replace(world, pose_from=source) for world in record.worlds]
         known = changed(blind, worlds=worlds)

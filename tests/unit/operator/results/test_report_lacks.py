@@ -314,7 +314,7 @@ def test_report_map_of_upward_snake_is_rotated(short_record: RunRecord) -> None:
     count = len(short_record.time_s)
     up = changed(
         short_record,
-        position_w=short_record.position_w[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
+        position_w_m=short_record.position_w_m[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
         orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
         worlds=[],
         control=[],
