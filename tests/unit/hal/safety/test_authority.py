@@ -121,6 +121,14 @@ def test_arming_for_the_first_time_waits_for_no_stop() -> None:
     assert rig.arm().ok
 
 
+def test_arming_after_a_disarm_needs_a_new_command() -> None:
+    rig = armed()
+    rig.tick_with(0.1)
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick()
+    assert rig.arm().reason == "no commands from control yet"
+
+
 def test_arming_after_commands_ended_is_refused_despite_renewals() -> None:
     rig = commanded()
     renewal = LeaseRequest(action="renew", holder="control", priority=100, epoch=1)
