@@ -42,6 +42,8 @@ def test_arming_unmet_conditions_are_named_until_met() -> None:
     assert "joint_1 has a target +0.60 rad" in rig.arm().reason
     rig.send(0.1, Mode.TORQUE)
     assert "joint_1 is commanded in mode torque; it must hold its position at arming" in rig.arm().reason
+    rig.send(0.0, Mode.PASSIVE)
+    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     rig.send(0.1)
     assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     answer = rig.arm()
