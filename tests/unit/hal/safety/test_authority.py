@@ -42,6 +42,8 @@ def test_arming_unmet_conditions_are_named_until_met() -> None:
     assert "joint_1 has a target +0.60 rad" in rig.arm().reason
     rig.send(0.1, Mode.TORQUE)
     assert "joint_1 is commanded in mode torque; it must hold its position at arming" in rig.arm().reason
+    rig.send(0.0, Mode.PASSIVE)
+    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     rig.send(0.1)
     assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     answer = rig.arm()
@@ -119,6 +121,14 @@ def test_arming_for_the_first_time_waits_for_no_stop() -> None:
     rig.acquire()
     rig.send(0.1)
     assert rig.arm().ok
+
+
+def test_arming_after_a_disarm_needs_a_new_command() -> None:
+    rig = armed()
+    rig.tick_with(0.1)
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick()
+    assert rig.arm().reason == "no commands from control yet"
 
 
 def test_arming_after_commands_ended_is_refused_despite_renewals() -> None:

@@ -536,6 +536,7 @@ class Everything(Model):
         assert found.accepted_count + found.standby_count + found.rejected_counts.total() == self.offered
 
 
+@pytest.mark.timeout(600)  # a busy computer may take minutes, which is no failure
 @pytest.mark.parametrize("batch", range(-(-SEQUENCES // PER_TEST)))
 def test_whatever_happens_the_robot_does_only_what_it_may(batch: int) -> None:
     """In batches, because hypothesis keeps every sequence of a test in memory."""
