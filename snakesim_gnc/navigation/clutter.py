@@ -12,6 +12,7 @@ plan, and a plan takes the same robot time on every computer. Until it is there 
 """
 
 import math
+import statistics
 from collections import deque
 from collections.abc import Generator, Sequence
 
@@ -271,7 +272,7 @@ class ClutterPlanner:
         head_s_m = plan.route.project(body_w[-1])
         if self._back_out_from_m is not None:
             return self._check_backed_out(self._back_out_from_m, head_s_m, now_ns)
-        from_path_m = np.median([_distance_from_route_m(plan.route, point_w) for point_w in body_w[::10]])
+        from_path_m = statistics.median(_distance_from_route_m(plan.route, point_w) for point_w in body_w[::10])
         if from_path_m > OFF_PATH_M:
             return OFF_PATH
         if self._failed_w and from_path_m > SHIFTED_M and now_ns - self._planned_ns > STUCK_S * 1e9:
