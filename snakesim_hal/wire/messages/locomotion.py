@@ -38,7 +38,7 @@ class WorldContact(Message, frozen=True, kw_only=True):
     normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
     tangent_w: Annotated[q.UnitVector, about("across the normal, towards the head")]
     force_w: Annotated[q.ForceVector, about("on the body")]
-    confidence: q.Fraction = 1.0
+    confidence: Annotated[q.Fraction, about("1: measured; less: estimated")] = 1.0
 
 
 class World(Message, frozen=True, kw_only=True):

@@ -115,7 +115,11 @@ def test_advance_of_sideways_travel_has_metrics_along_both_directions() -> None:
     """Along its first heading it hardly advances, and per metre of that its energy says nothing."""
     straight = simulate_run("path_following")
     record = straight.record
-    turned = record.position_w_m[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]  # as if it had gone to its left, by a quarter of a turn
+    turned = record.position_w_m[:, [1, 0, 2]] * [
+        -1.0,
+        1.0,
+        1.0,
+    ]  # as if it had gone to its left, by a quarter of a turn
     sideways = summarise(dataclasses.replace(record, position_w_m=turned), "complete")
     assert sideways.net_displacement_m == pytest.approx(straight.summary.net_displacement_m, rel=0.1)
     assert sideways.heading_advance_m is not None
