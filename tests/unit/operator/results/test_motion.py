@@ -19,7 +19,7 @@ def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
     position = np.repeat(record.position_w_m[:1], len(x_m), axis=0)
     position[:, 0] += x_m
     still = {name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0) for name in ("orientation_wxyz", "angle_rad")}
-    return changed(record, position_w=position, **still)
+    return changed(record, position_w_m=position, **still)
 
 
 def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> None:

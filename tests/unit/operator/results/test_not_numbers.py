@@ -40,7 +40,7 @@ SIGNALS = {
     "torque_nm": 13,
     "target": 13,
     "torque_limit_nm": 13,
-    "position_w": 3,
+    "position_w_m": 3,
     "orientation_wxyz": 4,
     "time_s": 0,
     "contact_peak_n": 0,
@@ -157,7 +157,7 @@ def test_black_box_with_nan_is_summarized(base: RunRecord, tmp_path: Path, cells
     said = {line.partition(":")[0]: line for line in record.missing}
     for name, values in corrupted.items():
         bad = ~(np.abs(values) < 1e9)
-        if name in ("position_w", "orientation_wxyz") or not bad.any():
+        if name in ("position_w_m", "orientation_wxyz") or not bad.any():
             continue
         assert f"of {LAST - FIRST} samples are not numbers" in said[name]
         counts = zip(JOINTS, bad.sum(axis=0), strict=True) if values.ndim > 1 else [("", bad.sum())]
@@ -211,17 +211,17 @@ def test_recording_with_nan_is_summarized(base: RunRecord, tmp_path: Path, data:
 
 def test_unknown_pose_is_a_gap_only_with_a_pose_sensor(base: RunRecord, tmp_path: Path) -> None:
     def lacks(sensors: Any, unknown: slice) -> list[str]:
-        position = base.position_w.copy()
+        position = base.position_w_m.copy()
         position[unknown] = np.nan
         robot = msgspec.structs.replace(base.config.robot, sensors=sensors)
         config = msgspec.structs.replace(base.config, robot=robot)
-        write_record(tmp_path, dataclasses.replace(base, config=config, position_w=position))
+        write_record(tmp_path, dataclasses.replace(base, config=config, position_w_m=position))
         record = RunRecord.load(tmp_path)
         summary_and_page(record)
         return record.missing
 
     sensors = base.config.robot.sensors
     assert lacks(sensors, slice(0, 5)) == []
-    assert lacks(sensors, slice(3, 5)) == ["position_w: 2 of 90 samples are not numbers"]
-    assert lacks(sensors, slice(0, None)) == ["position_w: 90 of 90 samples are not numbers"]
+    assert lacks(sensors, slice(3, 5)) == ["position_w_m: 2 of 90 samples are not numbers"]
+    assert lacks(sensors, slice(0, None)) == ["position_w_m: 90 of 90 samples are not numbers"]
     assert lacks(msgspec.structs.replace(sensors, pose=None), slice(0, None)) == []

@@ -13,7 +13,7 @@ from snakesim_operator.run.in_process import simulate
 from snakesim_testing.operator.recorded_triplet import Reader, changed
 
 SECONDS = 1.5
-MOVING = ("position_w", "orientation_wxyz", "angle_rad")
+MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
 
 
 @pytest.fixture(scope="module")
