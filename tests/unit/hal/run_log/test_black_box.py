@@ -64,8 +64,8 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
     assert columns["target"][4321] == pytest.approx([0.4321] * 3)
     assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3
     assert set(columns["mode"].flat) == {3}
-    assert np.isnan(columns["position_w"][:2]).all()  # unknown until the first pose
-    assert columns["position_w"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
+    assert np.isnan(columns["position_w_m"][:2]).all()  # unknown until the first pose
+    assert columns["position_w_m"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
     assert columns["orientation_wxyz"][5].tolist() == [1.0, 0.0, 0.0, 0.0]
     assert columns["contact_peak_n"][:8].tolist() == [0, 0, 0, 5, 5, 5, 0, 0]
     assert columns["contact_count"][:8].tolist() == [0, 0, 0, 2, 2, 2, 0, 0]
