@@ -44,7 +44,7 @@ LAWS = NativeLibrary(
 PLANNER = NativeLibrary(
     name="planner",
     uses_mujoco=False,
-    python_cost="a search of the path planner takes about eight times as long",
+    python_cost="a search of the path planner takes about seven times as long",
 )
 LIBRARIES = (LAWS, PLANNER)
 

@@ -1,6 +1,6 @@
 """How a beam search makes its paths longer by one layer of arcs: the specification. Pure.
 
-`native_growth` computes the same numbers in C, about eight times as fast. This module is what a reader should trust: it
+`native_growth` computes the same numbers in C, about seven times as fast. This module is what a reader should trust: it
 explains the search, the tests compare the two bit for bit, and it plans where the C library is not installed. A change
 here needs the same change in `snakesim_native/planner/`.
 
