@@ -64,7 +64,9 @@ def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     )
     assert apart is not None
     assert sum(map(int, apart.groups())) == 100
-    assert "the record does not show why" in why_empty(dataclasses.replace(late, position_w_m=late.position_w_m * np.nan))
+    assert "the record does not show why" in why_empty(
+        dataclasses.replace(late, position_w_m=late.position_w_m * np.nan)
+    )
 
 
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:

@@ -73,7 +73,9 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
 
 def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
     count = len(short_record.time_s)
-    blind = changed(short_record, position_w_m=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
+    blind = changed(
+        short_record, position_w_m=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan)
+    )
     page = read(blind)
     assert "No playback: no valid pose was recorded." in page.text
     assert "pose sensor" not in page.text
