@@ -73,10 +73,12 @@ def show_record(folder: Path, at_s: float, port: int | None) -> int:
     """
     _prepare_process()
     from snakesim_operator.features.console.display_loop import show_recorded
+    from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
 
+    run = RunPlayback(folder)
     stop = _stop_on_signal()
     with _front_server(port, None, stop) as ports:
-        return show_recorded(folder, at_s, ports.pages, stop)
+        return show_recorded(run, at_s, ports.pages, stop)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

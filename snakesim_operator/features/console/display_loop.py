@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.session import Link, open_session
@@ -22,6 +23,9 @@ from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import Surroundings
 from snakesim_operator.features.console.web.added_html import SECOND_STOP
 from snakesim_operator.features.console.web.serve import serve_pages
+
+if TYPE_CHECKING:
+    from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
 
 FRAMES_PER_S = 30.0
 
@@ -76,27 +80,23 @@ def show_live(
                 page.show_snapshot(snapshot)
 
 
-def show_recorded(folder: Path, start_s: float, listening: socket.socket, stop: threading.Event) -> int:
+def show_recorded(run: "RunPlayback", start_s: float, listening: socket.socket, stop: threading.Event) -> int:
     """Show the record of a run until `stop` is set.
 
     Args:
-        folder: The folder of the run.
+        run: The run.
         start_s: Where to begin, in seconds after the first instant.
         listening: The Unix socket at which the front server connects.
         stop: Set to end the console.
 
     Returns:
         The exit code: it reports data that the record should have and has not.
-
-    Raises:
-        ConfigError: The folder has no record.
     """
     # Imported here, because modules that only recordings need would delay the page of a run that starts.
     from snakesim_operator.features.console.robot_data.playback_signals import PlaybackSignals
-    from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
     from snakesim_operator.results.missing_data import exit_code
 
-    run = RunPlayback(folder)
+    folder = run.record.folder
     log = PageLog()
     for missing in run.record.missing:
         log.write(f"the record is incomplete: {missing}")

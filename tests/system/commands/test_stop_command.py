@@ -40,7 +40,8 @@ def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
     ended = snakesim("estop", "--namespace", "nobody", cwd=tmp_path, more={"PYTHONPROFILEIMPORTTIME": "1"})
     imported = [line.rpartition("|")[2].strip() for line in ended.err.splitlines()]
     assert not {"numpy", "jinja2", "mujoco"} & set(imported)
-    assert imported.index("snakesim_hal.network.stop_port") < imported.index("msgspec") < imported.index("zenoh")
+    slow = min(imported.index("msgspec"), imported.index("zenoh"))
+    assert imported.index("snakesim_hal.network.stop_port") < slow
 
 
 def test_stop_answer_without_matching_status_is_not_trusted() -> None:

@@ -49,7 +49,7 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
             intents, way = session.reader(keys.INTENT, Intent), Way(session)
             with at_the_keyboard(run, tmp_path) as lost:
                 assert intents.drain() == []
-                assert lost.shows("nothing asked for yet") is None
+                assert lost.shows("nothing requested yet") is None
                 lost.type(2 * UP)
                 wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost.type(LEFT)
@@ -122,5 +122,5 @@ def test_teleop_says_that_robot_stopped_sending(in_lockstep: Running, tmp_path: 
     with at_the_keyboard(in_lockstep, tmp_path) as operator:
         operator.shows("armed: ")
         with frozen(in_lockstep.part("host")):
-            operator.shows("the robot has given no clock for ")
+            operator.shows("the robot has sent no clock for ")
             operator.shows("s ago): ")  # before what may be cut off at the edge

@@ -47,9 +47,11 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "deploy/vm/machine.py": "qemu",
     "deploy/vm/packages.py": "apt",
     "deploy/vm/with_vcan.py": "the command that the user types",
+    "deploy/wheels.py": "the package build, uv and the wheel in another environment",
     "docs/site/build.py": "git",
     "docs/style/check_prose.py": "git and proselint",
     "snakesim_can_backend/bus/bus_faults.py": "ip",
+    "snakesim_native/compile.py": "the C compiler",
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
 FORKS = {
@@ -102,7 +104,7 @@ def test_child_processes_all_start_with_prepared_command_and_environment() -> No
 
 
 def test_nothing_else_makes_a_command_line_of_this_interpreter() -> None:
-    allowed = {"snakesim_hal/base/process.py", "deploy/bootstrap.py"}
+    allowed = {"snakesim_hal/base/process.py", "deploy/bootstrap.py", "snakesim_native/compile.py"}  # zig, a compiler
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         if "sys.executable" not in text or path.relative_to(ROOT).as_posix() in allowed:

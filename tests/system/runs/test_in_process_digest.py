@@ -27,7 +27,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
     assert ours.summary.ended == "complete"
     assert ours.summary.command_digest == summary.command_digest
     assert ours.summary.path_distance_m == summary.path_distance_m
-    for name in ("angle_rad", "torque_nm", "target", "position_w", "contact_peak_n"):
+    for name in ("angle_rad", "torque_nm", "target", "position_w_m", "contact_peak_n"):
         assert np.array_equal(getattr(ours.record, name), getattr(theirs, name), equal_nan=True), name
     # Not every tick's: on a busy computer a network drops some, and control reports that time is paused.
     for name in ("control", "worlds"):

@@ -159,10 +159,14 @@ def _find_first_unit(schemas: Iterable[Any]) -> str | None:
 
 def _flatten(name: str, value: Any, robot: Description, numbers: dict[str, float]) -> None:
     """Add each number of a field to `numbers`, under the field's name and the name of each part."""
-    if not isinstance(value, list | tuple):
+    if isinstance(value, dict):
+        parts = list(value.items())
+    elif isinstance(value, list | tuple):
+        parts = list(zip(_name_parts(value, robot), value, strict=True))
+    else:
         numbers[name] = np.nan if value is None else float(value)
         return
-    for part, element in zip(_name_parts(value, robot), value, strict=True):
+    for part, element in parts:
         _flatten(f"{name}.{part}", element, robot, numbers)
 
 
