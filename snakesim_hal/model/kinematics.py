@@ -131,6 +131,63 @@ def find_nodes_w(
     return np.vstack([origins, head_end_w])
 
 
+def find_nodes_of_many_w(robot: Description, positions_w: Floats, wxyz: Floats, angles_rad: Floats) -> Floats:
+    """Return what `find_nodes_w` returns for many poses of a robot, (n, joints + 2, 3), with the same bits.
+
+    Args:
+        robot: gives the lengths of the links and the axes of the joints.
+        positions_w: (n, 3) the tail ends, m.
+        wxyz: (n, 4) orientations of the bases.
+        angles_rad: (n, n_joints) joint angles, tail to head.
+    """
+    count = len(positions_w)
+    lengths_m = np.array([link.length_m for link in robot.links])
+    axes = [joint.axis for joint in robot.joints]
+    rotations = _rotations_from_quaternions(wxyz)
+    nodes = np.empty((count, len(axes) + 2, 3))
+    nodes[:, 0] = positions_w
+    if "pitch" not in axes:
+        yaw_rad = np.zeros((count, len(axes) + 1))  # of each link, relative to the base
+        np.cumsum(angles_rad, axis=1, out=yaw_rad[:, 1:])
+        cosine = np.cos(yaw_rad)[:, :, None]
+        sine = np.sin(yaw_rad)[:, :, None]
+        forward = cosine * rotations[:, None, :, 0] + sine * rotations[:, None, :, 1]
+        link_vectors = forward[:, :-1] * lengths_m[:-1, None]
+        nodes[:, 1:-1] = positions_w[:, None] + np.cumsum(link_vectors, axis=1)
+        nodes[:, -1] = nodes[:, -2] + lengths_m[-1] * forward[:, -1]
+        return nodes
+    for i, axis in enumerate(axes):
+        nodes[:, i + 1] = nodes[:, i] + rotations[:, :, 0] * lengths_m[i]
+        rotations = rotations @ _joint_rotations(axis, angles_rad[:, i])
+    nodes[:, -1] = nodes[:, -2] + lengths_m[-1] * rotations[:, :, 0]
+    return nodes
+
+
+def _rotations_from_quaternions(wxyz: Floats) -> Floats:
+    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), which are normalized first."""
+    w, x, y, z = (wxyz / np.sqrt(np.vecdot(wxyz, wxyz))[:, None]).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0).copy()
+
+
+def _joint_rotations(axis: str, angles_rad: Floats) -> Floats:
+    """Return the rotations (n, 3, 3) of one joint at many angles about its own axis."""
+    rotations = np.zeros((len(angles_rad), 3, 3))
+    cosine = np.cos(angles_rad)
+    sine = np.sin(angles_rad)
+    first, second, fixed = (0, 1, 2) if axis == "yaw" else (2, 0, 1)
+    rotations[:, first, first] = cosine
+    rotations[:, first, second] = -sine
+    rotations[:, second, first] = sine
+    rotations[:, second, second] = cosine
+    rotations[:, fixed, fixed] = 1.0
+    return rotations
+
+
 def _yaw_only_frames(
     base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
 ) -> tuple[Floats, Floats]:

@@ -73,13 +73,13 @@ def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: Mode) -> None:
         for i, robot_limits in enumerate(limits_of_robot):
             asked: JointCommand = command(
                 robots[i],
-                mode=[mode] * JOINTS, target=requested[i].tolist(), torque_limit_nm=limits.torque_nm[i].tolist()
+                mode=[mode] * JOINTS,
+                target=requested[i].tolist(),
+                torque_limit_nm=limits.torque_nm[i].tolist(),
             )
             state = Measured(angle_rad[i], velocity_rad_s[i], np.zeros(JOINTS))
             last = Applied(np.full(JOINTS, int(mode)), last_target[i], last_limit_nm[i])
-            expected = limit_command(
-                asked, measured=state, last=last, limits=robot_limits, torque_fraction=fraction[i]
-            )
+            expected = limit_command(asked, measured=state, last=last, limits=robot_limits, torque_fraction=fraction[i])
             assert target[i].tobytes() == expected.target.tobytes()
             assert torque_limit_nm[i].tobytes() == expected.torque_limit_nm.tobytes()
             expected_names = name_active_limits(

@@ -1,0 +1,55 @@
+"""One robot at rest in its scene, before its simulation becomes a row of many."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.programs.preflight import backend_settings
+from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.contacts import TouchReader
+from snakesim_sim_backend.divergence import log_warnings
+from snakesim_sim_backend.model import SimModel, build
+from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.start import place_robot
+from snakesim_sim_backend.tether import TetherRope
+
+
+@dataclass(frozen=True)
+class PlacedRobot:
+    """A compiled model, and its state at the start of an episode."""
+
+    config: RunConfig
+    sim: SimModel
+    data: mujoco.MjData
+    physics: Physics
+    motors: Motors  # off
+    touches: TouchReader
+
+
+def place(config: RunConfig) -> PlacedRobot:
+    """Build the scene, place the robot and let it come to rest, as `SimBackend` does.
+
+    Raises:
+        ConfigError: the settings do not match the robot or the scene.
+    """
+    log_warnings()
+    settings = backend_settings(config, SimBackend)
+    sim = build(config, settings)
+    data = mujoco.MjData(sim.model)
+    physics = Physics(sim, data)
+    motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale)
+    place_robot(sim, data, physics, config, motors, settings.settle_s)
+    if settings.tether is not None:
+        TetherRope(sim.model, data, settings.tether).tighten()
+    # MuJoCo's own sensors are the IMUs, which no environment observes.
+    sim.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics))
+
+
+def read_rotations(robot: PlacedRobot) -> np.ndarray:
+    """Return a view of the rotations world_from_link of all links, (n_links, 9), row by row."""
+    first = robot.sim.first_link_body
+    return robot.data.xmat[first : first + len(robot.sim.link_geoms)]

@@ -1,0 +1,332 @@
+"""What environments observe of many robots: joints, pose, contact forces and winding temperatures.
+
+The values have the noise, rates and delays of the sensors of `SimBackend`, and the same bits. All sensors of a robot
+share one stream of random numbers, so the numbers of an IMU are left out although no environment observes it.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.sensors import Sensors
+from snakesim_hal.wire.quantities import MAX_CONTACTS
+from snakesim_sim_backend.batch.noise import NoiseStreams
+from snakesim_sim_backend.batch.samples import DelayedValues, DueTicks, Mask, Ticks
+from snakesim_sim_backend.batch.simulations import NO_TOUCHES, Simulations, TouchArrays
+from snakesim_sim_backend.sensors.timing import round_to_ticks
+
+NUMBERS_OF_POSE = 19  # of a raw sample: 7 of the pose, 6 of the velocities, 6 of noise
+NUMBERS_OF_CONTACT = 6  # of noise: of position and force
+
+
+def describe_timing(config: RunConfig) -> bytes:
+    """Return what must be equal for all robots that are simulated together: which sensors they have, and when."""
+    sensors = config.robot.sensors
+    parts: list[object] = [config.period_ns, config.rate_hz, config.robot.chain.modules, sensors.joints.delay_s]
+    parts.append(_has_noise(sensors.joints))
+    for _, sensor in _without_mounted(sensors).published():
+        parts += [type(sensor).__name__, sensor.rate_hz, sensor.delay_s, _has_noise(sensor)]
+    return msgspec.json.encode(parts)
+
+
+@dataclass(frozen=True)
+class ContactSample:
+    """A sample of contacts whose forces are not computed yet."""
+
+    touches: TouchArrays
+    noise: Floats  # (n, 3), of the forces in the frames of the links
+
+
+NO_CONTACTS = ContactSample(NO_TOUCHES, np.empty((0, 3)))
+
+
+class SensorArrays:
+    """The sensors of many robots.
+
+    Attributes:
+        joints: (robots, 3 * joints), angles, velocities and torques as delivered at this tick.
+        windings: temperatures, (robots, joints), as the power sensor has delivered them.
+    """
+
+    def __init__(self, robots: int, config: RunConfig, noise: NoiseStreams) -> None:
+        """Make the sensors of robots whose configurations agree with this one in `describe_timing`."""
+        sensors = config.robot.sensors
+        joints = config.robot.chain.modules
+        self._noise = noise
+        self._count = robots
+        self._joint_count = joints
+        self._period_ns = config.period_ns
+
+        def due_ticks(rate_hz: float) -> DueTicks:
+            return DueTicks(rate_hz, config.rate_hz, config.period_ns)
+
+        # Joints.
+        self.joints: Floats = np.zeros((robots, 3 * joints))
+        self._joint_sigma = np.zeros((robots, 3 * joints))
+        self._is_measured = np.ones((robots, 3 * joints), dtype=np.bool_)
+        self._all_are_measured = True
+        self._joints_have_noise = _has_noise(sensors.joints)
+        self.joint_delay_ticks = round_to_ticks(sensors.joints.delay_s, config.period_ns)
+        self._waiting_joints: deque[Floats] = deque(maxlen=1 + self.joint_delay_ticks)
+
+        # Contacts.
+        self._contact_due: DueTicks | None = None
+        if sensors.contacts is not None:
+            self._contact_due = due_ticks(sensors.contacts.rate_hz)
+            self._contacts_have_noise = _has_noise(sensors.contacts)
+            self._contact_delay_ticks = round_to_ticks(sensors.contacts.delay_s, config.period_ns)
+        self._contact_sigma_n = [0.0] * robots
+        self._contact_threshold_n = [0.0] * robots
+        self._waiting_contacts: deque[tuple[ContactSample, Mask]] = deque()
+        self._contacts = NO_CONTACTS
+
+        # Numbers that IMUs would draw.
+        self._imu_due: DueTicks | None = None
+        if sensors.imu is not None and _has_noise(sensors.imu):
+            self._imu_due = due_ticks(sensors.imu.rate_hz)
+        self._imu_numbers = 6 * (joints + 1)
+
+        # Pose.
+        self._pose_due: DueTicks | None = None
+        if sensors.pose is not None:
+            self._pose_due = due_ticks(sensors.pose.rate_hz)
+            self._pose_has_noise = _has_noise(sensors.pose)
+            self._raw_poses = DelayedValues(robots, NUMBERS_OF_POSE, sensors.pose.delay_s, config.period_ns)
+            self._raw_poses.values[:, 3] = 1.0  # a quaternion that can be normalized, until there is a pose
+        self._pose_sigma = np.zeros((robots, 6))
+
+        # Power.
+        self._power_due: DueTicks | None = None
+        self.windings: DelayedValues | None = None
+        if sensors.power is not None:
+            self._power_due = due_ticks(sensors.power.rate_hz)
+            self.windings = DelayedValues(robots, joints, sensors.power.delay_s, config.period_ns)
+
+    def restart(self, robot: int, config: RunConfig) -> None:
+        """Forget all samples of a robot, and use the noise of its new configuration."""
+        sensors = config.robot.sensors
+        joints = self._joint_count
+        sigma = [sensors.joints.angle_noise_rad, sensors.joints.velocity_noise_rad_s, sensors.joints.torque_noise_nm]
+        self._joint_sigma[robot] = np.repeat(sigma, joints)
+        for i, joint in enumerate(config.robot.joint_table):
+            self._is_measured[robot, 2 * joints + i] = "torque" in joint.drive.measures
+        self._all_are_measured = bool(self._is_measured.all())
+        if sensors.contacts is not None:
+            self._contact_sigma_n[robot] = sensors.contacts.force_noise_n
+            self._contact_threshold_n[robot] = sensors.contacts.threshold_n
+            self._contacts = _leave_out(self._contacts, robot)
+            for _, due in self._waiting_contacts:
+                due[robot] = False
+        if sensors.pose is not None:
+            pose_sigma = [sensors.pose.position_noise_m, 0.5 * sensors.pose.angle_noise_rad]
+            self._pose_sigma[robot] = np.repeat(pose_sigma, 3)
+            self._raw_poses.restart(robot)
+        if self.windings is not None:
+            self.windings.restart(robot)
+
+    def sample(
+        self, ticks: Ticks, active: Mask, simulations: Simulations, winding_c: Floats, *, starts: bool = False
+    ) -> None:
+        """Read the sensors of the active robots at their present ticks, in the order of `Sensors.published`.
+
+        Args:
+            ticks: (robots,), the present tick of each robot.
+            active: which robots are read; the others keep their values.
+            simulations: the states of all robots.
+            winding_c: (robots, joints), temperatures of the windings.
+            starts: whether the active robots have just been reset, while the others go on.
+        """
+        if self._contact_due is not None:
+            self._sample_contacts(self._contact_due.find_due(ticks, active), simulations, starts)
+        if self._imu_due is not None:
+            self._noise.skip(self._imu_numbers, self._imu_due.find_due(ticks, active))
+        if self._pose_due is not None:
+            self._sample_poses(self._pose_due.find_due(ticks, active), simulations, starts)
+        if self._power_due is not None and self.windings is not None:
+            self.windings.add(winding_c.copy(), self._power_due.find_due(ticks, active), starts=starts)
+        self._sample_joints(active, simulations, starts)
+
+    def _sample_contacts(self, due: Mask, simulations: Simulations, starts: bool) -> None:
+        if np.count_nonzero(due):
+            sample = self._draw_contact_noise(simulations.find_touches(np.flatnonzero(due).tolist()))
+        else:
+            sample = NO_CONTACTS
+        if self._contact_delay_ticks:
+            if starts and self._waiting_contacts:
+                waiting, waiting_due = self._waiting_contacts[-1]  # the others have taken their samples of this tick
+                merged = _replace_contacts(waiting, sample, due)
+                self._waiting_contacts[-1] = (merged, waiting_due | due)
+                return
+            self._waiting_contacts.append((sample, due.copy()))
+            if len(self._waiting_contacts) <= self._contact_delay_ticks:
+                return
+            sample, due = self._waiting_contacts.popleft()
+        self._contacts = _replace_contacts(self._contacts, sample, due)
+
+    def _draw_contact_noise(self, touches: TouchArrays) -> ContactSample:
+        """Return the contacts above the threshold with the random numbers of their forces."""
+        if not len(touches.robot):
+            return NO_CONTACTS
+        thresholds_n = self._contact_threshold_n
+        is_detected = [
+            math.hypot(*force_w) >= thresholds_n[robot]
+            for robot, force_w in zip(touches.robot.tolist(), touches.force_w.tolist(), strict=True)
+        ]
+        if not all(is_detected):
+            touches = _select(touches, np.array(is_detected))
+        contacts_of_robot = np.bincount(touches.robot, minlength=self._count)
+        rank = np.arange(len(touches.robot)) - (np.cumsum(contacts_of_robot) - contacts_of_robot)[touches.robot]
+        noise = np.zeros((len(touches.robot), 3))
+        if self._contacts_have_noise:
+            numbers = self._noise.peek(NUMBERS_OF_CONTACT * int(contacts_of_robot.max()))
+            of_force = NUMBERS_OF_CONTACT * rank[:, None] + np.arange(3, 6)
+            noise = numbers[touches.robot[:, None], of_force]
+            self._noise.skip_each(NUMBERS_OF_CONTACT * contacts_of_robot)
+        fits = rank < MAX_CONTACTS
+        return ContactSample(_select(touches, fits), noise[fits])
+
+    def _sample_poses(self, due: Mask, simulations: Simulations, starts: bool) -> None:
+        raw = np.zeros((self._count, NUMBERS_OF_POSE))
+        raw[:, :7] = simulations.base_pose
+        raw[:, 7:13] = simulations.base_velocity
+        if self._pose_has_noise:
+            raw[:, 13:] = self._noise.peek(6)
+            self._noise.skip(6, due)
+        self._raw_poses.add(raw, due, starts=starts)
+
+    def _sample_joints(self, active: Mask, simulations: Simulations, starts: bool) -> None:
+        joints = self._joint_count
+        values = np.empty((self._count, 3 * joints))
+        values[:, :joints] = simulations.angle_rad
+        values[:, joints : 2 * joints] = simulations.velocity_rad_s
+        values[:, 2 * joints :] = simulations.torque_nm
+        if self._joints_have_noise:
+            values += self._joint_sigma * self._noise.peek(3 * joints)
+            self._noise.skip(3 * joints, active)
+        if not self._all_are_measured:
+            values[~self._is_measured] = 0.0
+        if starts and self._waiting_joints:
+            for waiting in self._waiting_joints:  # the reading of the start is used until a delayed one is delivered
+                np.copyto(waiting, values, where=active[:, None])
+        else:
+            self._waiting_joints.append(values)
+        np.copyto(self.joints, self._waiting_joints[0], where=active[:, None])
+
+    # --- what is observed -----------------------------------------------------------------------------------
+
+    @property
+    def has_poses(self) -> Mask:
+        """Whether a pose has been delivered in this episode, (robots,)."""
+        if self._pose_due is None:
+            return np.zeros(self._count, dtype=np.bool_)
+        return self._raw_poses.is_known
+
+    def read_poses(self) -> tuple[Floats, Floats]:
+        """Return the newest poses, (robots, 7), and velocities in the world, (robots, 6); only where `has_poses`."""
+        if self._pose_due is None:
+            return np.zeros((self._count, 7)), np.zeros((self._count, 6))
+        raw = self._raw_poses.values
+        pose = raw[:, :7].copy()
+        velocity = raw[:, 7:13].copy()
+        velocity[:, 3:] = _rotate(raw[:, 3:7], raw[:, 10:13])
+        if self._pose_has_noise:
+            error = self._pose_sigma * raw[:, 13:]
+            pose[:, :3] += error[:, :3]
+            pose[:, 3:] = _add_rotation(raw[:, 3:7], error[:, 3:])
+        return pose, velocity
+
+    def read_contact_forces(self) -> Floats:
+        """Return the sum of the sizes of all contact forces on every link, (robots, links) in N."""
+        forces_n = [[0.0] * (self._joint_count + 1) for _ in range(self._count)]
+        touches = self._contacts.touches
+        if not len(touches.robot):
+            return np.array(forces_n)
+        sigma_n = np.array(self._contact_sigma_n)[touches.robot, None]
+        force_l = _rotate_into(touches.rotation, touches.force_w)
+        if self._contacts_have_noise:
+            force_l = force_l + sigma_n * self._contacts.noise
+        for robot, link, force in zip(touches.robot.tolist(), touches.link.tolist(), force_l.tolist(), strict=True):
+            forces_n[robot][link] += math.hypot(*force)
+        return np.array(forces_n)
+
+
+def _without_mounted(sensors: Sensors) -> Sensors:
+    return msgspec.structs.replace(sensors, depth=[], range=[], custom=[])
+
+
+def _has_noise(sensor: msgspec.Struct) -> bool:
+    """Return whether a sensor of the body draws random numbers."""
+    return any(value for name, value in msgspec.structs.asdict(sensor).items() if "noise" in name)
+
+
+def _select(touches: TouchArrays, mask: Mask) -> TouchArrays:
+    return TouchArrays(touches.robot[mask], touches.link[mask], touches.force_w[mask], touches.rotation[mask])
+
+
+def _leave_out(contacts: ContactSample, robot: int) -> ContactSample:
+    """Return the contacts without those of one robot."""
+    others = contacts.touches.robot != robot
+    return ContactSample(_select(contacts.touches, others), contacts.noise[others])
+
+
+def _replace_contacts(before: ContactSample, sample: ContactSample, due: Mask) -> ContactSample:
+    """Return the newest contacts of every robot: those of the sample for the robots that are due.
+
+    A delayed sample may hold robots that have been reset since then, which are not due any more.
+    """
+    if due.all():
+        return sample
+    kept = ~due[before.touches.robot]
+    new = due[sample.touches.robot]
+    touches = TouchArrays(
+        np.concatenate((before.touches.robot[kept], sample.touches.robot[new])),
+        np.concatenate((before.touches.link[kept], sample.touches.link[new])),
+        np.concatenate((before.touches.force_w[kept], sample.touches.force_w[new])),
+        np.concatenate((before.touches.rotation[kept], sample.touches.rotation[new])),
+    )
+    return ContactSample(touches, np.concatenate((before.noise[kept], sample.noise[new])))
+
+
+# --- the arithmetic of `sensors.frames` and `sensors.pose` on arrays -------------------------------------------------
+
+
+def _rotate_into(rotation: Floats, vector_w: Floats) -> Floats:
+    """Return the coordinates of world vectors, (n, 3), in the frames whose world_from_frame is (n, 9), row by row."""
+    a, b, c, d, e, f, g, h, i = rotation.T
+    x, y, z = vector_w.T
+    return np.stack((a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z), axis=1)
+
+
+def _rotate(wxyz: Floats, vector: Floats) -> Floats:
+    """Return vectors, (n, 3), rotated by unit quaternions, (n, 4)."""
+    w, x, y, z = wxyz.T
+    vx, vy, vz = vector.T
+    tx = 2 * (y * vz - z * vy)
+    ty = 2 * (z * vx - x * vz)
+    tz = 2 * (x * vy - y * vx)
+    return np.stack(
+        (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx), axis=1
+    )
+
+
+def _add_rotation(wxyz: Floats, half_angles: Floats) -> Floats:
+    """Return the unit quaternions along wxyz * (1, half angles): small rotations about axes of the base are added."""
+    w, x, y, z = wxyz.T
+    a, b, c = half_angles.T
+    quaternion = np.stack(
+        (
+            w - a * x - b * y - c * z,
+            x + a * w + b * z - c * y,
+            y + b * w + c * x - a * z,
+            z + c * w + a * y - b * x,
+        ),
+        axis=1,
+    )
+    w, x, y, z = quaternion.T
+    norm = np.sqrt(w * w + x * x + y * y + z * z)
+    return quaternion / norm[:, None]
