@@ -7,8 +7,7 @@ written twice, apart from the limits of targets.
 """
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +47,7 @@ def can_arm(config: RunConfig) -> bool:
     return config.backend == "sim" and not config.faults and has_current_temperatures
 
 
-@dataclass(frozen=True)
-class _Decided:
+class _Decided(NamedTuple):
     """The decisions of the array limiter in the last tick, and what they are based on."""
 
     robots: Mask
@@ -120,6 +118,13 @@ class ArmedRobots:
         self._descriptions = [describe_run_robot(config)] * robots
         self._everybody: Mask = np.ones(robots, dtype=np.bool_)
 
+        # Robots that take part in the present ticks.
+        self._active: Mask = np.zeros(robots, dtype=np.bool_)
+        self._active_robots: list[int] = []
+        self._ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # of the active ones
+        self._ordinary_at_call = self._is_ordinary
+        self._all_are_ordinary = False
+
     def can_start(self, config: RunConfig) -> bool:
         """Return whether a robot of this configuration can be a row."""
         schedule = config.services.get(CONTROL, ServiceSchedule())
@@ -180,17 +185,34 @@ class ArmedRobots:
             target: (robots, joints), in rad, rad/s or N·m. It must not change afterwards.
             active: (robots,), which robots take part; they must be armed.
         """
-        ordinary = active & self._is_ordinary
-        if self._decided is not None and not np.array_equal(self._decided.robots, ordinary):
-            self._update_active_limits()
+        if active is not self._active or self._is_ordinary is not self._ordinary_at_call:
+            self._choose_robots(active)
+        ordinary = self._ordinary
         self._commands.append(target)
         self._decide_together(mode, ordinary)
-        for robot in [robot for robot in self._clients if active[robot]]:
+        for robot in self._find_clients(active):
             self._decide_alone(robot, mode, target[robot].tolist())
         self._digests.add(active, self.ticks, self._modes, self._target, self._torque_limit_nm)
         self.simulated.enact(mode, self._target, self._torque_limit_nm, ordinary)
         moved = self._advance(active)
         self._observe(mode, moved)
+
+    def _choose_robots(self, active: Mask) -> None:
+        """Find the robots that take part in the next ticks."""
+        self._active = active
+        self._active_robots = np.flatnonzero(active).tolist()
+        self._ordinary_at_call = self._is_ordinary
+        ordinary = active & self._is_ordinary
+        if not np.array_equal(ordinary, self._ordinary):
+            self._update_active_limits()
+        self._ordinary = ordinary
+        self._all_are_ordinary = bool(ordinary.all())
+
+    def _find_clients(self, robots: Mask) -> list[int]:
+        """Return those of these robots that have a limiter to themselves."""
+        if not self._clients:
+            return []
+        return [robot for robot in self._clients if robots[robot]]
 
     def read_digest(self, robot: int) -> str:
         """Return the digest of all setpoints, as the `command_digest` of a run."""
@@ -220,7 +242,7 @@ class ArmedRobots:
             torque_limit_nm = self._limits.torque_nm
             target = requested.copy()
             is_limited = np.zeros_like(self.is_limited)
-        if np.count_nonzero(robots) < len(robots):
+        if not self._all_are_ordinary:
             target = np.where(robots[:, None], target, self._target)
             torque_limit_nm = np.where(robots[:, None], torque_limit_nm, self._torque_limit_nm)
             is_limited = is_limited & robots[:, None]
@@ -276,8 +298,12 @@ class ArmedRobots:
 
     def _advance(self, active: Mask) -> Mask:
         """Step the physics, and return the robots whose simulations go on."""
-        robots = np.flatnonzero(active).tolist()
-        diverged = self.simulated.advance(robots, (self.ticks + 1)[active].tolist())
+        following = self.ticks + active
+        diverged = self.simulated.advance(self._active_robots, following.tolist())
+        if not diverged:
+            self.ticks = following
+            self.simulated.sample(following, active)
+            return active
         moved = active
         for robot, cause in diverged.items():
             moved = _replace(moved, robot, False)
@@ -301,21 +327,22 @@ class ArmedRobots:
     def _observe(self, mode: Mode, moved: Mask) -> None:
         """Let the limiters judge the newest samples of the robots that have moved."""
         before = self.joints
-        self.joints = self.simulated.sensors.joints.copy()
+        self.joints = self.simulated.sensors.joints
         if not self._safe:
-            for robot in [robot for robot in self._clients if moved[robot]]:
+            for robot in self._find_clients(moved):
                 self._join_others(robot)
             return
         self._update_torque_fractions()
         is_near, is_ordinary = self._find_ordinary(before)
-        for robot in [robot for robot in self._clients if moved[robot]]:
+        for robot in self._find_clients(moved):
             self._observe_alone(self._clients[robot], robot)
             self._stays_alone[robot] |= not is_near[robot] or self._clients[robot].has_isolated_joints
             if is_ordinary[robot] and not self._stays_alone[robot] and self._obeys(robot, mode):
                 self._join_others(robot)
-        unusual = self._is_ordinary & moved & ~is_ordinary
-        for robot in np.flatnonzero(unusual).tolist():
-            self._leave_others(robot, before[robot], mode)
+        if is_ordinary is not self._everybody:
+            unusual = self._ordinary & moved & ~is_ordinary
+            for robot in np.flatnonzero(unusual).tolist():
+                self._leave_others(robot, before[robot], mode)
 
     def _find_ordinary(self, before: Floats) -> tuple[Mask, Mask]:
         """Compare the newest joint states with those before.

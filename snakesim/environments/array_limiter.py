@@ -7,7 +7,7 @@ one mode, and had it in the period before; a test compares the two over random c
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,7 @@ class LimitArrays:
             self.velocity_gain[robot, i] = max(joint.velocity_gain_nm_s_per_rad, joint.torque_limit_nm / max_speed)
 
 
-@dataclass(frozen=True)
-class MeasuredArrays:
+class MeasuredArrays(NamedTuple):
     """The measured states of the joints, (robots, joints) each."""
 
     angle_rad: Floats

@@ -1,7 +1,7 @@
 """The digests of many robots: hashes over every applied setpoint, as `BlackBox` computes them for one robot."""
 
 import hashlib
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ TICKS_AT_ONCE = 64  # hashing many ticks together costs little more than hashing
 Mask = NDArray[np.bool_]  # (robots,)
 
 
-@dataclass(frozen=True)
-class _Tick:
+class _Tick(NamedTuple):
     """The setpoints of one tick, (robots, joints)."""
 
     robots: Mask  # which robots got setpoints

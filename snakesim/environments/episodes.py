@@ -12,7 +12,7 @@ alone and among others.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -119,10 +119,15 @@ class Episodes:
         start_m = self.advance_m
         ticks = np.zeros(self._count, dtype=np.int64)
         steps: list[_Tick] = []
-        for _ in range(setup.frame_skip):
-            active = environments & self.robots.is_armed & (ticks < self._ticks_left)
-            if not np.count_nonzero(active):
-                break
+        shortest = int(self._ticks_left[environments].min(initial=setup.frame_skip))
+        active = environments
+        is_armed: Mask | None = None  # as of the last computation of `active`
+        for tick in range(setup.frame_skip):
+            if is_armed is not self.robots.is_armed or tick >= shortest:
+                is_armed = self.robots.is_armed
+                active = environments & is_armed & (ticks < self._ticks_left)
+                if not np.count_nonzero(active):
+                    break
             self.robots.step(setup.commands.mode, actions, active)
             steps.append(_Tick(active, self.robots.joints, self.robots.is_limited))
             ticks = ticks + active
@@ -197,15 +202,14 @@ class Episodes:
         samples = np.stack([step.joints for step in steps])
         # The sum is made in order, so that it does not depend on how many environments there are.
         joint_power_w = np.abs(samples[:, :, 2 * joints :] * samples[:, :, joints : 2 * joints])
-        power_w = np.cumsum(joint_power_w, axis=2)[:, :, -1]
+        power_w = joint_power_w.cumsum(axis=2)[:, :, -1]
         for tick_energy_j in np.where(active, power_w * self._period_ns * 1e-9, 0.0):
             energy_j = energy_j + tick_energy_j
         is_limited = np.stack([step.is_limited for step in steps]) & active[:, :, None]
         return energy_j, np.count_nonzero(is_limited, axis=(0, 2))
 
 
-@dataclass(frozen=True)
-class _Tick:
+class _Tick(NamedTuple):
     """What a step collects in each of its ticks."""
 
     active: Mask  # (environments,), which took part

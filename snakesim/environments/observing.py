@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from snakesim.environments.armed import Mask
 from snakesim.environments.robots import Robots
-from snakesim_gnc.control.goal_progress import GoalProgress, compute_centers_w, compute_mass_ratios
+from snakesim_gnc.control.goal_progress import BodyLocator, GoalProgress
 from snakesim_gnc.control.observations import ObservationPart
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Task
-from snakesim_hal.model.kinematics import find_nodes_of_many_w
 from snakesim_hal.wire.messages import Description
 
 
@@ -27,9 +26,8 @@ class Seen:
     time_s: Floats  # (robots,), since arming
     joints: Floats  # (robots, 3 * joints)
     poses: Floats  # (robots, 7)
-    velocities: Floats  # (robots, 6), in the world
     progress: Sequence[GoalProgress]
-    read_contact_forces: Callable[[], Floats]
+    robots: Robots  # measures what few environments observe
 
 
 class Observers:
@@ -52,7 +50,7 @@ class Observers:
         self._high = np.array([value for part in parts.values() for value in part.high], np.float32)
         self._descriptions = [description] * robots
         self._has_equal_links = True
-        self._mass_ratios = compute_mass_ratios(description)
+        self._locator = BodyLocator(description)
         self._start_poses = np.zeros((robots, 7))
         self._start_poses[:, 3] = 1.0
         no_task = Task((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None)
@@ -63,7 +61,7 @@ class Observers:
         self._descriptions[robot] = description
         first = self._descriptions[0]
         self._has_equal_links = all(_has_equal_links(first, other) for other in self._descriptions)
-        self._mass_ratios = compute_mass_ratios(first)
+        self._locator = BodyLocator(first)
         self._start_poses[robot] = [*task.start_position_w, *task.start_wxyz]
         self.progress[robot] = GoalProgress(description, task)
 
@@ -75,11 +73,11 @@ class Observers:
             time_s: (robots,), time since arming.
             rows: (robots,), the robots whose advance is measured; the observations of the others mean nothing.
         """
-        has_pose, poses, velocities = robots.read_poses()
-        poses = np.where(has_pose[:, None], poses, self._start_poses)
-        velocities = np.where(has_pose[:, None], velocities, 0.0)
+        has_pose, poses = robots.read_poses()
+        if not has_pose.all():
+            poses = np.where(has_pose[:, None], poses, self._start_poses)
         self._measure_advance(robots.joints, poses, rows)
-        seen = Seen(time_s, robots.joints, poses, velocities, self.progress, robots.read_contact_forces)
+        seen = Seen(time_s, robots.joints, poses, self.progress, robots)
         columns = [read(seen) for read in self._readers]
         numbers = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
         return np.minimum(np.maximum(numbers, self._low), self._high)
@@ -91,10 +89,8 @@ class Observers:
         if self._has_equal_links and indices:
             groups = [indices]  # faster
         for group in groups:
-            description = self._descriptions[group[0]]
-            ratios = self._mass_ratios if self._has_equal_links else compute_mass_ratios(description)
-            nodes_w = find_nodes_of_many_w(description, poses[group, :3], poses[group, 3:], angles_rad[group])
-            centers_w = compute_centers_w(ratios, nodes_w)
+            locator = self._locator if self._has_equal_links else BodyLocator(self._descriptions[group[0]])
+            nodes_w, centers_w = locator.locate(poses[group], angles_rad[group])
             for i, robot in enumerate(group):
                 progress = self.progress[robot]
                 progress.pose = poses[robot, :3], poses[robot, 3:]
@@ -133,9 +129,9 @@ READERS: Mapping[str, Callable[[Seen], Floats]] = {
     "torque_nm": _read_joints(2),
     "goal_bearing": _read_bearings,
     "goal_m": _read_distances_left,
-    "contact_n": lambda seen: seen.read_contact_forces(),
+    "contact_n": lambda seen: seen.robots.read_contact_forces(),
     "position_w_m": lambda seen: seen.poses[:, :3],
     "orientation_wxyz": lambda seen: seen.poses[:, 3:],
-    "velocity_w_m_s": lambda seen: seen.velocities[:, :3],
-    "angular_velocity_w_rad_s": lambda seen: seen.velocities[:, 3:],
+    "velocity_w_m_s": lambda seen: seen.robots.read_velocities()[:, :3],
+    "angular_velocity_w_rad_s": lambda seen: seen.robots.read_velocities()[:, 3:],
 }

@@ -126,23 +126,36 @@ class Robots:
 
     # --- what the sensors besides the joints measure -----------------------------------------------------------
 
-    def read_poses(self) -> tuple[Mask, Floats, Floats]:
-        """Return which robots have a pose, the poses, (robots, 7), and the velocities in the world, (robots, 6)."""
+    def read_poses(self) -> tuple[Mask, Floats]:
+        """Return which robots have a pose, and the positions and quaternions, (robots, 7)."""
         if self._armed is None:
             is_known = np.zeros(self._count, dtype=np.bool_)
             poses = np.zeros((self._count, NUMBERS_OF_POSE))
-            velocities = np.zeros((self._count, NUMBERS_OF_VELOCITY))
         else:
             sensors = self._armed.simulated.sensors
-            is_known = sensors.has_poses.copy()
-            poses, velocities = sensors.read_poses()
+            is_known = sensors.has_poses
+            poses = sensors.read_poses()
+        if self._alone:
+            is_known = is_known.copy()
         for robot, alone in self._alone.items():
             pose = alone.newest.get(keys.POSE)
             is_known[robot] = isinstance(pose, Pose)
             if isinstance(pose, Pose):
                 poses[robot] = [*pose.position_w, *pose.orientation_wxyz]
+        return is_known, poses
+
+    def read_velocities(self) -> Floats:
+        """Return linear and angular velocities in the world, (robots, 6); zeros for robots without a pose."""
+        velocities = np.zeros((self._count, NUMBERS_OF_VELOCITY))
+        if self._armed is not None:
+            sensors = self._armed.simulated.sensors
+            velocities = np.where(sensors.has_poses[:, None], sensors.read_velocities(), 0.0)
+        for robot, alone in self._alone.items():
+            pose = alone.newest.get(keys.POSE)
+            velocities[robot] = 0.0
+            if isinstance(pose, Pose):
                 velocities[robot] = [*pose.velocity_w, *pose.angular_velocity_w]
-        return is_known, poses, velocities
+        return velocities
 
     def read_contact_forces(self) -> Floats:
         """Return the sum of the sizes of all contact forces on every link, (robots, links) in N."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Task
-from snakesim_hal.model.kinematics import find_nodes_w
+from snakesim_hal.model.kinematics import NodeFinder
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose
 
@@ -25,8 +25,7 @@ class GoalProgress:
             robot: description of the robot.
             task: start pose and goal.
         """
-        self._robot = robot
-        self._mass_ratios = compute_mass_ratios(robot)
+        self._locator = BodyLocator(robot)
 
         # The goal.
         self._goal = task.goal
@@ -47,8 +46,8 @@ class GoalProgress:
         if pose is not None:
             self.pose = pose.position_w, pose.orientation_wxyz
         position_w, wxyz = self.pose
-        nodes_w = find_nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
-        self.follow(nodes_w, compute_centers_w(self._mass_ratios, nodes_w[None])[0])
+        nodes_w, centers_w = self._locator.locate(np.array([[*position_w, *wxyz]]), np.array([joints.angle_rad]))
+        self.follow(nodes_w[0], centers_w[0])
 
     def follow(self, nodes_w: Floats, center_w: Floats) -> None:
         """Measure the advance of a body that has been located.
@@ -126,21 +125,28 @@ class GoalProgress:
         return float(np.hypot(*np.subtract(self._points_m[self._next_point], self._head_w)))
 
 
-def compute_mass_ratios(robot: Description) -> Floats:
-    """Return the mass of every link as a fraction of the whole, (n_links,)."""
-    masses_kg = np.array([link.mass_kg for link in robot.links])
-    return masses_kg / masses_kg.sum()
+class BodyLocator:
+    """Computes where bodies are, for any number of robots with equal links."""
 
+    def __init__(self, robot: Description) -> None:
+        """Read the links of a robot."""
+        self._nodes = NodeFinder(robot)
+        masses_kg = np.array([link.mass_kg for link in robot.links])
+        self._mass_ratios = masses_kg / masses_kg.sum()  # (n_links,), of the whole
 
-def compute_centers_w(mass_ratios: Floats, nodes_w: Floats) -> Floats:
-    """Return the centers of mass of bodies on the ground, (n, 2), in m. The mass of every link is at its middle.
+    def locate(self, poses: Floats, angles_rad: Floats) -> tuple[Floats, Floats]:
+        """Locate bodies.
 
-    Args:
-        mass_ratios: (n_links,), of the whole.
-        nodes_w: (n, joints + 2, 3), tail end, joints and head end of each body.
-    """
-    # The last link reaches from its origin to the head.
-    origins_w = nodes_w[:, :-1, :2]
-    middles_w = 0.5 * (origins_w[:, 1:] + origins_w[:, :-1])
-    last_moments_w = mass_ratios[-1] * 0.5 * (origins_w[:, -1] + nodes_w[:, -1, :2])
-    return mass_ratios[:-1] @ middles_w + last_moments_w
+        Args:
+            poses: (n, 7), position in m and quaternion wxyz of the tail ends.
+            angles_rad: (n, joints), tail to head.
+
+        Returns:
+            Tail ends, joints and head ends, (n, joints + 2, 3); and centers of mass on the ground, (n, 2); in m.
+        """
+        nodes_w = self._nodes.find(poses[:, :3], poses[:, 3:], angles_rad)
+        # The mass of every link is at its middle. The last link reaches from its origin to the head.
+        origins_w = nodes_w[:, :-1, :2]
+        middles_w = 0.5 * (origins_w[:, 1:] + origins_w[:, :-1])
+        last_moments_w = self._mass_ratios[-1] * 0.5 * (origins_w[:, -1] + nodes_w[:, -1, :2])
+        return nodes_w, self._mass_ratios[:-1] @ middles_w + last_moments_w

@@ -26,7 +26,7 @@ class HeatArrays:
         self._approach = np.zeros(shape)  # fraction of the way to the settled temperature, in a control period
         self._derate_from_c = np.ones(shape)
         self._stop_at_c = np.full(shape, 2.0)
-        self._is_derated = np.zeros(robots, dtype=np.bool_)  # whether a motor was hot when `find_changed` was called
+        self._derated = set[int]()  # robots with a hot motor when `find_changed` was called
 
     def restart(self, robot: int, joints: Sequence[Joint]) -> None:
         """Start a robot with every winding at the ambient temperature."""
@@ -37,22 +37,25 @@ class HeatArrays:
         self._derate_from_c[robot] = [joint.limits.derate_from_c for joint in joints]
         self._stop_at_c[robot] = [joint.limits.stop_at_c for joint in joints]
         self.winding_c[robot] = self._ambient_c[robot]
-        self._is_derated[robot] = False
+        self._derated.discard(robot)
 
     def pass_period(self, torque_nm: Floats) -> None:
         """Heat and cool the windings for a control period under these torques, (robots, joints)."""
-        settled_c = self._ambient_c + self._rise * np.square(torque_nm)
-        self.winding_c += (settled_c - self.winding_c) * self._approach
+        change_c = np.square(torque_nm)
+        change_c *= self._rise
+        change_c += self._ambient_c  # the settled temperature
+        change_c -= self.winding_c
+        change_c *= self._approach
+        self.winding_c += change_c
 
     def find_changed(self) -> list[int]:
         """Return the robots whose motors are to be derated anew: those that are hot, or were so at the last call."""
         hot = self.winding_c > self._derate_from_c
-        if not np.count_nonzero(hot) and not np.count_nonzero(self._is_derated):
+        if not np.count_nonzero(hot) and not self._derated:
             return []
-        is_derated = hot.any(axis=1)
-        changed = is_derated | self._is_derated
-        self._is_derated = is_derated
-        return np.flatnonzero(changed).tolist()
+        before = self._derated
+        self._derated = set(np.flatnonzero(hot.any(axis=1)).tolist())
+        return sorted(before | self._derated)
 
     def remaining_fractions(self, winding_c: Floats) -> Floats:
         """Return the fraction of its torque that each motor may use at these temperatures, (robots, joints)."""

@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 
-Mask = NDArray[np.bool_]  # (robots,)
 BLOCK = 4096  # numbers that are drawn at once for each robot; a tick needs about 130
 
 
@@ -25,21 +24,18 @@ class NoiseStreams:
         self._numbers[robot] = self._random[robot].standard_normal(BLOCK)
         self._next[robot] = 0
 
-    def peek(self, count: int) -> Floats:
-        """Return the next numbers of every robot, (robots, count), and leave them in the streams."""
-        self._reserve(count)
+    def peek(self, count: int, offset: int = 0) -> Floats:
+        """Return the next numbers of every robot after `offset`, (robots, count), and leave them in the streams."""
+        self._reserve(offset + count)
         if len(self._next) == 1:  # faster
-            start = int(self._next[0])
+            start = int(self._next[0]) + offset
             return self._numbers[:, start : start + count]
-        return self._numbers.take((self._first + self._next)[:, None] + np.arange(count))
+        return self._numbers.take((self._first + self._next + offset)[:, None] + np.arange(count))
 
-    def skip(self, count: int, robots: Mask) -> None:
-        """Leave out the next `count` numbers of these robots."""
+    def skip(self, count: int) -> None:
+        """Leave out the next `count` numbers of every robot."""
         self._reserve(count)
-        if np.count_nonzero(robots) == len(robots):
-            self._next += count
-        else:
-            self._next += count * robots
+        self._next += count
         self._left -= count
 
     def skip_each(self, counts: NDArray[np.intp]) -> None:

@@ -42,6 +42,7 @@ class SimulatedRobots:
         self._min_torque_nm = np.zeros((robots, joints))
         self._max_torque_nm = np.zeros((robots, joints))
         self._torque_limit_nm = np.zeros((robots, joints))  # of the last setpoints
+        self._last_limit_nm: Floats | None = None  # the same array in many ticks
         self._changing = set[int]()  # robots whose torque limits have not reached their new values yet
         self._supplies: list[tuple[list[float], list[float]]] = [([], [])] * robots  # voltage and idle current
 
@@ -72,6 +73,7 @@ class SimulatedRobots:
         self._changing.discard(robot)
         self._read_motor_range(robot)
         self._torque_limit_nm[robot] = [joint.limits.torque_nm for joint in joint_table]
+        self._last_limit_nm = None
         only_this = np.zeros(len(self._supplies), dtype=np.bool_)
         only_this[robot] = True
         ticks = np.zeros(len(self._supplies), dtype=np.int64)
@@ -89,9 +91,10 @@ class SimulatedRobots:
         """
         inputs = self._simulations.motor_inputs[:, INPUT_OF_MODE[mode] :: INPUTS]
         np.copyto(inputs, target, where=robots[:, None])
-        is_changed = torque_limit_nm != self._torque_limit_nm
-        if not np.count_nonzero(is_changed):
+        if torque_limit_nm is self._last_limit_nm:
             return
+        self._last_limit_nm = torque_limit_nm
+        is_changed = torque_limit_nm != self._torque_limit_nm
         for robot in np.flatnonzero(is_changed.any(axis=1) & robots).tolist():
             modes = [mode] * self._joints
             self._simulations.motors[robot].drive(modes, target[robot].tolist(), torque_limit_nm[robot].tolist())
@@ -102,6 +105,7 @@ class SimulatedRobots:
         """Give the motors of one robot any setpoints."""
         self._simulations.motors[robot].enact(setpoints)
         self._torque_limit_nm[robot] = setpoints.torque_limit_nm
+        self._last_limit_nm = None
         self._changing.add(robot)
 
     def advance(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
@@ -109,16 +113,14 @@ class SimulatedRobots:
 
         Args:
             robots: their rows.
-            ticks: number of the control cycle that ends with this step, for messages.
+            ticks: for every row, number of the control cycle that ends with this step, for messages.
 
         Returns:
             Why a simulation has diverged, by its row.
         """
         simulations = self._simulations
-        for robot in self._changing:
-            simulations.motors[robot].before_steps()
-            self._read_motor_range(robot)
-        self._changing = {robot for robot in self._changing if simulations.motors[robot].limit_is_changing}
+        if self._changing:
+            self._change_limits()
         if simulations.motor_state.shape[1]:  # a limit ends wind-up above it, see `Motors.before_steps`
             state = simulations.motor_state
             np.minimum(state, self._max_torque_nm, out=state)
@@ -177,6 +179,14 @@ class SimulatedRobots:
             leak=[False] * self._joints,
             valid=[True] * self._joints,
         )
+
+    def _change_limits(self) -> None:
+        """Apply lowered limits as fast as the motors can follow."""
+        motors = self._simulations.motors
+        for robot in self._changing:
+            motors[robot].before_steps()
+            self._read_motor_range(robot)
+        self._changing = {robot for robot in self._changing if motors[robot].limit_is_changing}
 
     def _warm_windings(self) -> None:
         """Let a period of heat pass, and derate hot joints. The torque of the last step stands for the period."""

@@ -21,15 +21,17 @@ class DueTicks:
         self._period_ns = period_ns
         self._always = sensor_hz >= tick_hz
         self._due: Mask = np.zeros(0, dtype=np.bool_)  # by tick
+        self._calls = 0  # no robot has made more ticks
 
     def find_due(self, ticks: Ticks, active: Mask) -> Mask:
         """Return which of the active robots sample at their present ticks."""
         if self._always:
             return active
-        if ticks.max() >= len(self._due):
-            count = max(2 * len(self._due), FIRST_TICKS, int(ticks.max()) + 1)
+        self._calls += 1
+        if self._calls > len(self._due):
+            count = max(2 * len(self._due), FIRST_TICKS)
             self._due = np.array([self._schedule.is_due(tick * self._period_ns) for tick in range(count)])
-        return self._due[ticks] & active
+        return self._due.take(ticks) & active
 
 
 class DelayedValues:
@@ -43,6 +45,7 @@ class DelayedValues:
 
     def __init__(self, robots: int, width: int, delay_s: float, period_ns: int) -> None:
         self._delay_ticks = round_to_ticks(delay_s, period_ns)
+        self._nobody: Mask = np.zeros(robots, dtype=np.bool_)
         self._waiting: deque[tuple[Floats, Mask]] = deque()  # values, and which of them are samples
         self.values: Floats = np.zeros((robots, width))
         self.is_known: Mask = np.zeros(robots, dtype=np.bool_)
@@ -50,10 +53,13 @@ class DelayedValues:
 
     def restart(self, robot: int) -> None:
         """Forget all samples of a robot."""
+        self.is_known = self.is_known.copy()
         self.is_known[robot] = False
-        self.is_new[robot] = False
-        for _, due in self._waiting:
-            due[robot] = False
+        self.is_new = self._nobody
+        for age, (values, due) in enumerate(self._waiting):
+            others_due = due.copy()
+            others_due[robot] = False
+            self._waiting[age] = (values, others_due)
 
     def add(self, values: Floats, due: Mask, *, starts: bool = False) -> None:
         """Take in the samples of a tick, and deliver those whose delay is over.
@@ -65,16 +71,25 @@ class DelayedValues:
         """
         if self._delay_ticks:
             if starts and self._waiting:
-                waiting_values, waiting_due = self._waiting[-1]  # the others have taken their samples of this tick
-                np.copyto(waiting_values, values, where=due[:, None])
-                waiting_due |= due
+                waiting, waiting_due = self._waiting[-1]  # the others have taken their samples of this tick
+                self._waiting[-1] = (np.where(due[:, None], values, waiting), waiting_due | due)
                 return
-            self._waiting.append((values, due.copy()))
+            self._waiting.append((values, due))
             if len(self._waiting) <= self._delay_ticks:
-                self.is_new = np.zeros_like(due)
+                self.is_new = self._nobody
                 return
             values, due = self._waiting.popleft()
         self.is_new = due
-        if np.count_nonzero(due):
+        if due.all():
+            self.is_known = due
+            self.values = values
+        else:
             self.is_known = self.is_known | due
-            np.copyto(self.values, values, where=due[:, None])
+            self.values = np.where(due[:, None], values, self.values)
+
+    def add_nothing(self) -> None:
+        """Go on by a tick in which no robot samples."""
+        if self._delay_ticks:
+            self.add(self.values, self._nobody)
+        else:
+            self.is_new = self._nobody

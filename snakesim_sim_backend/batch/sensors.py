@@ -20,7 +20,9 @@ from snakesim_sim_backend.batch.samples import DelayedValues, DueTicks, Mask, Ti
 from snakesim_sim_backend.batch.simulations import NO_TOUCHES, Simulations, TouchArrays
 from snakesim_sim_backend.sensors.timing import round_to_ticks
 
-NUMBERS_OF_POSE = 19  # of a raw sample: 7 of the pose, 6 of the velocities, 6 of noise
+NUMBERS_OF_POSE = 7
+NUMBERS_OF_VELOCITY = 6
+NUMBERS_OF_RAW_POSE = 19  # those of pose and velocity, and 6 of noise
 NUMBERS_OF_CONTACT = 6  # of noise: of position and force
 
 
@@ -49,7 +51,8 @@ class SensorArrays:
     """The sensors of many robots.
 
     Attributes:
-        joints: (robots, 3 * joints), angles, velocities and torques as delivered at this tick.
+        joints: (robots, 3 * joints), angles, velocities and torques as delivered at this tick. A new array in each
+            tick, which never changes afterwards.
         windings: temperatures, (robots, joints), as the power sensor has delivered them.
     """
 
@@ -96,9 +99,10 @@ class SensorArrays:
         if sensors.pose is not None:
             self._pose_due = due_ticks(sensors.pose.rate_hz)
             self._pose_has_noise = _has_noise(sensors.pose)
-            self._raw_poses = DelayedValues(robots, NUMBERS_OF_POSE, sensors.pose.delay_s, config.period_ns)
+            self._raw_poses = DelayedValues(robots, NUMBERS_OF_RAW_POSE, sensors.pose.delay_s, config.period_ns)
             self._raw_poses.values[:, 3] = 1.0  # a quaternion that can be normalized, until there is a pose
         self._pose_sigma = np.zeros((robots, 6))
+        self._no_pose_noise = np.zeros((robots, 6))
 
         # Power.
         self._power_due: DueTicks | None = None
@@ -120,8 +124,10 @@ class SensorArrays:
             self._contact_sigma_n[robot] = sensors.contacts.force_noise_n
             self._contact_threshold_n[robot] = sensors.contacts.threshold_n
             self._contacts = _leave_out(self._contacts, robot)
-            for _, due in self._waiting_contacts:
-                due[robot] = False
+            for age, (sample, due) in enumerate(self._waiting_contacts):
+                others_due = due.copy()
+                others_due[robot] = False
+                self._waiting_contacts[age] = (sample, others_due)
         if sensors.pose is not None:
             pose_sigma = [sensors.pose.position_noise_m, 0.5 * sensors.pose.angle_noise_rad]
             self._pose_sigma[robot] = np.repeat(pose_sigma, 3)
@@ -141,28 +147,38 @@ class SensorArrays:
             winding_c: (robots, joints), temperatures of the windings.
             starts: whether the active robots have just been reset, while the others go on.
         """
+        everybody = np.count_nonzero(active) == self._count
         if self._contact_due is not None:
             self._sample_contacts(self._contact_due.find_due(ticks, active), simulations, starts)
         if self._imu_due is not None:
-            self._noise.skip(self._imu_numbers, self._imu_due.find_due(ticks, active))
+            self._skip(self._imu_numbers, self._imu_due.find_due(ticks, active))
         if self._pose_due is not None:
             self._sample_poses(self._pose_due.find_due(ticks, active), simulations, starts)
         if self._power_due is not None and self.windings is not None:
-            self.windings.add(winding_c.copy(), self._power_due.find_due(ticks, active), starts=starts)
-        self._sample_joints(active, simulations, starts)
+            due = self._power_due.find_due(ticks, active)
+            if np.count_nonzero(due):
+                self.windings.add(winding_c.copy(), due, starts=starts)
+            elif not starts:
+                self.windings.add_nothing()
+        self._sample_joints(active, everybody, simulations, starts)
+
+    def _skip(self, count: int, due: Mask) -> None:
+        """Leave out the next random numbers of the robots that are due."""
+        if np.count_nonzero(due) == self._count:
+            self._noise.skip(count)
+        else:
+            self._noise.skip_each(count * due)
 
     def _sample_contacts(self, due: Mask, simulations: Simulations, starts: bool) -> None:
-        if np.count_nonzero(due):
-            sample = self._draw_contact_noise(simulations.find_touches(np.flatnonzero(due).tolist()))
-        else:
-            sample = NO_CONTACTS
+        touches = simulations.find_touches(due)
+        sample = self._draw_contact_noise(touches) if len(touches.robot) else NO_CONTACTS
         if self._contact_delay_ticks:
             if starts and self._waiting_contacts:
                 waiting, waiting_due = self._waiting_contacts[-1]  # the others have taken their samples of this tick
                 merged = _replace_contacts(waiting, sample, due)
                 self._waiting_contacts[-1] = (merged, waiting_due | due)
                 return
-            self._waiting_contacts.append((sample, due.copy()))
+            self._waiting_contacts.append((sample, due))
             if len(self._waiting_contacts) <= self._contact_delay_ticks:
                 return
             sample, due = self._waiting_contacts.popleft()
@@ -170,8 +186,6 @@ class SensorArrays:
 
     def _draw_contact_noise(self, touches: TouchArrays) -> ContactSample:
         """Return the contacts above the threshold with the random numbers of their forces."""
-        if not len(touches.robot):
-            return NO_CONTACTS
         thresholds_n = self._contact_threshold_n
         is_detected = [
             math.hypot(*force_w) >= thresholds_n[robot]
@@ -191,31 +205,29 @@ class SensorArrays:
         return ContactSample(_select(touches, fits), noise[fits])
 
     def _sample_poses(self, due: Mask, simulations: Simulations, starts: bool) -> None:
-        raw = np.zeros((self._count, NUMBERS_OF_POSE))
-        raw[:, :7] = simulations.base_pose
-        raw[:, 7:13] = simulations.base_velocity
+        noise = self._no_pose_noise
         if self._pose_has_noise:
-            raw[:, 13:] = self._noise.peek(6)
-            self._noise.skip(6, due)
+            noise = self._noise.peek(6)
+            self._skip(6, due)
+        raw = np.concatenate((simulations.base_pose, simulations.base_velocity, noise), axis=1)
         self._raw_poses.add(raw, due, starts=starts)
 
-    def _sample_joints(self, active: Mask, simulations: Simulations, starts: bool) -> None:
+    def _sample_joints(self, active: Mask, everybody: bool, simulations: Simulations, starts: bool) -> None:
         joints = self._joint_count
-        values = np.empty((self._count, 3 * joints))
-        values[:, :joints] = simulations.angle_rad
-        values[:, joints : 2 * joints] = simulations.velocity_rad_s
-        values[:, 2 * joints :] = simulations.torque_nm
+        values = np.concatenate((simulations.angle_rad, simulations.velocity_rad_s, simulations.torque_nm), axis=1)
         if self._joints_have_noise:
             values += self._joint_sigma * self._noise.peek(3 * joints)
-            self._noise.skip(3 * joints, active)
+            self._skip(3 * joints, active)
         if not self._all_are_measured:
             values[~self._is_measured] = 0.0
         if starts and self._waiting_joints:
-            for waiting in self._waiting_joints:  # the reading of the start is used until a delayed one is delivered
-                np.copyto(waiting, values, where=active[:, None])
+            # The reading of the start is used until a delayed one is delivered.
+            for age, waiting in enumerate(self._waiting_joints):
+                self._waiting_joints[age] = np.where(active[:, None], values, waiting)
         else:
             self._waiting_joints.append(values)
-        np.copyto(self.joints, self._waiting_joints[0], where=active[:, None])
+        delivered = self._waiting_joints[0]
+        self.joints = delivered if everybody else np.where(active[:, None], delivered, self.joints)
 
     # --- what is observed -----------------------------------------------------------------------------------
 
@@ -226,19 +238,26 @@ class SensorArrays:
             return np.zeros(self._count, dtype=np.bool_)
         return self._raw_poses.is_known
 
-    def read_poses(self) -> tuple[Floats, Floats]:
-        """Return the newest poses, (robots, 7), and velocities in the world, (robots, 6); only where `has_poses`."""
+    def read_poses(self) -> Floats:
+        """Return the newest positions and quaternions, (robots, 7); they mean something only where `has_poses`."""
         if self._pose_due is None:
-            return np.zeros((self._count, 7)), np.zeros((self._count, 6))
+            return np.zeros((self._count, NUMBERS_OF_POSE))
         raw = self._raw_poses.values
         pose = raw[:, :7].copy()
-        velocity = raw[:, 7:13].copy()
-        velocity[:, 3:] = _rotate(raw[:, 3:7], raw[:, 10:13])
         if self._pose_has_noise:
             error = self._pose_sigma * raw[:, 13:]
             pose[:, :3] += error[:, :3]
             pose[:, 3:] = _add_rotation(raw[:, 3:7], error[:, 3:])
-        return pose, velocity
+        return pose
+
+    def read_velocities(self) -> Floats:
+        """Return the newest velocities in the world, linear and angular, (robots, 6); only where `has_poses`."""
+        if self._pose_due is None:
+            return np.zeros((self._count, NUMBERS_OF_VELOCITY))
+        raw = self._raw_poses.values
+        velocity = raw[:, 7:13].copy()
+        velocity[:, 3:] = _rotate(raw[:, 3:7], raw[:, 10:13])
+        return velocity
 
     def read_contact_forces(self) -> Floats:
         """Return the sum of the sizes of all contact forces on every link, (robots, links) in N."""
@@ -279,7 +298,7 @@ def _replace_contacts(before: ContactSample, sample: ContactSample, due: Mask) -
 
     A delayed sample may hold robots that have been reset since then, which are not due any more.
     """
-    if due.all():
+    if due.all() or not (len(before.touches.robot) or len(sample.touches.robot)):
         return sample
     kept = ~due[before.touches.robot]
     new = due[sample.touches.robot]
@@ -314,19 +333,15 @@ def _rotate(wxyz: Floats, vector: Floats) -> Floats:
     )
 
 
+# In the product of a quaternion and (1, a, b, c): the three terms that are added to each component, in order.
+FACTOR_OF_TERM = [[0, 0, 1, 2], [1, 1, 2, 0], [2, 2, 0, 1]]  # index in (a, b, c)
+COMPONENT_OF_TERM = [[1, 0, 0, 0], [2, 3, 1, 2], [3, 2, 3, 1]]  # index in the quaternion
+SIGN_OF_TERM = np.array([[-1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, -1.0]])
+
+
 def _add_rotation(wxyz: Floats, half_angles: Floats) -> Floats:
     """Return the unit quaternions along wxyz * (1, half angles): small rotations about axes of the base are added."""
-    w, x, y, z = wxyz.T
-    a, b, c = half_angles.T
-    quaternion = np.stack(
-        (
-            w - a * x - b * y - c * z,
-            x + a * w + b * z - c * y,
-            y + b * w + c * x - a * z,
-            z + c * w + a * y - b * x,
-        ),
-        axis=1,
-    )
-    w, x, y, z = quaternion.T
-    norm = np.sqrt(w * w + x * x + y * y + z * z)
-    return quaternion / norm[:, None]
+    terms = SIGN_OF_TERM * (half_angles[:, FACTOR_OF_TERM] * wxyz[:, COMPONENT_OF_TERM])
+    quaternion = wxyz + terms[:, 0] + terms[:, 1] + terms[:, 2]
+    squares = np.cumsum(quaternion * quaternion, axis=1)  # in order, so that it does not depend on how many there are
+    return quaternion / np.sqrt(squares[:, 3:])

@@ -15,6 +15,8 @@ from snakesim_sim_backend.batch.placed import PlacedRobot, read_rotations
 from snakesim_sim_backend.divergence import DivergenceWatch
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
 
+Mask = NDArray[np.bool_]  # (robots,)
+
 
 @dataclass(frozen=True)
 class TouchArrays:
@@ -66,15 +68,15 @@ class Simulations(ABC):
 
         Args:
             robots: their rows.
-            ticks: number of the control cycle of each of them, for messages.
+            ticks: for every row, number of the control cycle, for messages.
 
         Returns:
             Why a simulation has diverged, by its row.
         """
 
     @abstractmethod
-    def find_touches(self, robots: Sequence[int]) -> TouchArrays:
-        """Return the contacts with obstacles over the last physics step."""
+    def find_touches(self, robots: Mask) -> TouchArrays:
+        """Return the contacts of these robots with obstacles over the last physics step."""
 
 
 class LoopedSimulations(Simulations):
@@ -116,7 +118,8 @@ class LoopedSimulations(Simulations):
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
         diverged: dict[int, str] = {}
         is_view = len(self._placed) == 1
-        for robot, tick in zip(robots, ticks, strict=True):
+        for robot in robots:
+            tick = ticks[robot]
             placed = self._placed[robot]
             watch = self._watches[robot]
             assert placed is not None and watch is not None
@@ -135,14 +138,14 @@ class LoopedSimulations(Simulations):
                 self._copy_from(placed.data, robot)
         return diverged
 
-    def find_touches(self, robots: Sequence[int]) -> TouchArrays:
+    def find_touches(self, robots: Mask) -> TouchArrays:
         rows: list[int] = []
         links: list[int] = []
         forces_w: list[tuple[float, float, float]] = []
         rotations: list[Floats] = []
-        for robot in robots:
-            placed = self._placed[robot]
-            assert placed is not None
+        for robot, placed in enumerate(self._placed):
+            if placed is None or not robots[robot]:
+                continue
             for touch in placed.touches.read():
                 rows.append(robot)
                 links.append(touch.link)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import find_nodes_of_many_w, find_nodes_w
+from snakesim_hal.model.kinematics import NodeFinder, find_nodes_w
 from snakesim_hal.model.scenario import describe_run_robot, load
 
 POSES = 50
@@ -16,7 +16,7 @@ def test_many_poses_have_the_nodes_of_each_pose_alone(scenario: str) -> None:
     positions_w = random.normal(size=(POSES, 3))
     wxyz = random.normal(size=(POSES, 4))
     angles_rad = random.normal(size=(POSES, len(robot.joints)))
-    nodes_w = find_nodes_of_many_w(robot, positions_w, wxyz, angles_rad)
+    nodes_w = NodeFinder(robot).find(positions_w, wxyz, angles_rad)
     for i in range(POSES):
         alone_w = find_nodes_w(robot, positions_w[i], wxyz[i], angles_rad[i].tolist())
         assert nodes_w[i].tobytes() == alone_w.tobytes()
