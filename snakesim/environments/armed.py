@@ -116,14 +116,14 @@ class ArmedRobots:
         self._is_ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # limited as arrays
         self._stays_alone: Mask = np.zeros(robots, dtype=np.bool_)  # until its next reset
         self._descriptions = [describe_run_robot(config)] * robots
-        self._everybody: Mask = np.ones(robots, dtype=np.bool_)
+        self._everybody = self.simulated.everybody
 
         # Robots that take part in the present ticks.
         self._active: Mask = np.zeros(robots, dtype=np.bool_)
+        self._active_at_call = self._active
         self._active_robots: list[int] = []
         self._ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # of the active ones
         self._ordinary_at_call = self._is_ordinary
-        self._all_are_ordinary = False
 
     def can_start(self, config: RunConfig) -> bool:
         """Return whether a robot of this configuration can be a row."""
@@ -185,8 +185,9 @@ class ArmedRobots:
             target: (robots, joints), in rad, rad/s or N·m. It must not change afterwards.
             active: (robots,), which robots take part; they must be armed.
         """
-        if active is not self._active or self._is_ordinary is not self._ordinary_at_call:
+        if active is not self._active_at_call or self._is_ordinary is not self._ordinary_at_call:
             self._choose_robots(active)
+        active = self._active
         ordinary = self._ordinary
         self._commands.append(target)
         self._decide_together(mode, ordinary)
@@ -199,14 +200,14 @@ class ArmedRobots:
 
     def _choose_robots(self, active: Mask) -> None:
         """Find the robots that take part in the next ticks."""
-        self._active = active
-        self._active_robots = np.flatnonzero(active).tolist()
+        self._active_at_call = active
         self._ordinary_at_call = self._is_ordinary
+        self._active = self._everybody if active.all() else active
+        self._active_robots = np.flatnonzero(active).tolist()
         ordinary = active & self._is_ordinary
         if not np.array_equal(ordinary, self._ordinary):
             self._update_active_limits()
-        self._ordinary = ordinary
-        self._all_are_ordinary = bool(ordinary.all())
+        self._ordinary = self._everybody if ordinary.all() else ordinary
 
     def _find_clients(self, robots: Mask) -> list[int]:
         """Return those of these robots that have a limiter to themselves."""
@@ -242,7 +243,7 @@ class ArmedRobots:
             torque_limit_nm = self._limits.torque_nm
             target = requested.copy()
             is_limited = np.zeros_like(self.is_limited)
-        if not self._all_are_ordinary:
+        if robots is not self._everybody:
             target = np.where(robots[:, None], target, self._target)
             torque_limit_nm = np.where(robots[:, None], torque_limit_nm, self._torque_limit_nm)
             is_limited = is_limited & robots[:, None]
@@ -356,7 +357,7 @@ class ArmedRobots:
         is_near = change <= self._max_change
         has_moved = change[:, joints : 2 * joints] != 0.0
         windings = self.simulated.sensors.windings
-        is_heat_new = windings is not None and np.count_nonzero(windings.is_new) > 0
+        is_heat_new = windings is not None and windings.is_new is not windings.nobody
         all_near = np.count_nonzero(is_near) == is_near.size
         if all_near and np.count_nonzero(has_moved) == has_moved.size and not is_heat_new:
             return self._everybody, self._everybody
@@ -371,7 +372,7 @@ class ArmedRobots:
     def _update_torque_fractions(self) -> None:
         """Derate the torque limits of robots whose winding temperatures have just been measured."""
         windings = self.simulated.sensors.windings
-        if windings is None or not np.count_nonzero(windings.is_new):
+        if windings is None or windings.is_new is windings.nobody:
             return
         fractions = np.where(self._heat_is_measured, self.simulated.remaining_fractions(), 1.0)
         self._torque_fraction = np.where(windings.is_new[:, None], fractions, self._torque_fraction)

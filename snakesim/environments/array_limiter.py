@@ -30,6 +30,7 @@ class LimitArrays:
     angle_min_rad: Floats
     angle_max_rad: Floats
     max_step_rad: Floats  # maximum distance of an angle target from the measured angle
+    angle_rate_rad: Floats  # maximum change of an angle target in a period
     speed_rad_s: Floats
     acceleration_rad_s2: Floats
     torque_nm: Floats
@@ -39,7 +40,7 @@ class LimitArrays:
     @staticmethod
     def allocate(robots: int, joints: int, period_s: float) -> "LimitArrays":
         """Return limits that `set_robot` fills in."""
-        return LimitArrays(period_s, *(np.ones((robots, joints)) for _ in range(8)))
+        return LimitArrays(period_s, *(np.ones((robots, joints)) for _ in range(9)))
 
     def set_robot(self, robot: int, description: Description) -> None:
         """Fill in the limits of one robot."""
@@ -48,6 +49,7 @@ class LimitArrays:
             self.angle_min_rad[robot, i] = joint.angle_min_rad
             self.angle_max_rad[robot, i] = joint.angle_max_rad
             self.max_step_rad[robot, i] = description.max_step_rad
+            self.angle_rate_rad[robot, i] = joint.speed_limit_rad_s * self.period_s
             self.speed_rad_s[robot, i] = joint.speed_limit_rad_s
             self.acceleration_rad_s2[robot, i] = joint.acceleration_limit_rad_s2
             self.torque_nm[robot, i] = joint.torque_limit_nm
@@ -98,7 +100,7 @@ def limit_targets(
         case Mode.POSITION:
             low = _clamp(measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
             high = _clamp(measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
-            step = limits.speed_rad_s * limits.period_s
+            step = limits.angle_rate_rad
         case Mode.VELOCITY:
             low, high = _velocity_bounds(measured, limits)
             low = _clamp(low, -limits.speed_rad_s, limits.speed_rad_s)

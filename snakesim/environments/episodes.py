@@ -10,9 +10,8 @@ Every array has one row for each environment, and no row depends on another one.
 alone and among others.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -71,6 +70,12 @@ class Episodes:
         self._ticks_left: NDArray[np.int64] = np.zeros(count, dtype=np.int64)
         self._films: dict[int, Any] = {}
 
+        # What is collected in the ticks of a step.
+        ticks = setup.frame_skip
+        self._tick_active: Masks = np.zeros((ticks, count), dtype=np.bool_)
+        self._tick_joints: Floats = np.zeros((ticks, count, 3 * joints))
+        self._tick_is_limited = np.zeros((ticks, count, joints), dtype=np.bool_)
+
     @property
     def time_s(self) -> Floats:
         """Robot time since arming, (environments,)."""
@@ -118,7 +123,8 @@ class Episodes:
         self.is_over = self.is_over | environments  # if an interrupt ends this step, some of its ticks are not counted
         start_m = self.advance_m
         ticks = np.zeros(self._count, dtype=np.int64)
-        steps: list[_Tick] = []
+        count = 0  # of ticks
+        everybody = True
         shortest = int(self._ticks_left[environments].min(initial=setup.frame_skip))
         active = environments
         is_armed: Mask | None = None  # as of the last computation of `active`
@@ -126,16 +132,20 @@ class Episodes:
             if is_armed is not self.robots.is_armed or tick >= shortest:
                 is_armed = self.robots.is_armed
                 active = environments & is_armed & (ticks < self._ticks_left)
+                everybody = everybody and bool(active.all())
                 if not np.count_nonzero(active):
                     break
             self.robots.step(setup.commands.mode, actions, active)
-            steps.append(_Tick(active, self.robots.joints, self.robots.is_limited))
+            self._tick_active[tick] = active
+            self._tick_joints[tick] = self.robots.joints
+            self._tick_is_limited[tick] = self.robots.is_limited
             ticks = ticks + active
+            count += 1
         self._ticks = self._ticks + ticks
         self._ticks_left = self._ticks_left - ticks
 
         observations = self.observe(environments)
-        energy_j, limited = self._sum_ticks(steps)
+        energy_j, limited = self._sum_ticks(count, everybody)
         reached = np.array([progress.reached for progress in self._observers.progress])
         stopped = ~self.robots.is_armed
         values = {
@@ -192,29 +202,26 @@ class Episodes:
                     raise
         raise AssertionError("the last attempt returns or raises")
 
-    def _sum_ticks(self, steps: Sequence["_Tick"]) -> tuple[Floats, NDArray[np.int64]]:
-        """Return the energy in J and the number of limited targets of each environment in a step."""
-        energy_j = np.zeros(self._count)
-        if not steps:
-            return energy_j, np.zeros(self._count, dtype=np.int64)
+    def _sum_ticks(self, count: int, everybody: bool) -> tuple[Floats, NDArray[np.int64]]:
+        """Return the energy in J and the number of limited targets of each environment in a step.
+
+        Args:
+            count: number of ticks in the step.
+            everybody: whether all environments took part in all of them.
+        """
+        if not count:
+            return np.zeros(self._count), np.zeros(self._count, dtype=np.int64)
         joints = len(self._setup.action_names)
-        active = np.stack([step.active for step in steps])  # (ticks, environments)
-        samples = np.stack([step.joints for step in steps])
-        # The sum is made in order, so that it does not depend on how many environments there are.
+        samples = self._tick_joints[:count]
+        # The sums are made in order, so that they do not depend on how many environments there are.
         joint_power_w = np.abs(samples[:, :, 2 * joints :] * samples[:, :, joints : 2 * joints])
-        power_w = joint_power_w.cumsum(axis=2)[:, :, -1]
-        for tick_energy_j in np.where(active, power_w * self._period_ns * 1e-9, 0.0):
-            energy_j = energy_j + tick_energy_j
-        is_limited = np.stack([step.is_limited for step in steps]) & active[:, :, None]
-        return energy_j, np.count_nonzero(is_limited, axis=(0, 2))
-
-
-class _Tick(NamedTuple):
-    """What a step collects in each of its ticks."""
-
-    active: Mask  # (environments,), which took part
-    joints: Floats  # (environments, 3 * joints)
-    is_limited: Masks  # (environments, joints)
+        energy_j = joint_power_w.cumsum(axis=2)[:, :, -1] * self._period_ns * 1e-9
+        is_limited = self._tick_is_limited[:count]
+        if not everybody:
+            active = self._tick_active[:count]
+            energy_j = np.where(active, energy_j, 0.0)
+            is_limited = is_limited & active[:, :, None]
+        return energy_j.cumsum(axis=0)[-1], is_limited.sum(axis=2).sum(axis=0)
 
 
 def sum_terms(terms: dict[str, Floats]) -> Floats:

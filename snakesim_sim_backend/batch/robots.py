@@ -24,6 +24,7 @@ class SimulatedRobots:
 
     Attributes:
         sensors: what the robots measure.
+        everybody: the mask of all robots. A call with this object is faster than one with an equal mask.
     """
 
     def __init__(self, robots: int, config: RunConfig) -> None:
@@ -34,9 +35,10 @@ class SimulatedRobots:
         self._timing = describe_timing(config)
         self._has_heat = config.robot.sensors.power is not None
         self._simulations: Simulations = LoopedSimulations(robots, joints)
-        self._noise = NoiseStreams(robots)
+        self.everybody: Mask = np.ones(robots, dtype=np.bool_)
+        self._noise = NoiseStreams(self.everybody)
         self._heat = HeatArrays(robots, joints, config.period_ns * 1e-9)
-        self.sensors = SensorArrays(robots, config, self._noise)
+        self.sensors = SensorArrays(self.everybody, config, self._noise)
 
         # Motors.
         self._min_torque_nm = np.zeros((robots, joints))
@@ -90,7 +92,10 @@ class SimulatedRobots:
             robots: which robots get them.
         """
         inputs = self._simulations.motor_inputs[:, INPUT_OF_MODE[mode] :: INPUTS]
-        np.copyto(inputs, target, where=robots[:, None])
+        if robots is self.everybody:
+            inputs[:] = target
+        else:
+            np.copyto(inputs, target, where=robots[:, None])
         if torque_limit_nm is self._last_limit_nm:
             return
         self._last_limit_nm = torque_limit_nm

@@ -56,8 +56,16 @@ class SensorArrays:
         windings: temperatures, (robots, joints), as the power sensor has delivered them.
     """
 
-    def __init__(self, robots: int, config: RunConfig, noise: NoiseStreams) -> None:
-        """Make the sensors of robots whose configurations agree with this one in `describe_timing`."""
+    def __init__(self, everybody: Mask, config: RunConfig, noise: NoiseStreams) -> None:
+        """Make the sensors of robots.
+
+        Args:
+            everybody: the mask of all robots. A call with this object is faster than one with an equal mask.
+            config: configuration of one of the robots; those of the others agree with it in `describe_timing`.
+            noise: the random numbers of the robots.
+        """
+        robots = len(everybody)
+        self._everybody = everybody
         sensors = config.robot.sensors
         joints = config.robot.chain.modules
         self._noise = noise
@@ -99,7 +107,7 @@ class SensorArrays:
         if sensors.pose is not None:
             self._pose_due = due_ticks(sensors.pose.rate_hz)
             self._pose_has_noise = _has_noise(sensors.pose)
-            self._raw_poses = DelayedValues(robots, NUMBERS_OF_RAW_POSE, sensors.pose.delay_s, config.period_ns)
+            self._raw_poses = DelayedValues(everybody, NUMBERS_OF_RAW_POSE, sensors.pose.delay_s, config.period_ns)
             self._raw_poses.values[:, 3] = 1.0  # a quaternion that can be normalized, until there is a pose
         self._pose_sigma = np.zeros((robots, 6))
         self._no_pose_noise = np.zeros((robots, 6))
@@ -109,7 +117,7 @@ class SensorArrays:
         self.windings: DelayedValues | None = None
         if sensors.power is not None:
             self._power_due = due_ticks(sensors.power.rate_hz)
-            self.windings = DelayedValues(robots, joints, sensors.power.delay_s, config.period_ns)
+            self.windings = DelayedValues(everybody, joints, sensors.power.delay_s, config.period_ns)
 
     def restart(self, robot: int, config: RunConfig) -> None:
         """Forget all samples of a robot, and use the noise of its new configuration."""
@@ -147,11 +155,10 @@ class SensorArrays:
             winding_c: (robots, joints), temperatures of the windings.
             starts: whether the active robots have just been reset, while the others go on.
         """
-        everybody = np.count_nonzero(active) == self._count
         if self._contact_due is not None:
             self._sample_contacts(self._contact_due.find_due(ticks, active), simulations, starts)
         if self._imu_due is not None:
-            self._skip(self._imu_numbers, self._imu_due.find_due(ticks, active))
+            self._noise.skip(self._imu_numbers, self._imu_due.find_due(ticks, active))
         if self._pose_due is not None:
             self._sample_poses(self._pose_due.find_due(ticks, active), simulations, starts)
         if self._power_due is not None and self.windings is not None:
@@ -160,18 +167,11 @@ class SensorArrays:
                 self.windings.add(winding_c.copy(), due, starts=starts)
             elif not starts:
                 self.windings.add_nothing()
-        self._sample_joints(active, everybody, simulations, starts)
-
-    def _skip(self, count: int, due: Mask) -> None:
-        """Leave out the next random numbers of the robots that are due."""
-        if np.count_nonzero(due) == self._count:
-            self._noise.skip(count)
-        else:
-            self._noise.skip_each(count * due)
+        self._sample_joints(active, simulations, starts)
 
     def _sample_contacts(self, due: Mask, simulations: Simulations, starts: bool) -> None:
         touches = simulations.find_touches(due)
-        sample = self._draw_contact_noise(touches) if len(touches.robot) else NO_CONTACTS
+        sample = NO_CONTACTS if touches is NO_TOUCHES else self._draw_contact_noise(touches)
         if self._contact_delay_ticks:
             if starts and self._waiting_contacts:
                 waiting, waiting_due = self._waiting_contacts[-1]  # the others have taken their samples of this tick
@@ -208,16 +208,16 @@ class SensorArrays:
         noise = self._no_pose_noise
         if self._pose_has_noise:
             noise = self._noise.peek(6)
-            self._skip(6, due)
+            self._noise.skip(6, due)
         raw = np.concatenate((simulations.base_pose, simulations.base_velocity, noise), axis=1)
         self._raw_poses.add(raw, due, starts=starts)
 
-    def _sample_joints(self, active: Mask, everybody: bool, simulations: Simulations, starts: bool) -> None:
+    def _sample_joints(self, active: Mask, simulations: Simulations, starts: bool) -> None:
         joints = self._joint_count
         values = np.concatenate((simulations.angle_rad, simulations.velocity_rad_s, simulations.torque_nm), axis=1)
         if self._joints_have_noise:
             values += self._joint_sigma * self._noise.peek(3 * joints)
-            self._skip(3 * joints, active)
+            self._noise.skip(3 * joints, active)
         if not self._all_are_measured:
             values[~self._is_measured] = 0.0
         if starts and self._waiting_joints:
@@ -227,7 +227,9 @@ class SensorArrays:
         else:
             self._waiting_joints.append(values)
         delivered = self._waiting_joints[0]
-        self.joints = delivered if everybody else np.where(active[:, None], delivered, self.joints)
+        if active is not self._everybody:
+            delivered = np.where(active[:, None], delivered, self.joints)
+        self.joints = delivered
 
     # --- what is observed -----------------------------------------------------------------------------------
 
@@ -298,7 +300,9 @@ def _replace_contacts(before: ContactSample, sample: ContactSample, due: Mask) -
 
     A delayed sample may hold robots that have been reset since then, which are not due any more.
     """
-    if due.all() or not (len(before.touches.robot) or len(sample.touches.robot)):
+    if before is NO_CONTACTS and sample is NO_CONTACTS:
+        return NO_CONTACTS
+    if due.all():
         return sample
     kept = ~due[before.touches.robot]
     new = due[sample.touches.robot]
