@@ -66,6 +66,7 @@ verify: compiled ## Run the campaign, nightly and before a release: what takes h
 
 # Once: each worker would compile all that it imports, and the emulated machine would take many times as long.
 compiled: .venv/.compiled
+	@$(bin)/python -m snakesim_native.compile
 	-@$(bin)/python -m compileall -qq -j 0 $(packages) tests verification
 
 .venv/.compiled: $(stamp)

@@ -5,6 +5,7 @@ import random
 import pytest
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
+from snakesim_native.compile import SHIPPED_FOLDER, compile_all
 from snakesim_testing.hypothesis_profiles import load_profile
 
 pytest_plugins = ["snakesim_testing.contract.plugin", "snakesim_testing.messages"]
@@ -38,3 +39,4 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):  # a worker of pytest-xdist prints nothing
         config.pluginmanager.register(FailuresAtOnce(config), "failures-at-once")
+        compile_all(SHIPPED_FOLDER)  # here, because a unit test may not start a compiler

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_sim_backend.state.contacts import TouchReader
 from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
 
 MU, PRESS_N = 0.3, 2.0  # of the wall; on each link

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, build
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import G, make_config

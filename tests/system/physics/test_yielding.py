@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_sim_backend.model import build
+from snakesim_sim_backend.model.build import build
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from snakesim_testing.messages import raises_error

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.model import build
+from snakesim_sim_backend.model.build import build
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config

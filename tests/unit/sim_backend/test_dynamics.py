@@ -15,9 +15,9 @@ ICE = {"ground": {"friction": 0.0}}
 
 def loads_n(run: Run) -> NDArray[np.float64]:
     """On every foot."""
-    ground = run.sim.physics.ground
-    assert ground is not None
-    return ground.normal_force_n
+    forces_n = run.sim.physics.laws.foot_forces_n
+    assert forces_n is not None
+    return forces_n
 
 
 def kinetic_energy(run):

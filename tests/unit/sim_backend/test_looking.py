@@ -12,7 +12,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
-from snakesim_sim_backend.flat_ground import SINK_M
+from snakesim_sim_backend.laws.flat_ground import SINK_M
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config
 

@@ -12,10 +12,10 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.model.tether import WINCH_N_S_PER_M
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, Tether
-from snakesim_sim_backend.tether import WINCH_N_S_PER_M
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import G, Run, make_config

@@ -7,8 +7,8 @@ import pytest
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.flat_ground import SINK_M
-from snakesim_sim_backend.ground import make_heights
+from snakesim_sim_backend.laws.flat_ground import SINK_M
+from snakesim_sim_backend.model.ground import make_heights
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import Run, make_config
 

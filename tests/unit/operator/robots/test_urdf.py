@@ -19,7 +19,7 @@ from snakesim_operator.features.robots.importing import import_urdf
 from snakesim_operator.features.robots.meshes import read_vertices
 from snakesim_operator.features.robots.toml_text import format_toml
 from snakesim_operator.run.in_process import simulate
-from snakesim_sim_backend.model import build
+from snakesim_sim_backend.model.build import build
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
 

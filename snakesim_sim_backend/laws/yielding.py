@@ -20,7 +20,7 @@ import numpy as np
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_sim_backend.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
+from snakesim_sim_backend.laws.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
 
 JOINT_OF_AXIS = {
     "x": mujoco.mjtJoint.mjJNT_SLIDE,
@@ -28,6 +28,7 @@ JOINT_OF_AXIS = {
     "z": mujoco.mjtJoint.mjJNT_HINGE,
 }
 DOFS = len(JOINT_OF_AXIS)  # degrees of freedom of one obstacle, and its numbers in `userdata`
+SPRING_NUMBERS = 4  # parameters of one obstacle's spring, in the user data of its body
 RIGID_STRETCH_M = 1e-4  # how far a rigid one moves under as much force as friction holds
 WOOD_KG_M3 = 500.0  # density of an obstacle whose mass is not given
 MAX_OBSTACLES = 128  # the solver works on all their degrees of freedom together with the snake's
@@ -83,6 +84,23 @@ def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
             )
 
 
+def compute_spring(placed: Placed, step_s: float) -> list[float]:
+    """Return the parameters of an obstacle's spring, which are the user data of its body.
+
+    Returns:
+        Stiffness in N/m, damping in N·s/m, largest force in N, and mean radius of the foot in m.
+    """
+    mass_kg = compute_mass_kg(placed)
+    max_force_n = _friction_n(placed)
+    # A rigid obstacle is as stiff as needed to hardly move, or as the physics step allows.
+    stiffness = min(max_stiffness_n_per_m(placed, step_s), max_force_n / RIGID_STRETCH_M)
+    if placed.stiffness_n_per_m is not None:
+        stiffness = placed.stiffness_n_per_m
+    damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * mass_kg)
+    _, mean_radius_m = measure_foot(placed.obstacle)
+    return [stiffness, damping, max_force_n, mean_radius_m]
+
+
 class Yielding:
     """The springs of one simulation. Call `apply` between `mj_step1` and `mj_step2`.
 
@@ -95,22 +113,13 @@ class Yielding:
         generalized force = -L F
     """
 
-    def __init__(self, data: mujoco.MjData, placed: Sequence[Placed], first_dof: int, step_s: float) -> None:
-        """Compute the springs. The degrees of freedom of the obstacles are the model's last ones, from `first_dof`."""
-        count = len(placed)
-        masses_kg = np.array([compute_mass_kg(item) for item in placed])
-        mean_radii_m = np.array([measure_foot(item.obstacle)[1] for item in placed])
-        self._max_force_n = np.array([_friction_n(item) for item in placed])
-
-        # A rigid obstacle is as stiff as needed to hardly move, or as the physics step allows.
-        max_stiffness = np.array([max_stiffness_n_per_m(item, step_s) for item in placed])
-        stiffness = np.minimum(max_stiffness, self._max_force_n / RIGID_STRETCH_M)
-        for i, item in enumerate(placed):
-            if item.stiffness_n_per_m is not None:
-                stiffness[i] = item.stiffness_n_per_m
-
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, count: int) -> None:
+        """Read the parameters of this many obstacles. Their bodies and degrees of freedom are the model's last ones."""
+        stiffness, damping, max_force_n, mean_radii_m = model.body_user[-count:].T
+        first_dof = model.nv - DOFS * count
+        self._max_force_n = max_force_n
         self._stiffness = stiffness[:, None]  # N/m
-        self._damping = (2.0 * DAMPING_RATIO * np.sqrt(stiffness * masses_kg))[:, None]  # N·s/m
+        self._damping = damping[:, None]  # N·s/m
         self._lengths = np.column_stack([np.ones((count, 2)), mean_radii_m])  # L, (n_obstacles, 3)
 
         # Views of MuJoCo's arrays, (n_obstacles, 3) each.

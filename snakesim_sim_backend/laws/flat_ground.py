@@ -23,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.chain import Chain
+from snakesim_sim_backend.laws.chain import Chain
 
 SINK_M = 2e-4  # how deep a foot sinks in under its share of the weight
 MAX_PHASE_RAD = 0.7  # the normal spring vibrates by at most this in one step; long steps get softer ground
 DAMPING_RATIO = 0.5  # of critical damping
 NUMBERS_PER_FOOT = 5  # in `userdata`: two of its slip, three of its position
+FOOT = 1.0  # first number of a geom's user data, if the geom is a foot that flat ground carries
 MIN_DIVISOR = 1e-12  # keeps 0 / 0 out of the friction of a foot without load
 
 
@@ -43,11 +44,12 @@ class Feet:
     friction: float  # Coulomb coefficient
 
 
-def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float, friction: float) -> Feet:
+def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float) -> Feet:
     """Return the feet of a compiled model, whose geoms are called `foot_0` onwards."""
     masses_kg = model.body_mass[first_body : first_body + links]
     geoms = np.array([model.geom(f"foot_{i}").id for i in range(links + 1)])
     carried_kg = 0.5 * (np.append(masses_kg, 0.0) + np.append(0.0, masses_kg))
+    friction = float(model.geom_friction[geoms[0], 0])
     return Feet(geoms, first_body, carried_kg, radius_m, friction)
 
 
@@ -78,7 +80,8 @@ class FlatGround:
         count = len(feet.geoms)
         gravity = -float(model.opt.gravity[2])
         step_s = float(model.opt.timestep)
-        sink_m = max(SINK_M, gravity * (step_s / MAX_PHASE_RAD) ** 2)
+        slow = step_s / MAX_PHASE_RAD
+        sink_m = max(SINK_M, gravity * (slow * slow))
         stiffness = feet.carried_kg * gravity / sink_m  # N/m
         damping = 2.0 * DAMPING_RATIO * feet.carried_kg * math.sqrt(gravity / sink_m) / step_s  # N per m in one step
         self._chain = chain

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import mujoco
 
 from snakesim_hal.physics.physics_model import LinkLoad
-from snakesim_sim_backend.contacts import Touch, TouchReader
-from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.frames import rotate_into
+from snakesim_sim_backend.state.contacts import Touch, TouchReader
 
 
 @dataclass

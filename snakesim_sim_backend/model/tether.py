@@ -74,7 +74,7 @@ class TetherRope:
         """Place the anchor for the snake's present position, and take up the slack."""
         model = self._model
         data = self._data
-        mujoco.mj_forward(model, data)
+        mujoco.mj_kinematics(model, data)
         direction_w = np.array([*self._tether.direction_w, 0.0])
         hook_w = data.site(HOOK).xpos
         model.site_pos[model.site(ANCHOR).id] = hook_w + ROPE_M * direction_w / np.linalg.norm(direction_w)

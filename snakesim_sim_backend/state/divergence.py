@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.base.errors import BackendError
-from snakesim_sim_backend.model import FREE_DOFS
+from snakesim_sim_backend.model.build import FREE_DOFS
 from snakesim_sim_backend.physics import Physics
 
 _log = logging.getLogger("snakesim.sim")

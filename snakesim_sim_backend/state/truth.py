@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.contacts import Touch
+from snakesim_sim_backend.state.contacts import Touch
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
 
 NO_FORCE = (0.0, 0.0, 0.0)

@@ -9,9 +9,9 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scene import Placed
-from snakesim_sim_backend.ground import GROUND_GROUP, SAND
-from snakesim_sim_backend.surface import ContactParameters
-from snakesim_sim_backend.yielding import JOINT_OF_AXIS, compute_mass_kg
+from snakesim_sim_backend.laws.yielding import JOINT_OF_AXIS, compute_mass_kg, compute_spring
+from snakesim_sim_backend.model.ground import GROUND_GROUP, SAND
+from snakesim_sim_backend.model.surface import ContactParameters
 
 OBSTACLE = "obstacle:"  # prefix of the geom of an obstacle
 STEP = "step:"  # prefix of the geom of an obstacle that the snake may lie on
@@ -45,6 +45,7 @@ def add_obstacle(
     body_radius_m: float,
     hills_m: float,
     collide: bool,
+    step_s: float,
 ) -> None:
     """Add an obstacle to a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
 
@@ -55,6 +56,7 @@ def add_obstacle(
         body_radius_m: radius of the snake.
         hills_m: height of the ground's highest point above its lowest one.
         collide: obstacles also collide with each other, because some of them move.
+        step_s: physics step.
     """
     name = geom_name(placed)
     shape = _obstacle_shape(placed, body_radius_m, hills_m)
@@ -69,6 +71,7 @@ def add_obstacle(
     if placed.yields:
         foot_w = np.array([*placed.obstacle.position_w[:2], 0.0])
         body = _add_yielding_body(spec, name, foot_w)
+        body.userdata = compute_spring(placed, step_s)
         shape["pos"] = (shape["pos"] - foot_w).tolist()
         mass_kg = compute_mass_kg(placed)
     body.add_geom(

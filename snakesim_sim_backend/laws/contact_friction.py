@@ -24,7 +24,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.chain import Chain
+from snakesim_sim_backend.laws.chain import Chain
 
 # Numbers per contact in `userdata`: its key, the link's body, the other body, the mass that the spring has to follow in
 # kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, and the contact point in the frame of the
@@ -78,7 +78,6 @@ class ContactFriction:
         data: mujoco.MjData,
         chain: Chain,
         link_geoms: Collection[int],
-        friction: Floats,
         memory: Floats,
     ) -> None:
         """Prepare the law for a compiled model.
@@ -88,7 +87,6 @@ class ContactFriction:
             data: its state.
             chain: collects the forces on the links.
             link_geoms: numbers of the links' geoms.
-            friction: (n_geoms,), Coulomb coefficient between a link and each geom.
             memory: (count_numbers(n_links),), a view of `userdata`: the number of contacts, then those.
         """
         step_s = float(model.opt.timestep)
@@ -100,12 +98,12 @@ class ContactFriction:
         self.min_friction = 0.0
 
         # Properties of geoms and bodies.
-        self._friction: list[float] = friction.tolist()
+        self._friction: list[float] = model.geom_friction[:, 0].tolist()  # Coulomb coefficient with a link
         self._link_geoms = frozenset(link_geoms)
         self._body_of_geom: list[int] = model.geom_bodyid.tolist()
         self._mobility = [_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]  # 1/kg
-        self._stiffness_per_kg = (PHASE_RAD / step_s) ** 2  # N/m for each kg
-        self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / step_s**2  # N per m in one step, for each kg
+        self._stiffness_per_kg = (PHASE_RAD / step_s) * (PHASE_RAD / step_s)  # N/m for each kg
+        self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / (step_s * step_s)  # N per m in one step, for each kg
 
         # Views of MuJoCo's arrays.
         self._contact = data.contact

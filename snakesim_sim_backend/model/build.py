@@ -22,16 +22,16 @@ from snakesim_hal.model.scene import Placed
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
-from snakesim_sim_backend.chain import FREE_DOFS
-from snakesim_sim_backend.contact_friction import count_numbers
-from snakesim_sim_backend.flat_ground import NUMBERS_PER_FOOT, Feet, find_feet
-from snakesim_sim_backend.ground import add_ground
-from snakesim_sim_backend.imu import add_imus
-from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle, geom_name
+from snakesim_sim_backend.laws.chain import FREE_DOFS
+from snakesim_sim_backend.laws.flat_ground import FOOT, Feet, find_feet
+from snakesim_sim_backend.laws.version import LawsVersion, add_laws, choose_laws
+from snakesim_sim_backend.laws.yielding import check_yielding
+from snakesim_sim_backend.model.ground import add_ground
+from snakesim_sim_backend.model.imu import add_imus
+from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, geom_name
+from snakesim_sim_backend.model.surface import ContactParameters, contact_parameters
+from snakesim_sim_backend.model.tether import add_tether
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.surface import ContactParameters, contact_parameters
-from snakesim_sim_backend.tether import add_tether
-from snakesim_sim_backend.yielding import DOFS, check_yielding
 
 FREE_QPOS = 7  # coordinates of the base: position and quaternion
 CLAMP_INERTIA = 1e6  # kg and kg·m²: more than the robot can move, in all six degrees of freedom
@@ -52,9 +52,9 @@ class SimModel:
     obstacle_of_geom: list[str | None]  # (n_geoms,); None: link, ground or step
     feet: Feet | None  # None: the ground is not flat, and MuJoCo finds the contacts with it
     link_geoms: list[int]  # (n_links,), tail to head
-    friction: Floats  # (n_geoms,), Coulomb coefficient between a link and each geom
     suspended: bool  # the tail link is clamped
     yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
+    laws: LawsVersion  # which version of the laws the model is made for
 
 
 def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
@@ -64,7 +64,9 @@ def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
     return angles_rad, velocities_rad_s
 
 
-def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> SimModel:
+def build(
+    config: RunConfig, settings: SimSettings, *, motors: bool = True, laws: LawsVersion | None = None
+) -> SimModel:
     """Compile the model of a run.
 
     Args:
@@ -72,6 +74,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         settings: parameters of the physics.
         motors: False leaves the motors out. The joints are then hinges with the inertia and the friction of the motors'
             rotors, for torques that are applied from outside.
+        laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
@@ -89,23 +92,27 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
     contact = contact_parameters(settings)
     rough_ground_geoms = add_ground(spec, config.scene.ground, contact)
     fixed = [item for item in placed if not item.yields]
-    _add_obstacles(spec, fixed, config, contact, collide=bool(yielding))
-    _add_snake(spec, config.robot, settings, contact)
-    _add_obstacles(spec, yielding, config, contact, collide=bool(yielding))
+    _add_obstacles(spec, fixed, config, contact, collide=bool(yielding), step_s=step_s)
+    _add_snake(spec, config, settings, contact)
+    _add_obstacles(spec, yielding, config, contact, collide=bool(yielding), step_s=step_s)
     _add_devices(spec, config.robot, settings, step_s, motors=motors)
     links = config.robot.chain.modules + 1
-    spec.nuserdata = NUMBERS_PER_FOOT * (links + 1) + count_numbers(links) + DOFS * len(yielding)
-    model = _compile(spec, config.robot.name)
-
     link_names = [f"link_{i}" for i in range(links)]
-    friction_of = dict.fromkeys(rough_ground_geoms, config.scene.ground.friction)
+    foot_names = [f"foot_{i}" for i in range(links + 1)]
+    friction_of = dict.fromkeys([*rough_ground_geoms, *foot_names], config.scene.ground.friction)
     friction_of |= {geom_name(item): item.friction for item in placed}
     friction_of |= dict.fromkeys(link_names, settings.self_friction)
+    for geom in spec.geoms:
+        geom.friction[0] = friction_of.get(geom.name, 0.0)
+    laws = laws or choose_laws()
+    add_laws(spec, laws, links, [geom_name(item) for item in yielding])
+    model = _compile(spec, config.robot.name)
+
     geom_names = [model.geom(i).name for i in range(model.ngeom)]
     first_link_body = model.body("link_0").id
     feet = None
     if config.scene.ground.heightfield is None:
-        feet = find_feet(model, first_link_body, links, config.robot.module.radius_m, config.scene.ground.friction)
+        feet = find_feet(model, first_link_body, links, config.robot.module.radius_m)
     return SimModel(
         model=model,
         steps_per_tick=steps_per_tick,
@@ -113,9 +120,9 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         obstacle_of_geom=[_obstacle_name(name) for name in geom_names],
         feet=feet,
         link_geoms=[model.geom(name).id for name in link_names],
-        friction=np.array([friction_of.get(name, 0.0) for name in geom_names]),
         suspended=settings.suspended,
         yielding=yielding,
+        laws=laws,
     )
 
 
@@ -141,7 +148,13 @@ def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
 
 
 def _add_obstacles(
-    spec: mujoco.MjSpec, placed: list[Placed], config: RunConfig, contact: ContactParameters, *, collide: bool
+    spec: mujoco.MjSpec,
+    placed: list[Placed],
+    config: RunConfig,
+    contact: ContactParameters,
+    *,
+    collide: bool,
+    step_s: float,
 ) -> None:
     """Add obstacles to the model. collide: obstacles also collide with each other, because some of them move."""
     hills_m = 0.0
@@ -155,6 +168,7 @@ def _add_obstacles(
             body_radius_m=config.robot.module.radius_m,
             hills_m=hills_m,
             collide=collide,
+            step_s=step_s,
         )
 
 
@@ -186,12 +200,14 @@ def _obstacle_name(name: str) -> str | None:
     return None
 
 
-def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, contact: ContactParameters) -> None:
+def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, contact: ContactParameters) -> None:
     """Add the links, joints and feet.
 
     Links are capsules. Flat ground carries them at their feet, which are spheres at joints and ends: at a joint, two
     capsules would make two contacts.
     """
+    robot = config.robot
+    is_flat = config.scene.ground.heightfield is None
     lengths_m = robot.link_lengths_m
     radius_m = robot.module.radius_m
     body = spec.worldbody
@@ -213,8 +229,8 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, con
             rgba=ORANGE,
             **contact,
         )
-        _add_foot(body, f"foot_{i}", 0.0, radius_m)
-    _add_foot(body, f"foot_{len(lengths_m)}", lengths_m[-1], radius_m)
+        _add_foot(body, f"foot_{i}", 0.0, radius_m, stands=is_flat)
+    _add_foot(body, f"foot_{len(lengths_m)}", lengths_m[-1], radius_m, stands=is_flat)
     _exclude_near_links(spec, robot)
 
 
@@ -248,8 +264,16 @@ def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float, scale: float
     body.fullinertia = [scale * value for value in link.inertia(radius_m)]
 
 
-def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float) -> None:
-    """Add a massless sphere of the body's radius, at a joint or an end. MuJoCo finds no contacts of it."""
+def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, stands: bool) -> None:
+    """Add a massless sphere of the body's radius, at a joint or an end. MuJoCo finds no contacts of it.
+
+    Args:
+        body: the link's body.
+        name: the geom's name.
+        along_m: distance from the link's rear joint.
+        radius_m: radius of the body.
+        stands: flat ground carries the foot.
+    """
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -259,6 +283,7 @@ def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float) 
         contype=0,
         conaffinity=0,
         group=FOOT_GROUP,
+        userdata=[FOOT if stands else 0.0],
     )
 
 

@@ -9,8 +9,8 @@ from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rota
 from snakesim_hal.model.scenario import RunConfig, StartPose, find_start_pose
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.ground import GROUND_GROUP, PLANE_GROUP
-from snakesim_sim_backend.model import FREE_QPOS, SimModel, of_joints
+from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, of_joints
+from snakesim_sim_backend.model.ground import GROUND_GROUP, PLANE_GROUP
 from snakesim_sim_backend.physics import Physics
 
 REST_SPEED = 1e-3  # m/s and rad/s: slower is at rest

@@ -4,7 +4,7 @@ import mujoco
 
 from snakesim_hal.model.scene import Ground, Heightfield
 from snakesim_hal.physics.hills import make_heights
-from snakesim_sim_backend.surface import ContactParameters
+from snakesim_sim_backend.model.surface import ContactParameters
 
 GROUND = "ground"  # name of the plane's geom
 HILLS = "hills"  # name of the height field and of its geom
