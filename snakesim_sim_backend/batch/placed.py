@@ -9,12 +9,12 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.programs.preflight import backend_settings
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.contacts import TouchReader
-from snakesim_sim_backend.divergence import log_warnings
-from snakesim_sim_backend.model import SimModel, build
+from snakesim_sim_backend.model.build import SimModel, build
+from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
-from snakesim_sim_backend.start import place_robot
-from snakesim_sim_backend.tether import TetherRope
+from snakesim_sim_backend.state.contacts import TouchReader
+from snakesim_sim_backend.state.divergence import log_warnings
+from snakesim_sim_backend.state.start import place_robot
 
 
 @dataclass(frozen=True)

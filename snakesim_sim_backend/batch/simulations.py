@@ -12,8 +12,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_sim_backend.actuators import INPUTS, Motors
 from snakesim_sim_backend.batch.placed import PlacedRobot, read_rotations
-from snakesim_sim_backend.divergence import DivergenceWatch
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.state.divergence import DivergenceWatch
 
 Mask = NDArray[np.bool_]  # (robots,)
 
