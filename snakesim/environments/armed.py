@@ -73,10 +73,17 @@ class ArmedRobots:
         is_limited: (robots, joints), whose target was limited in the last tick.
     """
 
-    def __init__(self, robots: int, config: RunConfig, *, safe: bool) -> None:
-        """Make room for robots whose configurations agree with this one in joints, sensors and rates."""
+    def __init__(self, robots: int, config: RunConfig, *, safe: bool, threads: int) -> None:
+        """Make room for robots.
+
+        Args:
+            robots: their number.
+            config: configuration of one of them; those of the others agree with it in joints, sensors and rates.
+            safe: whether targets pass the limiter.
+            threads: number of threads that step the physics.
+        """
         joints = config.robot.chain.modules
-        self.simulated = SimulatedRobots(robots, config)
+        self.simulated = SimulatedRobots(robots, config, threads=threads)
         self._period_ns = config.period_ns
         self._safe = safe
         self._joint_count = joints

@@ -55,12 +55,18 @@ class Episodes:
         advance_m: (environments,), advance towards the goal.
     """
 
-    def __init__(self, setup: EnvironmentSetup, count: int) -> None:
-        """Make room for environments. `reset` makes their robots."""
+    def __init__(self, setup: EnvironmentSetup, count: int, threads: int) -> None:
+        """Make room for environments. `reset` makes their robots.
+
+        Args:
+            setup: what they share.
+            count: their number.
+            threads: number of threads that step the physics.
+        """
         self._setup = setup
         self._count = count
         joints = len(setup.action_names)
-        self.robots = Robots(count, joints, assisted=setup.is_assisted, safe=setup.is_safe)
+        self.robots = Robots(count, joints, assisted=setup.is_assisted, safe=setup.is_safe, threads=threads)
         self._observers = Observers(count, setup.description, setup.parts)
         self.configs: list[RunConfig] = [setup.config] * count
         self._period_ns: NDArray[np.int64] = np.full(count, setup.config.period_ns)

@@ -33,7 +33,7 @@ class Robots:
         is_limited: (robots, joints), whose target was limited in the last tick. A new array in each tick.
     """
 
-    def __init__(self, robots: int, joints: int, *, assisted: bool, safe: bool) -> None:
+    def __init__(self, robots: int, joints: int, *, assisted: bool, safe: bool, threads: int) -> None:
         """Make room for robots.
 
         Args:
@@ -41,7 +41,9 @@ class Robots:
             joints: number of joints of each.
             assisted: whether actions correct the targets of the scenario's controller.
             safe: whether targets pass the limiter.
+            threads: number of threads that step the physics.
         """
+        self._threads = threads
         self._count = robots
         self._joint_count = joints
         self._assisted = assisted
@@ -176,7 +178,7 @@ class Robots:
         if not can_arm(config):
             return False
         if self._armed is None:
-            self._armed = ArmedRobots(self._count, config, safe=self._safe)
+            self._armed = ArmedRobots(self._count, config, safe=self._safe, threads=self._threads)
         return self._armed.can_start(config) and self._armed.start(robot, config)
 
     def _collect(self) -> None:

@@ -1,5 +1,6 @@
 """Steps many environments at once, in one process: every array has a row for each environment."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,6 +32,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         self,
         num_envs: int = 1,
         *,
+        threads: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **arguments: Any,
     ) -> None:
@@ -38,6 +40,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             num_envs: Number of environments.
+            threads: Number of threads that step the physics; None takes one for each processor that this process may
+                use. The results do not depend on it.
             autoreset_mode: When an environment whose episode is over is reset: in the next step, in the same step, or
                 ("Disabled") only by `reset` with the option `reset_mask`.
             **arguments: Those of `SnakeEnv`.
@@ -45,10 +49,12 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             ConfigError: An argument is wrong.
         """
-        if type(num_envs) is not int or num_envs < 1:
-            raise ConfigError(
-                f"num_envs={num_envs!r:.60}: give a whole number, 1 or more", code="python/invalid-argument"
-            )
+        for name, number in (("num_envs", num_envs), ("threads", threads)):
+            is_count = type(number) is int and number >= 1
+            if not is_count and (name != "threads" or number is not None):
+                raise ConfigError(
+                    f"{name}={number!r:.60}: give a whole number, 1 or more", code="python/invalid-argument"
+                )
         try:
             self._autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -56,10 +62,15 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
                 f"autoreset_mode={autoreset_mode!r:.60}: give one of {', '.join(mode.value for mode in AutoresetMode)}",
                 code="python/invalid-argument",
             ) from None
-        self._arguments = {"num_envs": num_envs, "autoreset_mode": self._autoreset_mode, **arguments}
+        self._arguments = {
+            "num_envs": num_envs,
+            "threads": threads,
+            "autoreset_mode": self._autoreset_mode,
+            **arguments,
+        }
         setup = SnakeEnv(**arguments).setup
         self._setup = setup
-        self._episodes = Episodes(setup, num_envs)
+        self._episodes = Episodes(setup, num_envs, threads or len(os.sched_getaffinity(0)))
         self._random: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]
         self._has_unfinished_step = False
 

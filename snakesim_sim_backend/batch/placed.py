@@ -37,7 +37,7 @@ def place(config: RunConfig) -> PlacedRobot:
     """
     log_warnings()
     settings = backend_settings(config, SimBackend)
-    sim = build(config, settings)
+    sim = build(config, settings, keeps_touches=True)
     data = mujoco.MjData(sim.model)
     physics = Physics(sim, data)
     motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale)

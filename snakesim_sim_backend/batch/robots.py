@@ -9,12 +9,21 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import JointState, Mode, Power
 from snakesim_sim_backend.actuators import INPUT_OF_MODE, INPUTS
+from snakesim_sim_backend.batch.batched import BatchedSimulations
 from snakesim_sim_backend.batch.heat import HeatArrays
 from snakesim_sim_backend.batch.noise import NoiseStreams
 from snakesim_sim_backend.batch.placed import place
 from snakesim_sim_backend.batch.samples import Mask, Ticks
 from snakesim_sim_backend.batch.sensors import SensorArrays, describe_timing
 from snakesim_sim_backend.batch.simulations import LoopedSimulations, Simulations
+from snakesim_sim_backend.laws.version import choose_laws
+
+
+def _open_simulations(robots: int, joints: int, threads: int) -> Simulations:
+    """Return a batch of simulations, or a loop over one or where the laws run in Python."""
+    if robots == 1 or choose_laws() == "python":
+        return LoopedSimulations(robots, joints)
+    return BatchedSimulations(robots, joints, threads)
 
 
 class SimulatedRobots:
@@ -27,14 +36,20 @@ class SimulatedRobots:
         everybody: the mask of all robots. A call with this object is faster than one with an equal mask.
     """
 
-    def __init__(self, robots: int, config: RunConfig) -> None:
-        """Make room for robots whose configurations agree with this one in joints and sensors."""
+    def __init__(self, robots: int, config: RunConfig, *, threads: int) -> None:
+        """Make room for robots.
+
+        Args:
+            robots: their number.
+            config: configuration of one of them; those of the others agree with it in joints and sensors.
+            threads: number of threads that step the simulations.
+        """
         joints = config.robot.chain.modules
         self._period_ns = config.period_ns
         self._joints = joints
         self._timing = describe_timing(config)
         self._has_heat = config.robot.sensors.power is not None
-        self._simulations: Simulations = LoopedSimulations(robots, joints)
+        self._simulations = _open_simulations(robots, joints, threads)
         self.everybody: Mask = np.ones(robots, dtype=np.bool_)
         self._noise = NoiseStreams(self.everybody)
         self._heat = HeatArrays(robots, joints, config.period_ns * 1e-9)

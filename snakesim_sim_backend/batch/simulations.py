@@ -79,6 +79,18 @@ class Simulations(ABC):
         """Return the contacts of these robots with obstacles over the last physics step."""
 
 
+class MotorArrays:
+    """The arrays of one robot that its motors read and write, with the names that MjData gives them."""
+
+    def __init__(self, simulations: Simulations, robot: int) -> None:
+        self.act = simulations.motor_state[robot]
+        self.actuator_force = simulations.torque_nm[robot]
+        self.ctrl = simulations.motor_inputs[robot]
+
+
+NO_MOTORS: Motors = None  # pyright: ignore[reportAssignmentType] - of rows that are not loaded yet
+
+
 class LoopedSimulations(Simulations):
     """One MuJoCo state for each robot, stepped one after the other.
 
@@ -89,7 +101,7 @@ class LoopedSimulations(Simulations):
         self._joints = joints
         self._placed: list[PlacedRobot | None] = [None] * robots
         self._watches: list[DivergenceWatch | None] = [None] * robots
-        self.motors = [_NO_MOTORS] * robots
+        self.motors = [NO_MOTORS] * robots
         self.base_pose = np.zeros((robots, FREE_QPOS))
         self.base_velocity = np.zeros((robots, FREE_DOFS))
         self.angle_rad = np.zeros((robots, joints))
@@ -110,7 +122,7 @@ class LoopedSimulations(Simulations):
         if len(self._placed) == 1:
             self._view(data)
             return True
-        placed.motors.use_state(_MotorArrays(self, robot))
+        placed.motors.use_state(MotorArrays(self, robot))
         self.motor_state[robot] = data.act
         self._copy_from(data, robot)
         return True
@@ -174,15 +186,3 @@ class LoopedSimulations(Simulations):
         self.torque_nm = data.actuator_force[None, :joints]
         self.motor_state = data.act[None, :]
         self.motor_inputs = data.ctrl[None, : INPUTS * joints]
-
-
-class _MotorArrays:
-    """The arrays of one robot that its motors read and write, with the names that MjData gives them."""
-
-    def __init__(self, simulations: Simulations, robot: int) -> None:
-        self.act = simulations.motor_state[robot]
-        self.actuator_force = simulations.torque_nm[robot]
-        self.ctrl = simulations.motor_inputs[robot]
-
-
-_NO_MOTORS: Motors = None  # pyright: ignore[reportAssignmentType] - of rows that are not loaded yet

@@ -65,7 +65,12 @@ def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
 
 
 def build(
-    config: RunConfig, settings: SimSettings, *, motors: bool = True, laws: LawsVersion | None = None
+    config: RunConfig,
+    settings: SimSettings,
+    *,
+    motors: bool = True,
+    laws: LawsVersion | None = None,
+    keeps_touches: bool = False,
 ) -> SimModel:
     """Compile the model of a run.
 
@@ -75,6 +80,8 @@ def build(
         motors: False leaves the motors out. The joints are then hinges with the inertia and the friction of the motors'
             rotors, for torques that are applied from outside.
         laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
+        keeps_touches: whether the C version writes the forces between links and obstacles into MuJoCo's state, for
+            programs that see only the state.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
@@ -105,7 +112,7 @@ def build(
     for geom in spec.geoms:
         geom.friction[0] = friction_of.get(geom.name, 0.0)
     laws = laws or choose_laws()
-    add_laws(spec, laws, links, [geom_name(item) for item in yielding])
+    add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
     model = _compile(spec, config.robot.name)
 
     geom_names = [model.geom(i).name for i in range(model.ngeom)]
