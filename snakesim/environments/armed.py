@@ -26,11 +26,11 @@ from snakesim.environments.digests import CommandDigests
 from snakesim.environments.limiter_client import LimiterClient
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.model.scenario import RunConfig, ServiceSchedule, describe_run_robot
+from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.safety.authority import MAX_REASON_LENGTH
 from snakesim_hal.safety.joint_limits import Applied
 from snakesim_hal.safety.plausibility import SLACK_RAD, SPEED_MARGIN
-from snakesim_hal.wire.messages import Fault, Mode
+from snakesim_hal.wire.messages import Description, Fault, Mode
 from snakesim_sim_backend.batch.robots import SimulatedRobots
 
 Mask = NDArray[np.bool_]  # (robots,)
@@ -73,12 +73,13 @@ class ArmedRobots:
         is_limited: (robots, joints), whose target was limited in the last tick.
     """
 
-    def __init__(self, robots: int, config: RunConfig, *, safe: bool, threads: int) -> None:
+    def __init__(self, robots: int, config: RunConfig, description: Description, *, safe: bool, threads: int) -> None:
         """Make room for robots.
 
         Args:
             robots: their number.
             config: configuration of one of them; those of the others agree with it in joints, sensors and rates.
+            description: the robot of that configuration.
             safe: whether targets pass the limiter.
             threads: number of threads that step the physics.
         """
@@ -122,7 +123,7 @@ class ArmedRobots:
         self._clients: dict[int, LimiterClient] = {}
         self._is_ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # limited as arrays
         self._stays_alone: Mask = np.zeros(robots, dtype=np.bool_)  # until its next reset
-        self._descriptions = [describe_run_robot(config)] * robots
+        self._descriptions = [description] * robots
         self._everybody = self.simulated.everybody
 
         # Robots that take part in the present ticks.
@@ -141,8 +142,13 @@ class ArmedRobots:
         )
         return can_arm(config) and has_equal_schedule and self.simulated.can_simulate(config)
 
-    def start(self, robot: int, config: RunConfig) -> bool:
+    def start(self, robot: int, config: RunConfig, description: Description) -> bool:
         """Place a robot in its scene, and arm it.
+
+        Args:
+            robot: its row.
+            config: configuration of its episode.
+            description: the robot of that configuration.
 
         Returns:
             False if its simulation does not fit to the others.
@@ -154,7 +160,6 @@ class ArmedRobots:
         self.stop(robot)
         if not self.simulated.place(robot, config):
             return False
-        description = describe_run_robot(config)
         self._descriptions[robot] = description
         self._set_limits(robot)
         self.ticks = _replace(self.ticks, robot, 0)

@@ -200,7 +200,7 @@ class Episodes:
             episode_seed = int(random.integers(MAX_SEED)) if given is None else given
             try:
                 config = self._setup.make_config(episode_seed)
-                self.robots.start(environment, config)
+                self.robots.start(environment, config, self._setup.describe(config))
                 return config
             except ConfigError:
                 may_draw_again = given is None and self._setup.new_fields > 0

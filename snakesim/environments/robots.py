@@ -17,7 +17,7 @@ from snakesim_gnc.control.observations import sum_contact_forces_n
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, LifecycleState, Mode, Pose
+from snakesim_hal.wire.messages import Contacts, Description, LifecycleState, Mode, Pose
 
 NAMES_OR_NONE = np.array([name or None for name in LIMIT_NAMES], dtype=object)
 NUMBERS_OF_POSE = 7  # position and quaternion
@@ -54,8 +54,13 @@ class Robots:
         self.is_armed: Mask = np.zeros(robots, dtype=np.bool_)
         self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
 
-    def start(self, robot: int, config: RunConfig) -> None:
+    def start(self, robot: int, config: RunConfig, description: Description) -> None:
         """Put an armed robot in a row.
+
+        Args:
+            robot: the row.
+            config: configuration of its episode.
+            description: the robot of that configuration.
 
         Raises:
             ConfigError: the settings do not match the robot or the scene.
@@ -64,7 +69,7 @@ class Robots:
         self.stop(robot)
         if self._assisted:
             self._alone[robot] = AssistedRobot(config)
-        elif not self._start_together(robot, config):
+        elif not self._start_together(robot, config, description):
             self._alone[robot] = SteppedRobot(config, safe=self._safe)
         self._collect()
 
@@ -173,13 +178,13 @@ class Robots:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def _start_together(self, robot: int, config: RunConfig) -> bool:
+    def _start_together(self, robot: int, config: RunConfig, description: Description) -> bool:
         """Start a robot among those that are stepped together. Returns False if it does not fit to them."""
         if not can_arm(config):
             return False
         if self._armed is None:
-            self._armed = ArmedRobots(self._count, config, safe=self._safe, threads=self._threads)
-        return self._armed.can_start(config) and self._armed.start(robot, config)
+            self._armed = ArmedRobots(self._count, config, description, safe=self._safe, threads=self._threads)
+        return self._armed.can_start(config) and self._armed.start(robot, config, description)
 
     def _collect(self) -> None:
         """Make the arrays of all robots."""
