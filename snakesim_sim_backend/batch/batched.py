@@ -58,6 +58,7 @@ class BatchedSimulations(Simulations):
         self._placed[robot] = placed
         self.motors[robot] = placed.motors
         mujoco.mj_getState(placed.sim.model, data, batch.state[robot], COMPLETE_STATE)
+        self._good_states[robot] = batch.state[robot]
         batch.warning[robot] = 0
         self.torque_nm[robot] = data.actuator_force[: self._joints]
         self._start_rotations[robot] = read_rotations(placed)
@@ -107,8 +108,7 @@ class BatchedSimulations(Simulations):
         feet = len(sim.link_geoms) + 1
         numbers_before_plugins = batch.state.shape[1] - plugin_state.shape[1]
         self._numbers_before_contacts = numbers_before_plugins + friction + MEMORY_NUMBERS + FOOT_NUMBERS * feet
-        self._good_state = np.empty_like(batch.state)
-        self._good_width = batch.state.shape[1]
+        self._good_states = np.empty_like(batch.state)
 
     def _fits(self, robot: int, placed: PlacedRobot) -> bool:
         """Use the model of a robot in its row. Returns False if it has other sizes than the others."""
@@ -119,7 +119,7 @@ class BatchedSimulations(Simulations):
         models[robot] = sim.model
         try:
             self._require_batch().set_models(models)
-        except ValueError:
+        except mujoco.FatalError:
             self._require_batch().set_models(self._models)
             return False
         self._models = models
@@ -131,7 +131,6 @@ class BatchedSimulations(Simulations):
 
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
         batch = self._require_batch()
-        self._keep_good_states()
         diverged: dict[int, str] = {}
         everybody = len(robots) == self._count
         rows = slice(None) if everybody else np.array(robots)
@@ -147,13 +146,13 @@ class BatchedSimulations(Simulations):
             for robot in robots:
                 if not is_good[robot] and robot not in diverged:
                     diverged[robot] = self._explain_divergence(robot, ticks[robot])
+        self._keep_states()
         return diverged
 
-    def _keep_good_states(self) -> None:
-        """Copy the states before a step, without the room for more contacts than there are."""
-        most_contacts = int(self._contact_counts.max())
-        self._good_width = self._numbers_before_contacts + CONTACT_NUMBERS * most_contacts
-        self._good_state[:, : self._good_width] = self._require_batch().state[:, : self._good_width]
+    def _keep_states(self) -> None:
+        """Keep the states as the last good ones, without the room for more contacts than there are."""
+        width = self._numbers_before_contacts + CONTACT_NUMBERS * int(self._contact_counts.max())
+        self._good_states[:, :width] = self._require_batch().state[:, :width]
 
     def _find_good(self) -> Mask:
         """Return which states are good, by the rule of `DivergenceWatch`."""
@@ -173,7 +172,7 @@ class BatchedSimulations(Simulations):
         model = placed.sim.model
         data = placed.data
         bad_state = batch.state[robot].copy()
-        batch.state[robot, : self._good_width] = self._good_state[robot, : self._good_width]
+        batch.state[robot] = self._good_states[robot]
         mujoco.mj_setState(model, data, batch.state[robot], COMPLETE_STATE)
         watch = DivergenceWatch(model, data, placed.physics, self._steps)
         mujoco.mj_setState(model, data, bad_state, COMPLETE_STATE)
