@@ -20,7 +20,7 @@ class NativeLibrary:
 
     name: str  # of the folder
     uses_mujoco: bool
-    python_cost: str  # what the Python version costs, for messages
+    python_cost: str  # a clause about what the Python version costs, for messages
 
     @property
     def folder(self) -> Path:

@@ -1,7 +1,8 @@
 """Loads the compiled libraries, and compiles a library first if there is none of the present sources.
 
 The choice needs no configuration: a library is used if it can be loaded, else the Python version of the same functions.
-Set the environment variable SNAKESIM_NATIVE to `off` to use the Python versions, for example to compare both.
+Set the environment variable SNAKESIM_NATIVE to `off` to use the Python versions, for example to compare both, or to a
+folder whose libraries are to be used, for example ones with sanitizers.
 """
 
 import ctypes
@@ -49,12 +50,14 @@ def _load(library: NativeLibrary, switch: str) -> Loaded:
         return Loaded(None, None, "MuJoCo is not installed (install the extra [sim])")
     key = compute_build_key(library, mujoco.version if mujoco else "")
     try:
-        path = _find_file(library, key)
+        path = Path(switch, make_file_name(library, key)) if switch else _find_file(library, key)
         if path is None:
             path = _compile(library)
         handle = ctypes.CDLL(str(path))
         _check_key(handle, path, key)
     except (CannotCompileError, OSError, AttributeError) as error:
+        if switch:
+            raise  # a user who names a folder wants no other version
         return Loaded(None, None, str(error))
     return Loaded(handle, path, "")
 
@@ -87,7 +90,7 @@ def _find_cache_folder() -> Path:
 
 
 def _check_key(handle: ctypes.CDLL, path: Path, key: str) -> None:
-    """Raise OSError if a library was compiled from other sources than its name says."""
+    """Raise OSError if a library was compiled from other sources than its name stands for."""
     read_key = handle.snakesim_build_key
     read_key.restype = ctypes.c_char_p
     if read_key() != key.encode():

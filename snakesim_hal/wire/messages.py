@@ -416,6 +416,10 @@ class Description(Message, frozen=True, kw_only=True):
         Meta(max_length=8),
         about("hashes of what the host's BLAS, NumPy and C library compute: where they are equal, digests can be"),
     ] = {}
+    laws: Annotated[
+        Literal["c", "python"] | None,
+        about("in which language a simulator computes ground and friction, with equal results; null: no simulator"),
+    ] = None
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
     links: Annotated[
         list[LinkDescription],

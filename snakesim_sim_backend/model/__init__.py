@@ -5,5 +5,6 @@
 `obstacles`  adds pegs, boxes, steps and what else stands in the scene
 `surface`    contact parameters of everything that the robot may touch
 `imu`        adds the IMUs of the links
+`mjcf`       writes the model for other MuJoCo programs
 `tether`     adds the rope of the static checks, and reads its tension
 """

@@ -57,6 +57,16 @@ class SimModel:
     laws: LawsVersion  # which version of the laws the model is made for
 
 
+@dataclass(frozen=True)
+class Blueprint:
+    """The model of a run before it is compiled."""
+
+    spec: mujoco.MjSpec
+    steps_per_tick: int
+    yielding: list[Placed]  # obstacles that move when they are pushed
+    laws: LawsVersion
+
+
 def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
     """Return views of the joints' angles in rad and velocities in rad/s, (count,) each, tail to head."""
     angles_rad = data.qpos[FREE_QPOS : FREE_QPOS + count]
@@ -86,6 +96,35 @@ def build(
     Raises:
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
     """
+    laws = laws or choose_laws()
+    blueprint = make_blueprint(config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches)
+    model = _compile(blueprint.spec, config.robot.name)
+    links = config.robot.chain.modules + 1
+    first_link_body = model.body("link_0").id
+    feet = None
+    if config.scene.ground.heightfield is None:
+        feet = find_feet(model, first_link_body, links, config.robot.module.radius_m)
+    return SimModel(
+        model=model,
+        steps_per_tick=blueprint.steps_per_tick,
+        first_link_body=first_link_body,
+        obstacle_of_geom=[_obstacle_name(model.geom(i).name) for i in range(model.ngeom)],
+        feet=feet,
+        link_geoms=[model.geom(f"link_{i}").id for i in range(links)],
+        suspended=settings.suspended,
+        yielding=blueprint.yielding,
+        laws=blueprint.laws,
+    )
+
+
+def make_blueprint(
+    config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion, keeps_touches: bool = False
+) -> Blueprint:
+    """Return the model of a run before it is compiled.
+
+    Raises:
+        ConfigError: the settings do not match the robot or the scene.
+    """
     steps_per_tick = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
     step_s = config.period_ns * 1e-9 / steps_per_tick
     _check_contact_time(settings, step_s)
@@ -103,34 +142,17 @@ def build(
     _add_snake(spec, config, settings, contact)
     _add_obstacles(spec, yielding, config, contact, collide=bool(yielding), step_s=step_s)
     _add_devices(spec, config.robot, settings, step_s, motors=motors)
+
+    # Friction and the other laws.
     links = config.robot.chain.modules + 1
-    link_names = [f"link_{i}" for i in range(links)]
     foot_names = [f"foot_{i}" for i in range(links + 1)]
     friction_of = dict.fromkeys([*rough_ground_geoms, *foot_names], config.scene.ground.friction)
     friction_of |= {geom_name(item): item.friction for item in placed}
-    friction_of |= dict.fromkeys(link_names, settings.self_friction)
+    friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
     for geom in spec.geoms:
         geom.friction[0] = friction_of.get(geom.name, 0.0)
-    laws = laws or choose_laws()
     add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
-    model = _compile(spec, config.robot.name)
-
-    geom_names = [model.geom(i).name for i in range(model.ngeom)]
-    first_link_body = model.body("link_0").id
-    feet = None
-    if config.scene.ground.heightfield is None:
-        feet = find_feet(model, first_link_body, links, config.robot.module.radius_m)
-    return SimModel(
-        model=model,
-        steps_per_tick=steps_per_tick,
-        first_link_body=first_link_body,
-        obstacle_of_geom=[_obstacle_name(name) for name in geom_names],
-        feet=feet,
-        link_geoms=[model.geom(name).id for name in link_names],
-        suspended=settings.suspended,
-        yielding=yielding,
-        laws=laws,
-    )
+    return Blueprint(spec, steps_per_tick, yielding, laws)
 
 
 def _check_contact_time(settings: SimSettings, step_s: float) -> None:
