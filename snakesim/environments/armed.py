@@ -373,12 +373,12 @@ class ArmedRobots:
         all_near = np.count_nonzero(is_near) == is_near.size
         if all_near and np.count_nonzero(has_moved) == has_moved.size and not is_heat_new:
             return self._everybody, self._everybody
-        near = is_near.all(axis=1)
-        has_changed = (change.reshape(len(change), 3, joints) != 0.0).any(axis=1).all(axis=1)
-        ordinary = near & has_changed
+        near: Mask = np.all(is_near, axis=1)
+        has_changed: Mask = np.all(np.any(change.reshape(len(change), 3, joints) != 0.0, axis=1), axis=1)
+        ordinary: Mask = near & has_changed
         if windings is not None and is_heat_new:
             is_hot = (windings.values >= self._stop_at_c) & self._heat_is_measured
-            ordinary &= ~(is_hot.any(axis=1) & windings.is_new)
+            ordinary = ordinary & ~(np.any(is_hot, axis=1) & windings.is_new)
         return near, ordinary
 
     def _update_torque_fractions(self) -> None:
@@ -400,6 +400,7 @@ class ArmedRobots:
         windings = self.simulated.sensors.windings
         if windings is not None and windings.is_new[robot]:
             power = self.simulated.make_power(robot, tick)
+            assert power is not None, "a sample has just been delivered"
             client.core.observe_power(power, now_ns)
 
     def _obeys(self, robot: int, mode: Mode) -> bool:

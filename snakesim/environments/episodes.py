@@ -85,7 +85,7 @@ class Episodes:
     @property
     def time_s(self) -> Floats:
         """Robot time since arming, (environments,)."""
-        return self._ticks * self._period_ns * 1e-9
+        return np.asarray(self._ticks * self._period_ns * 1e-9, dtype=np.float64)
 
     @property
     def advance_m(self) -> Floats:

@@ -18,8 +18,9 @@ class InfoArrays:
 
     def add(self, key: str, values: NDArray[Any], environments: Mask) -> None:
         """Add one value for each of these environments, from an array with a row for every environment."""
-        nothing = None if values.dtype == object else values.dtype.type(0)
-        self._values[key] = np.where(environments, values, nothing), environments
+        merged: NDArray[Any] = np.full(self._count, None) if values.dtype == object else np.zeros_like(values)
+        np.copyto(merged, values, where=environments)
+        self._values[key] = merged, environments
 
     def add_objects(self, key: str, values: Mapping[int, Any]) -> None:
         """Add an object for each environment that has one."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import error
+from gymnasium import error, logger
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -18,6 +18,7 @@ from snakesim.environments.episodes import Episodes, StepResult
 from snakesim.environments.infos import InfoArrays
 from snakesim.environments.setup import RENDER_MODES
 from snakesim_hal.base.errors import ConfigError
+from snakesim_sim_backend.batch.simulations import describe_loop_cost
 
 
 class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
@@ -71,6 +72,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         setup = SnakeEnv(**arguments).setup
         self._setup = setup
         self._episodes = Episodes(setup, num_envs, threads or len(os.sched_getaffinity(0)))
+        if setup.config.backend == "sim" and num_envs > 1 and (cost := describe_loop_cost()):
+            logger.warn(cost)
         self._random: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]
         self._has_unfinished_step = False
 

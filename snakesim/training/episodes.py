@@ -120,7 +120,8 @@ class Episodes:
         from snakesim_operator.base.dask_cluster import connected  # Dask is of another extra
 
         client = self._opened.enter_context(connected(address))
-        self._shares = max(sum(client.nthreads().values()), 1)
+        threads: Any = client.nthreads()  # of each worker
+        self._shares = max(sum(threads.values()), 1)
         executor = client.get_executor(pure=False, retries=RETRIES)
         return lambda function, calls: list(executor.map(function, *zip(*calls, strict=True)))
 

@@ -1,6 +1,7 @@
 """Measures how far the body has advanced towards its goal, from the pose sensor and the joints alone."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -36,7 +37,8 @@ class GoalProgress:
         self._has_started = False
 
         # Results.
-        self.pose = task.start_position_w, task.start_wxyz  # position and quaternion of the tail end
+        # Position and quaternion of the tail end.
+        self.pose: tuple[Sequence[float] | Floats, Sequence[float] | Floats] = (task.start_position_w, task.start_wxyz)
         self.along_m = 0.0  # advance towards the goal since the start
         self.bearing_rad = 0.0  # of the goal, from the heading of the body
         self.goal_m: float | None = None  # distance of the goal from the start; None: there is no goal

@@ -132,10 +132,10 @@ class BatchedSimulations(Simulations):
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
         batch = self._require_batch()
         diverged: dict[int, str] = {}
-        everybody = len(robots) == self._count
-        rows = slice(None) if everybody else np.array(robots)
+        ids = None if len(robots) == self._count else np.array(robots)
+        rows = slice(None) if ids is None else ids
         try:
-            batch.step(None if everybody else rows, nstep=self._steps)
+            batch.step(ids, nstep=self._steps)
         except SimulationError as error:
             for robot in error.ids.tolist():
                 diverged[robot] = f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"

@@ -10,12 +10,23 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
+from snakesim_native.libraries import LAWS
+from snakesim_native.load import load
 from snakesim_sim_backend.actuators import INPUTS, Motors
 from snakesim_sim_backend.batch.placed import PlacedRobot, read_rotations
+from snakesim_sim_backend.laws.version import choose_laws
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
 from snakesim_sim_backend.state.divergence import DivergenceWatch
 
 Mask = NDArray[np.bool_]  # (robots,)
+
+
+def describe_loop_cost() -> str:
+    """Return what it costs that simulations are stepped in a loop here; empty if they are not."""
+    if choose_laws() == "c":
+        return ""
+    loaded = load(LAWS)
+    return f"many environments are stepped in a loop on one thread, and {LAWS.python_cost}. Reason: {loaded.problem}"
 
 
 @dataclass(frozen=True)
