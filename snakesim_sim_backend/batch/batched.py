@@ -161,7 +161,7 @@ class BatchedSimulations(Simulations):
             (np.vecdot(self._qpos, self._qpos) < MAX_POSITION**2)
             & (np.vecdot(self._qvel, self._qvel) < MAX_SPEED**2)
             & (np.vecdot(self._qacc, self._qacc) < MAX_ACCELERATION**2)
-            & ~warnings.any(axis=1)
+            & (warnings.sum(axis=1) == 0)
         )
 
     def _explain_divergence(self, robot: int, tick: int) -> str:

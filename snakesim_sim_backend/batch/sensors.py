@@ -24,6 +24,7 @@ NUMBERS_OF_POSE = 7
 NUMBERS_OF_VELOCITY = 6
 NUMBERS_OF_RAW_POSE = 19  # those of pose and velocity, and 6 of noise
 NUMBERS_OF_CONTACT = 6  # of noise: of position and force
+ROUNDING_ERROR = 1e-9  # relative; more than that of the size of a force
 
 
 def describe_timing(config: RunConfig) -> bytes:
@@ -91,8 +92,8 @@ class SensorArrays:
             self._contact_due = due_ticks(sensors.contacts.rate_hz)
             self._contacts_have_noise = _has_noise(sensors.contacts)
             self._contact_delay_ticks = round_to_ticks(sensors.contacts.delay_s, config.period_ns)
-        self._contact_sigma_n = [0.0] * robots
-        self._contact_threshold_n = [0.0] * robots
+        self._contact_sigma_n = np.zeros(robots)
+        self._contact_threshold_n = np.zeros(robots)
         self._waiting_contacts: deque[tuple[ContactSample, Mask]] = deque()
         self._contacts = NO_CONTACTS
 
@@ -186,13 +187,11 @@ class SensorArrays:
 
     def _draw_contact_noise(self, touches: TouchArrays) -> ContactSample:
         """Return the contacts above the threshold with the random numbers of their forces."""
-        thresholds_n = self._contact_threshold_n
-        is_detected = [
-            math.hypot(*force_w) >= thresholds_n[robot]
-            for robot, force_w in zip(touches.robot.tolist(), touches.force_w.tolist(), strict=True)
-        ]
-        if not all(is_detected):
-            touches = _select(touches, np.array(is_detected))
+        is_detected = _find_strong(touches.force_w, self._contact_threshold_n[touches.robot])
+        if not is_detected.all():
+            touches = _select(touches, is_detected)
+        if not len(touches.robot):
+            return NO_CONTACTS
         contacts_of_robot = np.bincount(touches.robot, minlength=self._count)
         rank = np.arange(len(touches.robot)) - (np.cumsum(contacts_of_robot) - contacts_of_robot)[touches.robot]
         noise = np.zeros((len(touches.robot), 3))
@@ -201,8 +200,10 @@ class SensorArrays:
             of_force = NUMBERS_OF_CONTACT * rank[:, None] + np.arange(3, 6)
             noise = numbers[touches.robot[:, None], of_force]
             self._noise.skip_each(NUMBERS_OF_CONTACT * contacts_of_robot)
-        fits = rank < MAX_CONTACTS
-        return ContactSample(_select(touches, fits), noise[fits])
+        if len(rank) > MAX_CONTACTS:
+            fits = rank < MAX_CONTACTS
+            return ContactSample(_select(touches, fits), noise[fits])
+        return ContactSample(touches, noise)
 
     def _sample_poses(self, due: Mask, simulations: Simulations, starts: bool) -> None:
         noise = self._no_pose_noise
@@ -267,7 +268,7 @@ class SensorArrays:
         touches = self._contacts.touches
         if not len(touches.robot):
             return np.array(forces_n)
-        sigma_n = np.array(self._contact_sigma_n)[touches.robot, None]
+        sigma_n = self._contact_sigma_n[touches.robot, None]
         force_l = _rotate_into(touches.rotation, touches.force_w)
         if self._contacts_have_noise:
             force_l = force_l + sigma_n * self._contacts.noise
@@ -283,6 +284,17 @@ def _without_mounted(sensors: Sensors) -> Sensors:
 def _has_noise(sensor: msgspec.Struct) -> bool:
     """Return whether a sensor of the body draws random numbers."""
     return any(value for name, value in msgspec.structs.asdict(sensor).items() if "noise" in name)
+
+
+def _find_strong(force_w: Floats, thresholds_n: Floats) -> Mask:
+    """Return which forces, (n, 3), are at least as large as their thresholds, (n,), as `math.hypot` decides it."""
+    x, y, z = force_w.T
+    sizes_n = np.sqrt(x * x + y * y + z * z)
+    is_strong = sizes_n >= thresholds_n
+    is_close = np.abs(sizes_n - thresholds_n) <= ROUNDING_ERROR * thresholds_n
+    for i in np.flatnonzero(is_close).tolist():
+        is_strong[i] = math.hypot(*force_w[i].tolist()) >= thresholds_n[i]
+    return is_strong
 
 
 def _select(touches: TouchArrays, mask: Mask) -> TouchArrays:
