@@ -13,7 +13,7 @@ from mujoco.batch import Batch, SimulationError
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_sim_backend.actuators import INPUTS
-from snakesim_sim_backend.batch.placed import PlacedRobot, read_rotations
+from snakesim_sim_backend.batch.placed import TOUCH_NUMBERS, PlacedRobot, find_touches, read_rotations
 from snakesim_sim_backend.batch.simulations import (
     NO_MOTORS,
     NO_TOUCHES,
@@ -23,7 +23,7 @@ from snakesim_sim_backend.batch.simulations import (
     TouchArrays,
 )
 from snakesim_sim_backend.laws.native_laws import CONTACT_COUNT, CONTACT_NUMBERS, FOOT_NUMBERS, MEMORY_NUMBERS
-from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, TOUCHES_INSTANCE
+from snakesim_sim_backend.laws.version import FRICTION_INSTANCE
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
 from snakesim_sim_backend.state.divergence import (
     COMPLETE_STATE,
@@ -33,8 +33,7 @@ from snakesim_sim_backend.state.divergence import (
     DivergenceWatch,
 )
 
-PLUGIN_STATE = int(mujoco.mjtState.mjSTATE_PLUGIN)
-TOUCH_NUMBERS = 4  # link and force, see `snakesim_native/laws/laws.h`
+PLUGIN = mujoco.mjtObj.mjOBJ_PLUGIN
 
 
 class BatchedSimulations(Simulations):
@@ -96,12 +95,11 @@ class BatchedSimulations(Simulations):
 
         # What the laws have written into the states.
         plugin_state = batch.bind("plugin_state")
-        friction = model.plugin_stateadr[_find_instance(model, FRICTION_INSTANCE)]
-        touches = _find_instance(model, TOUCHES_INSTANCE)
-        start = model.plugin_stateadr[touches]
+        friction = model.plugin_stateadr[mujoco.mj_name2id(model, PLUGIN, FRICTION_INSTANCE)]
+        touches = find_touches(model)
         self._contact_counts = plugin_state[:, friction + CONTACT_COUNT]
-        self._touch_counts = plugin_state[:, start]
-        self._touches = plugin_state[:, start + 1 : start + model.plugin_statenum[touches]]
+        self._touch_counts = plugin_state[:, touches.start]
+        self._touches = plugin_state[:, touches.start + 1 : touches.stop]
         self._touches = self._touches.reshape(self._count, -1, TOUCH_NUMBERS)
 
         # The last good states. Contacts come last in a state, and there is room for many more than there are.
@@ -197,8 +195,3 @@ class BatchedSimulations(Simulations):
         if self._is_at_start.any():
             rotations = np.where(self._is_at_start[rows, None], self._start_rotations[rows, links], rotations)
         return TouchArrays(rows, links, touches[:, 1:], rotations)
-
-
-def _find_instance(model: mujoco.MjModel, name: str) -> int:
-    """Return the number of a plugin instance."""
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_PLUGIN, name)

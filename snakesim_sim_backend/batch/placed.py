@@ -5,16 +5,20 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.programs.preflight import backend_settings
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.laws.version import TOUCHES_INSTANCE
 from snakesim_sim_backend.model.build import SimModel, build
 from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.state.contacts import TouchReader
 from snakesim_sim_backend.state.divergence import log_warnings
 from snakesim_sim_backend.state.start import place_robot
+
+TOUCH_NUMBERS = 4  # link and force, see `snakesim_native/laws/laws.h`
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,24 @@ class PlacedRobot:
     physics: Physics
     motors: Motors  # off
     touches: TouchReader
+    touch_memory: Floats | None  # see `find_touches`; None: the laws run in Python
+
+    def read_touches(self) -> list[list[float]]:
+        """Return the contacts with obstacles in the last step: link (0 at the tail) and force in N in the world."""
+        memory = self.touch_memory
+        if memory is None:
+            return [[touch.link, *touch.force_w] for touch in self.touches.read()]
+        count = int(memory[0])
+        if not count:
+            return []
+        return memory[1 : 1 + TOUCH_NUMBERS * count].reshape(count, TOUCH_NUMBERS).tolist()
+
+
+def find_touches(model: mujoco.MjModel) -> slice:
+    """Return where the C laws keep touches in `plugin_state`: their number, then TOUCH_NUMBERS of each."""
+    instance = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_PLUGIN, TOUCHES_INSTANCE)
+    start = model.plugin_stateadr[instance]
+    return slice(start, start + model.plugin_statenum[instance])
 
 
 def place(config: RunConfig) -> PlacedRobot:
@@ -46,7 +68,8 @@ def place(config: RunConfig) -> PlacedRobot:
         TetherRope(sim.model, data, settings.tether).tighten()
     # MuJoCo's own sensors are the IMUs, which no environment observes.
     sim.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics))
+    touch_memory = data.plugin_state[find_touches(sim.model)] if sim.laws == "c" else None
+    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics), touch_memory)
 
 
 def read_rotations(robot: PlacedRobot) -> np.ndarray:

@@ -164,16 +164,17 @@ class LoopedSimulations(Simulations):
     def find_touches(self, robots: Mask) -> TouchArrays:
         rows: list[int] = []
         links: list[int] = []
-        forces_w: list[tuple[float, float, float]] = []
+        forces_w: list[list[float]] = []
         rotations: list[Floats] = []
         for robot, placed in enumerate(self._placed):
             if placed is None or not robots[robot]:
                 continue
-            for touch in placed.touches.read():
+            for number, *force_w in placed.read_touches():
+                link = int(number)
                 rows.append(robot)
-                links.append(touch.link)
-                forces_w.append(touch.force_w)
-                rotations.append(read_rotations(placed)[touch.link].copy())
+                links.append(link)
+                forces_w.append(force_w)
+                rotations.append(read_rotations(placed)[link].copy())
         if not rows:
             return NO_TOUCHES
         return TouchArrays(np.array(rows), np.array(links), np.array(forces_w), np.array(rotations))
