@@ -84,6 +84,7 @@ class Observers:
 
     def _measure_advance(self, joints: Floats, poses: Floats, rows: Mask) -> None:
         angles_rad = joints[:, : joints.shape[1] // 3]
+        pose_numbers = poses.tolist()
         indices = np.flatnonzero(rows).tolist()
         groups = [[robot] for robot in indices]
         if self._has_equal_links and indices:
@@ -93,7 +94,7 @@ class Observers:
             nodes_w, centers_w = locator.locate(poses[group], angles_rad[group])
             for i, robot in enumerate(group):
                 progress = self.progress[robot]
-                progress.pose = poses[robot, :3], poses[robot, 3:]
+                progress.pose = pose_numbers[robot][:3], pose_numbers[robot][3:]
                 progress.follow(nodes_w[i], centers_w[i])
 
 

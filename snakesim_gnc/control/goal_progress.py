@@ -38,7 +38,7 @@ class GoalProgress:
 
         # Results.
         # Position and quaternion of the tail end.
-        self.pose: tuple[Sequence[float] | Floats, Sequence[float] | Floats] = (task.start_position_w, task.start_wxyz)
+        self.pose: tuple[Sequence[float], Sequence[float]] = (task.start_position_w, task.start_wxyz)
         self.along_m = 0.0  # advance towards the goal since the start
         self.bearing_rad = 0.0  # of the goal, from the heading of the body
         self.goal_m: float | None = None  # distance of the goal from the start; None: there is no goal
