@@ -5,7 +5,8 @@ robots, each in a scene of its own, with the same bits. Messages are left out: s
 (robots, n).
 
 `placed`        one robot at rest in its scene
-`simulations`   the seam to MuJoCo: steps all simulations through one control period
+`simulations`   the seam to MuJoCo: steps all simulations through one control period, in a loop
+`batched`       the same on MuJoCo's `Batch`, by threads in C
 `noise`         the random numbers of all robots
 `samples`       rates and delays of sensors
 `sensors`       what environments observe: joints, pose, contact forces, winding temperatures

@@ -15,10 +15,10 @@ PEGS = [
     {"name": f"peg{i}", "position_m": [0.25 * i - 0.1, 0.1 * (-1) ** i], "radius_m": 0.05, "friction": 0.2 * (i % 2)}
     for i in range(4)
 ]
-POST = {"name": "post", "position_m": [0.3, 0.1], "size_m": [0.1, 0.1, 0.2], "stiffness_n_per_m": 300.0}
+POST = {"name": "post", "position_m": [0.5, 0.095], "size_m": [0.1, 0.1, 0.2], "stiffness_n_per_m": 300.0}
 SCENES: dict[str, dict[str, Any]] = {
     "rough and smooth pegs": {"ground": {"friction": 0.1}, "cylinder": PEGS},
-    "an obstacle that yields": {"ground": {"friction": 0.1}, "cylinder": PEGS[:1], "box": [POST]},
+    "an obstacle that yields": {"ground": {"friction": 0.1}, "cylinder": PEGS[:2], "box": [POST]},
 }
 
 
@@ -37,4 +37,4 @@ def test_the_state_has_the_forces_that_python_reads(name: str) -> None:
         expected = [[touch.link, *touch.force_w] for touch in placed.touches.read()]
         assert placed.read_touches() == expected
         touched += len(expected)
-    assert touched > STEPS / 10
+    assert touched > 20
