@@ -5,7 +5,6 @@ one mode, and had it in the period before; a test compares the two over random c
 (robots, joints), and every robot may have limits of its own.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -153,11 +152,6 @@ def find_active_limits(
     names = np.where(target != requested, names, NO_LIMIT)
     derated = limits.torque_nm > limits.torque_nm * torque_fraction
     return np.where(derated & ((names == NO_LIMIT) | (names == TORQUE)), THERMAL, names)
-
-
-def name_limits(indices: Sequence[int]) -> dict[int, str]:
-    """Return the index of each limited joint of one robot with the name of the limit."""
-    return {joint: LIMIT_NAMES[index] for joint, index in enumerate(indices) if index != NO_LIMIT}
 
 
 def _velocity_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
