@@ -249,7 +249,8 @@ class ArmedRobots:
             target = limit_targets(mode, requested, self._target, torque_limit_nm, measured, self._limits)
             is_limited = target != requested
             if self._is_derated:
-                is_limited = is_limited | (self._torque_fraction < 1.0)
+                full_nm = self._limits.torque_nm
+                is_limited = is_limited | (full_nm > full_nm * self._torque_fraction)
         else:
             requested = self._commands[-1]
             torque_limit_nm = self._limits.torque_nm
