@@ -12,6 +12,7 @@ it follows the new demand with the motor's response time, also to zero in passiv
 """
 
 import math
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -65,6 +66,17 @@ def _gains_by_mode(joint: Joint, scale: float) -> dict[Mode, tuple[float, float,
     return {mode: values for mode, values in gains.items() if mode.name.lower() in mode_names}
 
 
+class MotorData(Protocol):
+    """The arrays of MuJoCo's state that motors read and write."""
+
+    @property
+    def act(self) -> Floats: ...
+    @property
+    def actuator_force(self) -> Floats: ...
+    @property
+    def ctrl(self) -> Floats: ...
+
+
 class Motors:
     """All motors of a compiled model, tail to head.
 
@@ -74,7 +86,7 @@ class Motors:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
+        self, model: mujoco.MjModel, data: MotorData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
     ) -> None:
         """Take over the motors of a model, and switch them off.
 
@@ -95,9 +107,7 @@ class Motors:
         self._gains = model.actuator_gainprm[: self.count]
         self._min_torque_nm = model.actuator_forcerange[: self.count, 0]
         self._max_torque_nm = model.actuator_forcerange[: self.count, 1]
-        self._torque_state = data.act  # empty when the motors have no lag
-        self._applied_nm = data.actuator_force[: self.count]
-        self._inputs = data.ctrl[: INPUTS * self.count]
+        self.use_state(data)
 
         # Torque limits, (n_joints,) each: of the robot file, after derating, and with the command's.
         self._full_limit_nm = np.array([joint.limits.torque_nm for joint in joints])
@@ -114,6 +124,12 @@ class Motors:
         expected = [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints]
         assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == expected)
         self.switch_off()
+
+    def use_state(self, data: MotorData) -> None:
+        """Read and write the arrays of this state from now on."""
+        self._torque_state = data.act  # empty when the motors have no lag
+        self._applied_nm = data.actuator_force[: self.count]
+        self._inputs = data.ctrl[: INPUTS * self.count]
 
     def enact(self, setpoints: SafeSetpoints) -> None:
         """Apply setpoints, tail to head; they hold until the next call.
@@ -161,6 +177,16 @@ class Motors:
     def applied_nm(self) -> Floats:
         """Return a view of the torque of every motor over the last physics step, (n_joints,) float64."""
         return self._applied_nm
+
+    @property
+    def limit_is_changing(self) -> bool:
+        """Return whether the torque limits have not reached their new values yet."""
+        return self._limit_is_changing
+
+    @property
+    def torque_range_nm(self) -> tuple[Floats, Floats]:
+        """Return views of the minimum and maximum torque of every motor at present, (n_joints,) each."""
+        return self._min_torque_nm, self._max_torque_nm
 
     def _update_limit(self) -> None:
         self._limit_nm = np.minimum(self._commanded_limit_nm, self._derated_limit_nm)

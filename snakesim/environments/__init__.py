@@ -5,10 +5,16 @@
 
     env = gymnasium.make("SnakeSIM/Clutter-v0", action="velocity", frame_skip=5)
 
-Importing this package registers the names; it needs the extra `gym`, and nothing else of SnakeSIM imports it.
-`environment` has the environment, `vector` many of them, `stepped` and `assisted` the robot in it,
-`rewards` what is paid; what is seen is in `snakesim_gnc.control.observations`. `docs/how-to/environments.md` is the
-reference.
+Importing this package registers the names; it needs the extra `gym`. `docs/how-to/environments.md` is the guide.
+
+`environment`, `vector`   what Gymnasium sees: one environment, and many
+`setup`                   the arguments, checked, and the configuration of each episode
+`episodes`                steps the episodes of any number of environments: one environment is a vector of one
+`observing`, `rewards`    what agents observe, and the terms of their rewards
+`robots`                  the robots as rows of arrays, whatever steps them:
+`armed`                   - simulated robots together, limited by `array_limiter`
+`stepped`, `assisted`     - a robot alone, on any backend, and one under a controller that is corrected
+`limiter_client`          commands the limiter of the HAL for one robot
 """
 
 from snakesim_operator.base import extras

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_hal.wire.messages import Description, Mode
 
@@ -52,27 +52,60 @@ class Commands:
                 low = [-value for value in high]
         return Commands(kind, mode, unit, names, low, high)
 
-    def target(self, action: Any) -> list[float]:
+    def target(self, action: Any) -> Floats:
         """Return the targets of an action.
 
         Args:
             action: (joints,) numbers, tail to head; an array or a sequence.
 
+        Returns:
+            A new array, (joints,).
+
         Raises:
             ValueError: The action has another shape, or holds a number that is not finite.
         """
         try:
-            values: NDArray[np.float64] = np.asarray(action, dtype=np.float64)
+            values: Floats = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
             raise ValueError(f"action is {action!r:.60}, must be {self._describe_expected()}") from None
         if values.shape != (len(self.names),):
             raise ValueError(f"action has shape {values.shape}, must be {self._describe_expected()}")
+        self._check_finite(values, "action")
+        return values
+
+    def targets(self, actions: Any, count: int) -> Floats:
+        """Return the targets of the actions of many environments.
+
+        Args:
+            actions: (count, joints) numbers; an array or a sequence.
+            count: number of environments.
+
+        Returns:
+            A new array, (count, joints).
+
+        Raises:
+            ValueError: The actions have another shape, or hold a number that is not finite.
+        """
+        try:
+            values: Floats = np.array(actions, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"actions is {actions!r:.60}, must have {count} rows, one for each environment") from None
+        if values.shape != (count, len(self.names)):
+            raise ValueError(
+                f"actions has shape {values.shape}, must have {count} rows, and each row {self._describe_expected()}"
+            )
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values).all(axis=1)))
+            self._check_finite(values[row], f"actions[{row}]")
+        return values
+
+    def _check_finite(self, values: Floats, name: str) -> None:
+        """Raise ValueError for a number that is not finite. `name` is that of the array."""
         if not np.isfinite(values).all():
             bad = int(np.argmin(np.isfinite(values)))
             raise ValueError(
-                f"action[{bad}] ({self.names[bad]}) is {values[bad]}, must be a finite number of {self.unit}"
+                f"{name}[{bad}] ({self.names[bad]}) is {values[bad]}, must be a finite number of {self.unit}"
             )
-        return values.tolist()
 
     def _describe_expected(self) -> str:
         count = len(self.names)

@@ -1,11 +1,12 @@
 """A robot that is stepped tick by tick: a backend behind the HAL's limiter, without host, services or network.
 
-Lifecycle, lease, limits and the latency of commands are those of a run in lockstep, and so is the digest.
+Lifecycle, lease, limits and the latency of commands are those of a run in lockstep, and so is the digest. `armed` steps
+many simulated robots at once with the same results; this is for any backend, and for injected faults.
 """
 
 import msgspec
 
-from snakesim.environments.no_limiter import NoLimiter
+from snakesim.environments.limiter_client import LimiterClient
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.base.errors import BackendError, ConfigError, RefusedError
 from snakesim_hal.faults.allowed import Faults, create_host_faults
@@ -17,21 +18,8 @@ from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.preflight import backend_settings, find_backend
 from snakesim_hal.run_log.black_box import BlackBox
-from snakesim_hal.safety.authority import Authority
-from snakesim_hal.wire.messages import (
-    Description,
-    Fault,
-    JointCommand,
-    JointState,
-    LeaseRequest,
-    LifecycleState,
-    Message,
-    Mode,
-    make_arm_request,
-)
+from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Message, Mode
 
-REQUESTER = "an environment"
-LEASE_PRIORITY = 100
 FAULT_TARGETS = ("joint", "bus", "simulator")  # faults of these need neither services nor processes
 
 
@@ -58,21 +46,21 @@ class SteppedRobot:
             session = LocalNetwork().session()
             backend, self._faults = create_host_faults(config, GuardedBackend(backend), session)
         self._backend = backend
-        self._authority = Authority(self.description) if safe else None
-        self._no_limiter = NoLimiter(self.description)
-        self._cycle = ControlCycle(backend, self._authority or self._no_limiter)
+        self._client = LimiterClient(self.description, safe=safe)
+        self._cycle = ControlCycle(backend, self._client.core)
 
         self._period_ns = config.period_ns
         self._service = config.services.get(CONTROL, ServiceSchedule())
         self._black_box = BlackBox(self.description, memory_bytes=0)
-        self._full_torque_nm = [joint.torque_limit_nm for joint in self.description.joints]
         self._tick = 0
-        self._sequence = 0
         self.newest: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
         self.limited: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
         self._samples = self._sample()
-        if self._authority is not None:
-            self._arm(self._authority)
+        try:
+            self._client.arm(self.joints)
+        except RefusedError:
+            self._backend.close()
+            raise
 
     @property
     def joints(self) -> JointState:
@@ -82,12 +70,12 @@ class SteppedRobot:
     @property
     def lifecycle(self) -> LifecycleState:
         """The lifecycle state, as a host would publish it."""
-        return self._cycle.safety.state
+        return self._client.state
 
     @property
     def reason(self) -> str:
         """Why the robot is in this state."""
-        return self._cycle.safety.reason
+        return self._client.reason
 
     @property
     def digest(self) -> str:
@@ -101,8 +89,8 @@ class SteppedRobot:
             mode: Mode of all joints.
             target: One target per joint, tail to head; in rad, rad/s or N·m, depending on the mode.
         """
-        self._command([mode] * len(target), target)
         now_ns = self._tick * self._period_ns
+        self._client.command(self._tick, now_ns, [mode] * len(target), target)
         decision = self._cycle.decide(now_ns, self._tick, self._service.used_output_tick(self._tick + 1))
         self.limited = decision.limited
         self._black_box.record(self._tick, now_ns, self._samples, decision)
@@ -119,50 +107,15 @@ class SteppedRobot:
         """Close the backend."""
         self._backend.close()
 
-    def _command(self, modes: list[Mode], target: list[float]) -> None:
-        """Hand a command to whatever decides on the setpoints."""
-        if self._authority is None:
-            self._no_limiter.command(modes, target)
-        elif self._authority.state == "armed":
-            self._offer(self._authority, modes, target)
-
     def _sample(self) -> Samples:
         """Read the sensors of this tick and let them be judged."""
         now_ns = self._tick * self._period_ns
         if self._faults is not None:
-            arm_session = 1 if self._authority is None else self._authority.arm_session
-            self._faults.update(now_ns, arm_session, self.lifecycle)
+            self._faults.update(now_ns, self._client.arm_session, self.lifecycle)
         samples = self._cycle.sample(self._tick, now_ns)
         self.newest.update(samples.others)
         self._cycle.observe(samples, now_ns)
         return samples
-
-    def _arm(self, authority: Authority) -> None:
-        """Arm at the present pose."""
-        authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
-        self._offer(authority, [Mode.POSITION] * len(self._full_torque_nm), list(self.joints.angle_rad))
-        answer = authority.on_lifecycle(make_arm_request(self.description, REQUESTER), 0)
-        if not answer.ok:
-            self._backend.close()
-            raise RefusedError(f"not ready to arm: {answer.reason}", code="robot/not-ready")
-
-    def _offer(self, authority: Authority, modes: list[Mode], target: list[float]) -> None:
-        """Send a command that answers the present samples."""
-        self._sequence += 1
-        command = JointCommand(
-            # What it answers, and on whose behalf.
-            tick=self._tick,
-            sequence=self._sequence,
-            arm_session=authority.arm_session,
-            lease_epoch=authority.lease.epoch,
-            layout=self.description.layout,
-            valid_for_ns=self.description.lease_ns,
-            # The setpoints.
-            mode=modes,
-            target=target,
-            torque_limit_nm=self._full_torque_nm,
-        )
-        authority.offer_command(command, now_ns=self._tick * self._period_ns, tick=self._tick, age_ns=0)
 
 
 def _check_planned_faults(config: RunConfig) -> None:

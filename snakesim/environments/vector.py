@@ -1,71 +1,93 @@
-"""Steps many environments at once: one process for each processor, and each steps its share of the environments.
+"""Steps many environments at once, in one process: every array has a row for each environment."""
 
-With one process for each environment, a step waits for the slowest process, and every environment pays for its own
-messages.
-"""
-
-import contextlib
-import multiprocessing
 import os
-import signal
-from collections.abc import Iterator, Sequence
-from multiprocessing.connection import Connection, wait
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import error
+from gymnasium import error, logger
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from gymnasium.vector.utils import batch_space
+from numpy.random import Generator
 from numpy.typing import NDArray
 
+from snakesim.environments.armed import Mask
 from snakesim.environments.environment import SnakeEnv
-from snakesim_hal.base.errors import BackendError, ConfigError
-
-CLOSE_TIMEOUT_S = 5.0
-CLOSE = "close"  # a request without an answer
-Outcome = tuple[Any, float, bool, bool, dict[str, Any]]
+from snakesim.environments.episodes import Episodes, StepResult
+from snakesim.environments.infos import InfoArrays
+from snakesim.environments.setup import RENDER_MODES
+from snakesim_hal.base.errors import ConfigError
+from snakesim_sim_backend.batch.simulations import describe_loop_cost
 
 
 class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
-    """Many environments of one scenario. The step after the end of an episode resets it, as Gymnasium's own do.
+    """Many environments of one scenario, each in a scene of its own. Each has the same bits as `SnakeEnv` alone.
 
-    An unpickled one starts new processes, and needs a `reset`.
+    A pickle holds the arguments and no robots, so an environment that is loaded from one needs a `reset`.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata = {"render_modes": RENDER_MODES, "autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    def __init__(self, num_envs: int = 1, *, processes: int | None = None, **arguments: Any) -> None:
-        """Start the processes.
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        threads: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **arguments: Any,
+    ) -> None:
+        """Load and check the scenario. `reset` makes the robots.
 
         Args:
             num_envs: Number of environments.
-            processes: Number of processes; None starts one for each processor that this process may use.
+            threads: Number of threads that step the physics; None takes one for each processor that this process may
+                use. The results do not depend on it.
+            autoreset_mode: When an environment whose episode is over is reset: in the next step, in the same step, or
+                ("Disabled") only by `reset` with the option `reset_mask`.
             **arguments: Those of `SnakeEnv`.
 
         Raises:
-            ConfigError: An argument is wrong. It is raised here rather than in a process.
+            ConfigError: An argument is wrong.
         """
-        if num_envs < 1 or (processes is not None and processes < 1):
+        for name, number in (("num_envs", num_envs), ("threads", threads)):
+            is_count = type(number) is int and number >= 1
+            if not is_count and (name != "threads" or number is not None):
+                raise ConfigError(
+                    f"{name}={number!r:.60}: give a whole number, 1 or more", code="python/invalid-argument"
+                )
+        try:
+            self._autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
             raise ConfigError(
-                f"num_envs={num_envs!r}, processes={processes!r}: give whole numbers, 1 or more",
+                f"autoreset_mode={autoreset_mode!r:.60}: give one of {', '.join(mode.value for mode in AutoresetMode)}",
                 code="python/invalid-argument",
-            )
-        self._arguments = {"num_envs": num_envs, "processes": processes, **arguments}
-        example = SnakeEnv(**arguments)
-        self._example = example
+            ) from None
+        self._arguments = {
+            "num_envs": num_envs,
+            "threads": threads,
+            "autoreset_mode": self._autoreset_mode,
+            **arguments,
+        }
+        setup = SnakeEnv(**arguments).setup
+        self._setup = setup
+        self._episodes = Episodes(setup, num_envs, threads or len(os.sched_getaffinity(0)))
+        if setup.config.backend == "sim" and num_envs > 1 and (cost := describe_loop_cost()):
+            logger.warn(cost)
+        self._random: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]
+        self._has_unfinished_step = False
+
         self.num_envs = num_envs
-        self.render_mode = example.render_mode
-        self.metadata = {**self.metadata, "render_fps": example.metadata["render_fps"]}
-        self.single_observation_space = example.observation_space
-        self.single_action_space = example.action_space
-        self.observation_space = batch_space(example.observation_space, num_envs)
-        self.action_space = batch_space(example.action_space, num_envs)
-        available = len(os.sched_getaffinity(0))
-        count = min(processes or available, num_envs)
-        self._shares = [part.tolist() for part in np.array_split(np.arange(num_envs), count)]
-        self._workers = _Workers([len(share) for share in self._shares], arguments)
-        self._unequal = False  # a request has not reached all environments, or not all have answered it
+        self.render_mode = setup.render_mode
+        self.metadata = {
+            "render_modes": RENDER_MODES,
+            "autoreset_mode": self._autoreset_mode,
+            "render_fps": setup.render_fps,
+        }
+        self.single_observation_space = setup.observation_space
+        self.single_action_space = setup.action_space
+        self.observation_space = batch_space(setup.observation_space, num_envs)
+        self.action_space = batch_space(setup.action_space, num_envs)
 
     def __reduce__(self) -> Any:
         return _rebuild_vector, (type(self), self._arguments, self.spec)
@@ -73,28 +95,29 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset all environments.
+        """Reset all environments, or some of them.
 
         Args:
             seed: Seed of the first environment, the next ones count up; or one seed for each environment.
-            options: `reset_mask` is not supported; nothing else is read.
+            options: `reset_mask`: (num_envs,), the environments that are reset; without it all are. Nothing else is
+                read.
 
         Returns:
-            Observations of all environments, stacked, and their merged info dicts.
+            Observations of all environments, stacked, and the merged info dicts of those that were reset.
 
         Raises:
             gymnasium.error.Error: A seed is not a Python integer of 0 or more, as in Gymnasium.
-            ValueError: The number of seeds is wrong, or `options` has a `reset_mask`.
+            ValueError: The number of seeds or the mask is wrong.
+            ConfigError: The obstacles of a random field find no place.
         """
-        if options and "reset_mask" in options:
-            raise ValueError("options['reset_mask'] is not supported: every environment is reset; leave it out")
         seeds = _spread_seeds(seed, self.num_envs)
-        self._unequal = True
-        results = self._request("reset", seeds)
-        self._unequal = False
-        observations = [observation for observation, _ in results]
-        infos = [info for _, info in results]
-        return self._stack(observations), self._merge(infos)
+        mask = _read_mask(options, self.num_envs)
+        self._has_unfinished_step = True
+        for environment in np.flatnonzero(mask).tolist():
+            self._reset_one(environment, seeds[environment])
+        observations = self._episodes.observe(self._episodes.has_robot)
+        self._has_unfinished_step = not self._episodes.has_robot.all()
+        return self._setup.split(observations), self._make_reset_infos(mask).read()
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Step every environment.
@@ -106,55 +129,133 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             Stacked observations; rewards, terminated and truncated, each (num_envs,); and merged info dicts.
 
         Raises:
-            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example.
+            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example; or
+                an episode is over, and the autoreset mode is "Disabled".
             ValueError: The number of rows is wrong, or a row is no action. No environment has taken a step then.
         """
-        if len(actions) != self.num_envs:
-            raise ValueError(f"actions has {len(actions)} rows, must have {self.num_envs}: one an environment")
-        for action in actions:
-            self._example.check_action(action)  # here, so that all environments take the step or none does
-        if self._unequal:
+        targets = self._setup.commands.targets(actions, self.num_envs)
+        if self._has_unfinished_step:
             raise error.ResetNeeded(
                 "the last step or reset did not finish, so some environments may be a step ahead of the others; "
                 "call reset()"
             )
-        self._unequal = True
-        outcomes = self._request("step", actions)
-        self._unequal = False
-        observations, rewards, terminated, truncated, infos = zip(*outcomes, strict=True)
+        was_over = self._episodes.is_over.copy()
+        if self._autoreset_mode is AutoresetMode.DISABLED and was_over.any():
+            over = np.flatnonzero(was_over).tolist()
+            raise error.ResetNeeded(f"the episodes of environments {over} are over; reset them with `reset_mask`")
+        self._has_unfinished_step = True
+        for environment in np.flatnonzero(was_over).tolist():
+            self._reset_one(environment, None)
+        result = self._episodes.step(targets, ~was_over)
+        infos = self._make_step_infos(result, ~was_over)
+        observations = result.observations
+        if was_over.any():
+            infos.update(self._make_reset_infos(was_over), was_over)
+            observations = self._observe_also(was_over, observations)
+        if self._autoreset_mode is AutoresetMode.SAME_STEP and self._episodes.is_over.any():
+            observations, infos = self._reset_in_same_step(observations, infos)
+        self._has_unfinished_step = False
         return (
-            self._stack(observations),
-            np.array(rewards, dtype=np.float64),
-            np.array(terminated, dtype=np.bool_),
-            np.array(truncated, dtype=np.bool_),
-            self._merge(infos),
+            self._setup.split(observations),
+            np.where(was_over, 0.0, result.rewards),
+            result.terminated,
+            result.truncated,
+            infos.read(),
         )
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return a picture of each environment; None without a `render_mode`."""
+        """Return a picture of each environment; None without a `render_mode`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There are no robots before the first `reset`, nor after `close`.
+        """
         if self.render_mode is None:
             return None
-        return tuple(self._request("render", [None] * self.num_envs))
+        if not self._episodes.has_robot.all():
+            raise error.ResetNeeded("there is no robot yet; call reset()")
+        return tuple(self._episodes.render(environment) for environment in range(self.num_envs))
 
     def close_extras(self, **_named: Any) -> None:
-        """End the processes."""
-        self._workers.close()
+        """Release all robots."""
+        for environment in range(self.num_envs):
+            self._episodes.close(environment)
+        self._has_unfinished_step = True
 
-    def _request(self, method: str, arguments: Sequence[Any]) -> list[Any]:
-        """Call a method of all environments with one argument each; return the results in their order."""
-        shares = [[arguments[i] for i in share] for share in self._shares]
-        return self._workers.request(method, shares)
+    def _reset_one(self, environment: int, seed: int | None) -> None:
+        """Start an episode of one environment."""
+        if seed is not None:
+            self._random[environment] = np_random(seed)[0]
+        self._episodes.reset(environment, seed, self._random[environment])
 
-    def _stack(self, observations: Sequence[Any]) -> Any:
-        """Return the observations of all environments as one batch."""
-        space = self.single_observation_space
-        return concatenate(space, observations, create_empty_array(space, self.num_envs))
+    def _observe_also(self, environments: Mask, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return observations in which those of some environments are new."""
+        return np.where(environments[:, None], self._episodes.observe(environments), observations)
 
-    def _merge(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        merged: dict[str, Any] = {}
-        for number, info in enumerate(infos):
-            merged = self._add_info(merged, info, number)
-        return merged
+    def _reset_in_same_step(
+        self, observations: NDArray[np.float32], infos: InfoArrays
+    ) -> tuple[NDArray[np.float32], InfoArrays]:
+        """Reset the environments whose episodes are over. Their last observations and infos go into the new infos."""
+        over = self._episodes.is_over.copy()
+        final_observations = np.full(self.num_envs, None, dtype=object)
+        for environment in np.flatnonzero(over).tolist():
+            final_observations[environment] = self._setup.split(observations[environment])
+            self._reset_one(environment, None)
+        following = infos.select(~over)
+        following.add("final_obs", final_observations, over)
+        following.add_group("final_info", infos.select(over), over)
+        following.update(self._make_reset_infos(over), over)
+        return self._observe_also(over, observations), following
+
+    # --- infos -----------------------------------------------------------------------------------------------
+
+    def _make_reset_infos(self, environments: Mask) -> InfoArrays:
+        """Return the merged info dicts of environments that have just been reset."""
+        infos = InfoArrays(self.num_envs)
+        infos.add("seed", np.array([config.seed for config in self._episodes.configs]), environments)
+        self._add_robot_infos(infos, environments)
+        return infos
+
+    def _make_step_infos(self, result: StepResult, environments: Mask) -> InfoArrays:
+        """Return the merged info dicts of environments that have taken a step."""
+        infos = InfoArrays(self.num_envs)
+        self._add_robot_infos(infos, environments)
+        infos.add("energy_j", result.energy_j, environments)
+        terms = InfoArrays(self.num_envs)
+        for name, term in result.terms.items():
+            terms.add(name, term, environments)
+        infos.add_group("reward_terms", terms, environments)
+        if result.endings:
+            robots = self._episodes.robots
+            infos.add_objects("ended", result.endings)
+            infos.add_objects(
+                "digest", {environment: robots.read_digest(environment) for environment in result.endings}
+            )
+        return infos
+
+    def _add_robot_infos(self, infos: InfoArrays, environments: Mask) -> None:
+        """Add the values that describe the robots at this tick."""
+        robots = self._episodes.robots
+        rows = np.flatnonzero(environments).tolist()
+        lifecycles = {environment: robots.read_lifecycle(environment) for environment in rows}
+        infos.add("time_s", self._episodes.time_s, environments)
+        infos.add("advance_m", self._episodes.advance_m, environments)
+        infos.add_objects("lifecycle", lifecycles)
+        limits = robots.read_limit_names()
+        is_limited = (limits != None).any(axis=1) & environments  # noqa: E711 - element by element
+        if is_limited.any():
+            group = InfoArrays(self.num_envs)
+            for joint, name in enumerate(self._setup.action_names):
+                of_joint = (limits[:, joint] != None) & environments  # noqa: E711
+                if of_joint.any():
+                    group.add(name, limits[:, joint], of_joint)
+            infos.add_group("limited", group, is_limited)
+        reasons = {
+            environment: robots.read_reason(environment)
+            for environment, lifecycle in lifecycles.items()
+            if lifecycle != "armed"
+        }
+        if reasons:
+            infos.add_objects("reason", reasons)
 
 
 def _rebuild_vector(env_class: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any) -> SnakeVectorEnv:
@@ -162,6 +263,18 @@ def _rebuild_vector(env_class: type[SnakeVectorEnv], arguments: dict[str, Any], 
     env = env_class(**arguments)
     env.spec = spec
     return env
+
+
+def _read_mask(options: dict[str, Any] | None, count: int) -> Mask:
+    """Return which environments a reset concerns. Raises ValueError for what is no mask, as Gymnasium does."""
+    mask = None if options is None else options.get("reset_mask")
+    if mask is None:
+        return np.ones(count, dtype=np.bool_)
+    if not isinstance(mask, np.ndarray) or mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+        raise ValueError(
+            f"options['reset_mask'] is {mask!r:.60}, must be an array of {count} booleans, at least one of them True"
+        )
+    return mask
 
 
 def _spread_seeds(seed: Any, count: int) -> list[int | None]:
@@ -194,153 +307,3 @@ def _check_seed(name: str, seed: Any) -> None:
         np_random(seed)
     except error.Error as refusal:
         raise error.Error(f"{name} is {seed!r:.60}: {refusal}") from None
-
-
-class _Workers:
-    """Processes with environments, and the numbered requests to them.
-
-    The number distinguishes an answer from that to an earlier request, whose caller was interrupted before the answer
-    came, by Ctrl-C for example.
-    """
-
-    def __init__(self, counts: Sequence[int], arguments: dict[str, Any]) -> None:
-        """Start a process for each count of environments."""
-        self._number = 0
-        self._mid_message = False
-        self._ends: list[Connection] = []
-        self._processes: list[multiprocessing.Process] = []
-        with _interrupts_blocked():  # a worker inherits this, until it ignores them
-            for count in counts:
-                ours, theirs = multiprocessing.Pipe()
-                ends_of_parent = [*self._ends, ours]
-                process = multiprocessing.Process(target=_work, args=(theirs, ends_of_parent, count, arguments))
-                process.daemon = True  # it ends with this process
-                process.start()
-                theirs.close()
-                self._ends.append(ours)
-                self._processes.append(process)
-
-    def request(self, method: str, shares: Sequence[Sequence[Any]]) -> list[Any]:
-        """Call a method of all environments, in all processes at the same time.
-
-        Args:
-            method: Name of a method of `_Seat`, or CLOSE.
-            shares: For each process, one argument for each of its environments.
-
-        Returns:
-            The results of all environments, in their order.
-
-        Raises:
-            BackendError: A process has ended, or a message was cut off.
-            Exception: What an environment has raised.
-        """
-        if self._mid_message:
-            raise BackendError(
-                "an interrupt has cut off a message between the processes of these environments; make them anew"
-            )
-        self._number += 1
-        answers: list[Any] = []
-        errors: list[Exception] = []
-        try:
-            for end, share in zip(self._ends, shares, strict=True):
-                self._send(end, (self._number, method, share))
-            for end in self._ends:
-                answer = self._receive(end)
-                if isinstance(answer, Exception):
-                    errors.append(answer)
-                else:
-                    answers += answer
-        except (EOFError, ConnectionError):
-            raise BackendError("a process with environments has ended; see its output above") from None
-        if errors:
-            raise errors[0]
-        return answers
-
-    def close(self) -> None:
-        """End the processes."""
-        for end in self._ends:
-            # A process that was forked later, for other environments, holds a copy of this end: closing is not enough.
-            with contextlib.suppress(OSError):
-                end.send((self._number, CLOSE, []))
-            end.close()
-        for process in self._processes:
-            process.join(CLOSE_TIMEOUT_S)
-            if process.is_alive():
-                process.kill()
-
-    def _send(self, end: Connection, message: Any) -> None:
-        self._mid_message = True
-        end.send(message)
-        self._mid_message = False
-
-    def _receive(self, end: Connection) -> Any:
-        """Return the answer to the newest request, and drop those to interrupted ones."""
-        while True:
-            wait([end])  # interrupts come here, between two messages, as good as always
-            self._mid_message = True
-            number, answer = end.recv()
-            self._mid_message = False
-            if number == self._number:
-                return answer
-
-
-class _Seat:
-    """One environment, which resets itself in the step after the end of an episode."""
-
-    def __init__(self, arguments: dict[str, Any]) -> None:
-        self._env = SnakeEnv(**arguments)
-        self._over = False
-
-    def reset(self, seed: int | None) -> tuple[Any, dict[str, Any]]:
-        self._over = False
-        return self._env.reset(seed=seed)
-
-    def step(self, action: Any) -> Outcome:
-        if self._over:
-            observation, info = self.reset(None)
-            return observation, 0.0, False, False, info
-        observation, reward, terminated, truncated, info = self._env.step(action)
-        self._over = terminated or truncated
-        return observation, reward, terminated, truncated, info
-
-    def render(self, _nothing: None) -> Any:
-        return self._env.render()
-
-
-def _work(end: Connection, ends_of_parent: Sequence[Connection], count: int, arguments: dict[str, Any]) -> None:
-    """Serve requests until the parent's end is closed; the main function of a worker process.
-
-    Args:
-        end: This worker's end of its pipe.
-        ends_of_parent: Ends that a fork has copied; they must close with their owner.
-        count: Number of environments.
-        arguments: Those of `SnakeEnv`.
-    """
-    # Ctrl-C reaches all processes of a terminal. What it ends is decided by the parent alone.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    for other in ends_of_parent:
-        other.close()
-    seats = [_Seat(arguments) for _ in range(count)]
-    while True:
-        try:
-            number, method, share = end.recv()
-            if method == CLOSE:
-                return
-            try:
-                answer: Any = [getattr(seat, method)(argument) for seat, argument in zip(seats, share, strict=True)]
-            except Exception as raised:  # noqa: BLE001 - the parent raises it, whatever it is
-                answer = raised
-            end.send((number, answer))
-        except (EOFError, ConnectionError):
-            return
-
-
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Keep SIGINT waiting for this thread, and for processes that it starts."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

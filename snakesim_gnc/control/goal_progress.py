@@ -1,11 +1,13 @@
 """Measures how far the body has advanced towards its goal, from the pose sensor and the joints alone."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Task
-from snakesim_hal.model.kinematics import find_nodes_w
+from snakesim_hal.model.kinematics import NodeFinder
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose
 
@@ -24,9 +26,7 @@ class GoalProgress:
             robot: description of the robot.
             task: start pose and goal.
         """
-        self._robot = robot
-        masses_kg = np.array([link.mass_kg for link in robot.links])
-        self._mass_ratios = masses_kg / masses_kg.sum()  # (n_links,), of the whole
+        self._locator = BodyLocator(robot)
 
         # The goal.
         self._goal = task.goal
@@ -37,21 +37,43 @@ class GoalProgress:
         self._has_started = False
 
         # Results.
-        self.pose = task.start_position_w, task.start_wxyz  # position and quaternion of the tail end
+        # Position and quaternion of the tail end.
+        self.pose: tuple[Sequence[float], Sequence[float]] = (task.start_position_w, task.start_wxyz)
         self.along_m = 0.0  # advance towards the goal since the start
+        self.bearing_rad = 0.0  # of the goal, from the heading of the body
         self.goal_m: float | None = None  # distance of the goal from the start; None: there is no goal
 
     def update(self, joints: JointState, pose: Pose | None) -> None:
         """Measure the advance with the newest samples. Before the first pose the scenario's start is used."""
         if pose is not None:
             self.pose = pose.position_w, pose.orientation_wxyz
-        self._locate_body(joints)
+        position_w, wxyz = self.pose
+        nodes_w, centers_w = self._locator.locate(np.array([[*position_w, *wxyz]]), np.array([joints.angle_rad]))
+        self.follow(nodes_w[0], centers_w[0])
+
+    def follow(self, nodes_w: Floats, center_w: Floats) -> None:
+        """Measure the advance of a body that has been located.
+
+        Args:
+            nodes_w: (joints + 2, 3), tail end, joints and head end.
+            center_w: (2,), center of mass on the ground.
+        """
+        self._nodes_w = nodes_w
+        self.center_w = center_w
+        self._head_w = nodes_w[-1, :2]
+        forward_x, forward_y = (self._head_w - nodes_w[0, :2]).tolist()
+        self._heading_rad = math.atan2(forward_y, forward_x)
         if not self._has_started:
             self._has_started = True
             self._start()
         # The waypoint that was next until now is the goal of the bearing, also if the head has just reached it.
         self.bearing_rad = self._goal_direction_rad() - self._heading_rad
         self.along_m = self._measure_advance_m()
+
+    @property
+    def height_m(self) -> float:
+        """Mean height of the links' origins."""
+        return float(self._nodes_w[:-1, 2].mean())
 
     @property
     def left_m(self) -> float:
@@ -64,23 +86,6 @@ class GoalProgress:
     def reached(self) -> bool:
         """Whether there is a goal, and it has been reached."""
         return self.goal_m is not None and self.along_m >= self.goal_m
-
-    def _locate_body(self, joints: JointState) -> None:
-        """Compute head, center of mass, height and heading of the body from its pose and joint angles."""
-        position_w, wxyz = self.pose
-        nodes = find_nodes_w(self._robot, position_w, wxyz, joints.angle_rad)
-        tail_w = nodes[0, :2]
-        self._head_w = nodes[-1, :2]
-
-        # The mass of every link is at its middle. The last link reaches from its origin to the head.
-        origins_w = nodes[:-1, :2]
-        middles_w = 0.5 * (origins_w[1:] + origins_w[:-1])
-        last_moment_w = self._mass_ratios[-1] * 0.5 * (origins_w[-1] + self._head_w)
-        self.center_w = self._mass_ratios[:-1] @ middles_w + last_moment_w
-
-        self.height_m = float(nodes[:-1, 2].mean())
-        forward_w = self._head_w - tail_w
-        self._heading_rad = math.atan2(forward_w[1], forward_w[0])
 
     def _start(self) -> None:
         """Fix where the advance begins, its direction, and how far the goal is."""
@@ -120,3 +125,30 @@ class GoalProgress:
 
     def _distance_to_next_m(self) -> float:
         return float(np.hypot(*np.subtract(self._points_m[self._next_point], self._head_w)))
+
+
+class BodyLocator:
+    """Computes where bodies are, for any number of robots with equal links."""
+
+    def __init__(self, robot: Description) -> None:
+        """Read the links of a robot."""
+        self._nodes = NodeFinder(robot)
+        masses_kg = np.array([link.mass_kg for link in robot.links])
+        self._mass_ratios = masses_kg / masses_kg.sum()  # (n_links,), of the whole
+
+    def locate(self, poses: Floats, angles_rad: Floats) -> tuple[Floats, Floats]:
+        """Locate bodies.
+
+        Args:
+            poses: (n, 7), position in m and quaternion wxyz of the tail ends.
+            angles_rad: (n, joints), tail to head.
+
+        Returns:
+            Tail ends, joints and head ends, (n, joints + 2, 3); and centers of mass on the ground, (n, 2); in m.
+        """
+        nodes_w = self._nodes.find(poses[:, :3], poses[:, 3:], angles_rad)
+        # The mass of every link is at its middle. The last link reaches from its origin to the head.
+        origins_w = nodes_w[:, :-1, :2]
+        middles_w = 0.5 * (origins_w[:, 1:] + origins_w[:, :-1])
+        last_moments_w = self._mass_ratios[-1] * 0.5 * (origins_w[:, -1] + nodes_w[:, -1, :2])
+        return nodes_w, self._mass_ratios[:-1] @ middles_w + last_moments_w

@@ -194,10 +194,19 @@ def _read_bearing(_observation: Observation, progress: GoalProgress) -> Sequence
 
 
 def _read_forces(observation: Observation, link_count: int) -> Sequence[float]:
-    """Return the sum of the sizes of all contact forces on every link, (link_count,) in N."""
-    forces_n = [0.0] * link_count
     sample = _newest_sample(observation, keys.CONTACTS)
-    if not isinstance(sample, Contacts):
+    return sum_contact_forces_n(sample if isinstance(sample, Contacts) else None, link_count)
+
+
+def sum_contact_forces_n(sample: Contacts | None, link_count: int) -> list[float]:
+    """Return the sum of the sizes of all contact forces on every link, (link_count,) in N.
+
+    Args:
+        sample: the newest contacts; None: there are none yet.
+        link_count: number of links.
+    """
+    forces_n = [0.0] * link_count
+    if sample is None:
         return forces_n
     for contact in sample.contacts:
         if contact.link < link_count:

@@ -131,6 +131,78 @@ def find_nodes_w(
     return np.vstack([origins, head_end_w])
 
 
+class NodeFinder:
+    """Computes what `find_nodes_w` does for many poses of robots with equal links, with the same bits."""
+
+    def __init__(self, robot: Description) -> None:
+        """Read the lengths of the links and the axes of the joints."""
+        self._lengths_m = np.array([link.length_m for link in robot.links])
+        self._axes = [joint.axis for joint in robot.joints]
+
+    def find(self, positions_w: Floats, wxyz: Floats, angles_rad: Floats) -> Floats:
+        """Return tail ends, joints and head ends in the world, (n, joints + 2, 3).
+
+        Args:
+            positions_w: (n, 3) the tail ends, m.
+            wxyz: (n, 4) orientations of the bases.
+            angles_rad: (n, n_joints) joint angles, tail to head.
+        """
+        lengths_m = self._lengths_m
+        rotations = _rotations_from_quaternions(wxyz)
+        nodes = np.empty((len(positions_w), len(self._axes) + 2, 3))
+        nodes[:, 0] = positions_w
+        if "pitch" not in self._axes:
+            forward = self._find_forward_in_plane(rotations, angles_rad)
+            link_vectors = forward[:, :-1] * lengths_m[:-1, None]
+            nodes[:, 1:-1] = positions_w[:, None] + link_vectors.cumsum(axis=1)
+            nodes[:, -1] = nodes[:, -2] + lengths_m[-1] * forward[:, -1]
+            return nodes
+        for i, axis in enumerate(self._axes):
+            nodes[:, i + 1] = nodes[:, i] + rotations[:, :, 0] * lengths_m[i]
+            rotations = rotations @ _joint_rotations(axis, angles_rad[:, i])
+        nodes[:, -1] = nodes[:, -2] + lengths_m[-1] * rotations[:, :, 0]
+        return nodes
+
+    def _find_forward_in_plane(self, rotations: Floats, angles_rad: Floats) -> Floats:
+        """Return the x axes of all links, (n, n_links, 3), of robots whose joints all yaw."""
+        yaw_rad = np.zeros((len(angles_rad), len(self._axes) + 1))  # of each link, relative to the base
+        angles_rad.cumsum(axis=1, out=yaw_rad[:, 1:])
+        cosine = np.cos(yaw_rad)[:, :, None]
+        sine = np.sin(yaw_rad)[:, :, None]
+        return cosine * rotations[:, None, :, 0] + sine * rotations[:, None, :, 1]
+
+
+# Each element of a rotation matrix, row by row, is twice a sum of two products of components of the quaternion.
+# On the diagonal that is subtracted from 1.
+FIRST_PRODUCT = [10, 6, 7, 6, 5, 11, 7, 11, 5]  # index 4 i + j of the product of components i and j
+SECOND_PRODUCT = [15, 3, 2, 3, 15, 1, 2, 1, 10]
+SECOND_SIGN = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
+DIAGONAL = slice(0, 9, 4)
+
+
+def _rotations_from_quaternions(wxyz: Floats) -> Floats:
+    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), which are normalized first."""
+    unit = wxyz / np.sqrt(np.vecdot(wxyz, wxyz))[:, None]
+    products = (unit[:, :, None] * unit[:, None, :]).reshape(-1, 16)
+    elements = 2 * (products[:, FIRST_PRODUCT] + SECOND_SIGN * products[:, SECOND_PRODUCT])
+    elements[:, DIAGONAL] = 1 - elements[:, DIAGONAL]
+    return elements.reshape(-1, 3, 3)
+
+
+def _joint_rotations(axis: str, angles_rad: Floats) -> Floats:
+    """Return the rotations (n, 3, 3) of one joint at many angles about its own axis."""
+    rotations = np.zeros((len(angles_rad), 3, 3))
+    cosine = np.cos(angles_rad)
+    sine = np.sin(angles_rad)
+    first, second, fixed = (0, 1, 2) if axis == "yaw" else (2, 0, 1)
+    rotations[:, first, first] = cosine
+    rotations[:, first, second] = -sine
+    rotations[:, second, first] = sine
+    rotations[:, second, second] = cosine
+    rotations[:, fixed, fixed] = 1.0
+    return rotations
+
+
 def _yaw_only_frames(
     base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
 ) -> tuple[Floats, Floats]:

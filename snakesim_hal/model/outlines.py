@@ -7,6 +7,7 @@ is a single point, its center, and its rounding is its radius.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Self
 
 import numpy as np
@@ -23,6 +24,7 @@ LINK_FRACTIONS = (np.arange(5) + 0.5) / 5
 # Corners and edge middles of a rectangle, in units of its half length and half width.
 CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
 
+ROUNDING_ERROR_M = 1e-6  # more than that of any distance in a scene
 MIN_SEGMENT_M = 1e-12  # avoids a division by zero for a segment whose ends coincide
 
 Coordinate = Annotated[float, bounded(-1000, 1000, "m")]
@@ -80,7 +82,20 @@ class Outlines:
     def __len__(self) -> int:
         return len(self.center_w)
 
-    @property
+    def select(self, which: NDArray[np.intp]) -> "Outlines":
+        """Return some of the outlines."""
+        return Outlines(self.center_w[which], self.direction[which], self.half_m[which], self.rounding_m[which])
+
+    def append(self, others: "Outlines") -> "Outlines":
+        """Return these outlines and others after them."""
+        return Outlines(
+            np.concatenate((self.center_w, others.center_w)),
+            np.concatenate((self.direction, others.direction)),
+            np.concatenate((self.half_m, others.half_m)),
+            np.concatenate((self.rounding_m, others.rounding_m)),
+        )
+
+    @cached_property
     def reach_m(self) -> Floats:
         """Return the distance from each center to the farthest point of its outline, (m,)."""
         return np.hypot(*self.half_m.T) + self.rounding_m
@@ -160,6 +175,20 @@ def gaps_m(single: Outlines, others: Outlines) -> Floats:
     from_single = others.distance_m(single.rims_w[0]).min(axis=0) - single.rounding_m[0]
     from_others = single.distance_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
     return np.minimum(from_single, from_others)
+
+
+def has_gap_below(single: Outlines, others: Outlines, limit_m: float) -> bool:
+    """Return whether the gap between a single outline and any of the others is below a limit, as `gaps_m` computes it.
+
+    Most of the others are so far away that the circles around both show it, which is faster.
+    """
+    offset_w = others.center_w - single.center_w
+    distances_m = np.hypot(offset_w[:, 0], offset_w[:, 1])
+    least_gaps_m = distances_m - others.reach_m - single.reach_m
+    near = np.flatnonzero(least_gaps_m < limit_m + ROUNDING_ERROR_M)
+    if not len(near):
+        return False
+    return bool(gaps_m(single, others.select(near)).min() < limit_m)
 
 
 def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:

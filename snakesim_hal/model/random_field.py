@@ -9,7 +9,7 @@ from msgspec import Meta
 from numpy.random import Generator
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, gaps_m
+from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, has_gap_below
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, make_block, make_peg, material_fields
 from snakesim_hal.wire.messages import Obstacle
@@ -112,12 +112,12 @@ def place_random_obstacles(
             return placed
         candidate = _random_obstacle(field, random, f"random_{index}_{len(placed)}")
         outline = Outlines.from_obstacles([candidate])
-        if len(others) and gaps_m(outline, others).min() < field.clearance_m:
+        if len(others) and has_gap_below(outline, others, field.clearance_m):
             continue
-        if any(gaps_m(outline, area).min() < 0.0 for area in free_areas):
+        if any(has_gap_below(outline, area, 0.0) for area in free_areas):
             continue
         placed.append(candidate)
-        others = Outlines.from_obstacles([*standing, *placed])
+        others = others.append(outline)
     if len(placed) < field.target_count:
         raise ConfigError(
             f"{where}: only {len(placed)} of {field.target_count} pegs fit; lower `density_per_m2` = "

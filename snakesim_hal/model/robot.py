@@ -166,7 +166,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     @property
     def joint_table(self) -> list[Joint]:
         """Return every joint as built, tail to head."""
-        return make_joints(self.axes, self.joints, self.limits, self.motor, self.drive, self.heat, self.supply)
+        return [*_make_joint_table(self)]
 
     @property
     def link_lengths_m(self) -> list[float]:
@@ -193,6 +193,20 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     def _module_parts(self) -> list[float]:
         """Return how many modules make up each link: half a module the tail and the head, and one module the others."""
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
+
+
+_newest_joint_table: tuple[RobotFile, list[Joint]] | None = None
+
+
+def _make_joint_table(robot: RobotFile) -> list[Joint]:
+    """Return every joint of a robot. That of the newest robot is kept: a simulator asks for it many times."""
+    global _newest_joint_table
+    newest = _newest_joint_table
+    if newest is not None and newest[0] is robot:
+        return newest[1]
+    joints = make_joints(robot.axes, robot.joints, robot.limits, robot.motor, robot.drive, robot.heat, robot.supply)
+    _newest_joint_table = (robot, joints)
+    return joints
 
 
 def describe_joints(robot: RobotFile) -> list[JointDescription]:

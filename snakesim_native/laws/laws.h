@@ -83,6 +83,24 @@ void rub_links(const mjModel* m, mjData* d, const Chain* chain, const RoughConta
 int update_contacts(const mjModel* m, mjData* d, const Chain* chain, RoughContact* contacts, int count,
                     mjtNum min_friction);
 
+//---------------------------------- Touches ---------------------------------------------------------------------------
+
+enum {
+  OBSTACLE_GROUP = 2,    // MuJoCo's geom group of obstacles
+  TOUCHES_PER_LINK = 8,  // on average; those beyond that number are left out
+};
+
+// A contact of a link with an obstacle in the last step.
+typedef struct {
+  mjtNum link;      // 0 at the tail
+  mjtNum force[3];  // on the link
+} Touch;
+
+// Write the contacts of links with obstacles, in MuJoCo's order. Returns their number.
+//   contacts   those with friction, after `update_contacts`
+int find_touches(const mjModel* m, const mjData* d, const Chain* chain, const RoughContact* contacts, int count,
+                 Touch* touches, int capacity);
+
 //---------------------------------- Obstacles that yield --------------------------------------------------------------
 
 enum { YIELDING_DOFS = 3 };  // of one obstacle: along x, along y, and a rotation

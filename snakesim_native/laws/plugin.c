@@ -1,7 +1,8 @@
-// The laws as two plugins of MuJoCo's engine, which are registered when this library is loaded:
+// The laws as plugins of MuJoCo's engine, which are registered when this library is loaded:
 //
 //   snakesim.dry_friction   flat ground and contact friction; belongs to the tail link's body
 //   snakesim.yielding       obstacles that yield; one instance belongs to the bodies of all of them
+//   snakesim.touches        no law: it writes the forces between links and obstacles into the state, for batches
 //
 // MuJoCo calls `compute` when it computes forces. That changes nothing that a later step depends on, so `mj_forward`
 // may be called at any time. MuJoCo calls `advance` at the end of `mj_step`, which updates what is remembered. By then
@@ -100,6 +101,51 @@ static void advance_yielding(const mjModel* m, mjData* d, int instance) {
   update_anchors(find_anchors(m, d, instance), m->plugin_statenum[instance] / ANCHOR_NUMBERS);
 }
 
+//---------------------------------- Touches ---------------------------------------------------------------------------
+
+enum { TOUCH_NUMBERS = sizeof(Touch) / sizeof(mjtNum) };
+
+// Return the instance of dry friction, or -1.
+static int find_friction_instance(const mjModel* m) {
+  for (int instance = 0; instance < m->nplugin; instance++) {
+    if (mjp_getPluginAtSlot(m->plugin[instance])->advance == advance_friction) {
+      return instance;
+    }
+  }
+  return -1;
+}
+
+static int count_touch_capacity(const mjModel* m) {
+  int friction = find_friction_instance(m);
+  return friction < 0 ? 0 : TOUCHES_PER_LINK * find_chain(m, friction).link_count;
+}
+
+// The number of touches comes first, then the touches.
+static int count_touch_numbers(const mjModel* m, int instance) {
+  (void)instance;
+  return 1 + TOUCH_NUMBERS * count_touch_capacity(m);
+}
+
+static void compute_nothing(const mjModel* m, mjData* d, int instance, int capability) {
+  (void)m;
+  (void)d;
+  (void)instance;
+  (void)capability;
+}
+
+// Is called after dry friction has advanced, whose instance has a lower number.
+static void advance_touches(const mjModel* m, mjData* d, int instance) {
+  int friction = find_friction_instance(m);
+  if (friction < 0) {
+    return;
+  }
+  Chain chain = find_chain(m, friction);
+  Parts parts = find_parts(m, d, friction, &chain);
+  mjtNum* state = d->plugin_state + m->plugin_stateadr[instance];
+  int capacity = TOUCHES_PER_LINK * chain.link_count;
+  state[0] = find_touches(m, d, &chain, parts.contacts, (int)parts.memory->contact_count, (Touch*)(state + 1), capacity);
+}
+
 //---------------------------------- Registration ----------------------------------------------------------------------
 
 static int init(const mjModel* m, mjData* d, int instance) {
@@ -136,6 +182,12 @@ mjPLUGIN_LIB_INIT(snakesim_laws) {
   yielding.compute = compute_yielding;
   yielding.advance = advance_yielding;
   mjp_registerPlugin(&yielding);
+
+  mjpPlugin touches = describe_plugin("snakesim.touches");
+  touches.nstate = count_touch_numbers;
+  touches.compute = compute_nothing;
+  touches.advance = advance_touches;
+  mjp_registerPlugin(&touches);
 }
 
 // Change the memory of all laws as `mj_step` does at its end, for a program that calls `mj_forward` alone.
@@ -144,7 +196,8 @@ void snakesim_advance(const mjModel* m, mjData* d);
 void snakesim_advance(const mjModel* m, mjData* d) {
   for (int instance = 0; instance < m->nplugin; instance++) {
     const mjpPlugin* plugin = mjp_getPluginAtSlot(m->plugin[instance]);
-    if (plugin->advance == advance_friction || plugin->advance == advance_yielding) {
+    if (plugin->advance == advance_friction || plugin->advance == advance_yielding ||
+        plugin->advance == advance_touches) {
       plugin->advance(m, d, instance);
     }
   }

@@ -19,8 +19,10 @@ LawsVersion = Literal["c", "python"]
 
 FRICTION_PLUGIN = "snakesim.dry_friction"
 YIELDING_PLUGIN = "snakesim.yielding"
+TOUCHES_PLUGIN = "snakesim.touches"
 FRICTION_INSTANCE = "dry_friction"  # names in MuJoCo's model
 YIELDING_INSTANCE = "yielding"
+TOUCHES_INSTANCE = "touches"
 USER_NUMBERS_OF_GEOM = 1
 
 
@@ -43,7 +45,9 @@ def load_library() -> ctypes.CDLL:
     return loaded.handle
 
 
-def add_laws(spec: mujoco.MjSpec, laws: LawsVersion, links: int, yielding_bodies: list[str]) -> None:
+def add_laws(
+    spec: mujoco.MjSpec, laws: LawsVersion, links: int, yielding_bodies: list[str], *, keeps_touches: bool
+) -> None:
     """Add the laws' parameters and memory to a model that is otherwise complete.
 
     Args:
@@ -51,6 +55,7 @@ def add_laws(spec: mujoco.MjSpec, laws: LawsVersion, links: int, yielding_bodies
         laws: which version computes the forces.
         links: number of links.
         yielding_bodies: names of the bodies of obstacles that yield.
+        keeps_touches: whether the C version writes the forces between links and obstacles into the state.
     """
     spec.nuser_geom = USER_NUMBERS_OF_GEOM
     spec.nuser_body = SPRING_NUMBERS
@@ -62,10 +67,12 @@ def add_laws(spec: mujoco.MjSpec, laws: LawsVersion, links: int, yielding_bodies
             _add_plugin(spec, FRICTION_PLUGIN, FRICTION_INSTANCE, ["link_0"])
             if yielding_bodies:
                 _add_plugin(spec, YIELDING_PLUGIN, YIELDING_INSTANCE, yielding_bodies)
+            if keeps_touches:
+                _add_plugin(spec, TOUCHES_PLUGIN, TOUCHES_INSTANCE, [])
 
 
 def _add_plugin(spec: mujoco.MjSpec, plugin: str, instance: str, bodies: list[str]) -> None:
-    """Add an instance of a plugin, which belongs to these bodies."""
+    """Add an instance of a plugin, which belongs to these bodies. It advances after those that are added before."""
     spec.activate_plugin(plugin)
     spec.add_plugin(name=instance, plugin_name=plugin, active=True)
     for body in bodies:

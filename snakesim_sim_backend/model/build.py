@@ -75,7 +75,12 @@ def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
 
 
 def build(
-    config: RunConfig, settings: SimSettings, *, motors: bool = True, laws: LawsVersion | None = None
+    config: RunConfig,
+    settings: SimSettings,
+    *,
+    motors: bool = True,
+    laws: LawsVersion | None = None,
+    keeps_touches: bool = False,
 ) -> SimModel:
     """Compile the model of a run.
 
@@ -85,11 +90,14 @@ def build(
         motors: False leaves the motors out. The joints are then hinges with the inertia and the friction of the motors'
             rotors, for torques that are applied from outside.
         laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
+        keeps_touches: whether the C version writes the forces between links and obstacles into MuJoCo's state, for
+            programs that see only the state.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
     """
-    blueprint = make_blueprint(config, settings, motors=motors, laws=laws or choose_laws())
+    laws = laws or choose_laws()
+    blueprint = make_blueprint(config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches)
     model = _compile(blueprint.spec, config.robot.name)
     links = config.robot.chain.modules + 1
     first_link_body = model.body("link_0").id
@@ -109,7 +117,9 @@ def build(
     )
 
 
-def make_blueprint(config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion) -> Blueprint:
+def make_blueprint(
+    config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion, keeps_touches: bool = False
+) -> Blueprint:
     """Return the model of a run before it is compiled.
 
     Raises:
@@ -141,7 +151,7 @@ def make_blueprint(config: RunConfig, settings: SimSettings, *, motors: bool, la
     friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
     for geom in spec.geoms:
         geom.friction[0] = friction_of.get(geom.name, 0.0)
-    add_laws(spec, laws, links, [geom_name(item) for item in yielding])
+    add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
     return Blueprint(spec, steps_per_tick, yielding, laws)
 
 

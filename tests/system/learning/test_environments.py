@@ -269,8 +269,8 @@ def ctrl_c_raises() -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("ctrl_c_raises")
-def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
-    envs = SnakeVectorEnv(num_envs=2, processes=2, scenario="triplet", frame_skip=600, duration=18)
+def test_an_interrupted_step_of_many_needs_a_reset() -> None:
+    envs = SnakeVectorEnv(num_envs=2, scenario="triplet", frame_skip=600, duration=18)
     still = np.zeros((2, 13))
     envs.reset(seed=1)
     threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
@@ -286,13 +286,14 @@ def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
 
 
 def test_seeds_are_read_as_by_gymnasium() -> None:
-    envs = SnakeVectorEnv(num_envs=2, processes=1, scenario="triplet", duration=0.1)
+    envs = SnakeVectorEnv(num_envs=2, scenario="triplet", duration=0.1)
     wrong: list[Any] = [np.int64(0), -1, [], [1, -2], [1, np.int64(2)], "12", 1.0]
     for seed in wrong:
         with raises_error((ValueError, gymnasium.error.Error)):
             envs.reset(seed=seed)
-    with raises_error(ValueError):
-        envs.reset(options={"reset_mask": np.array([True, False])})
+    for mask in (np.array([True]), np.array([False, False]), [True, False], np.array([1, 0])):
+        with raises_error(ValueError):
+            envs.reset(options={"reset_mask": mask})
     envs.close()
 
 
@@ -306,7 +307,7 @@ def test_a_pickle_is_a_new_environment_of_the_same_arguments() -> None:
     with pytest.raises(gymnasium.error.ResetNeeded):
         again.unwrapped.step(np.zeros(13))
     assert episode(again.unwrapped)["digest"] == episode(env.unwrapped)["digest"]
-    many = SnakeVectorEnv(num_envs=2, processes=1, scenario="triplet", duration=0.1)
+    many = SnakeVectorEnv(num_envs=2, scenario="triplet", duration=0.1)
     loaded = pickle.loads(pickle.dumps(many))
     seen, _ = loaded.reset(seed=1)
     assert np.array_equal(seen, many.reset(seed=1)[0])

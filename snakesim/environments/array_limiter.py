@@ -1,0 +1,199 @@
+"""The limiter for many simulated robots at once: `snakesim_hal.safety.limiter.limit_command` on arrays.
+
+Real robots use the limiter of the HAL. This one gives the same bits for commands in which all joints of all robots have
+one mode, and had it in the period before; a test compares the two over random commands. Every array has the shape
+(robots, joints), and every robot may have limits of its own.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.safety.limiter import MIN_SPEED_LIMIT_RAD_S, REACTION_PERIODS
+from snakesim_hal.wire.messages import Description, Mode
+
+Masks = NDArray[np.bool_]  # (robots, joints)
+# Names of limits, as `name_active_limits` gives them. An array of limits holds indices of this list.
+LIMIT_NAMES = ("", "angle", "angle_rate", "speed", "acceleration", "torque", "torque_rate", "thermal", "isolated")
+NO_LIMIT, ANGLE, ANGLE_RATE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, THERMAL, _ = range(len(LIMIT_NAMES))
+
+
+@dataclass(frozen=True)
+class LimitArrays:
+    """The limits of robots as their descriptions state them, (robots, joints)."""
+
+    period_s: float
+    angle_min_rad: Floats
+    angle_max_rad: Floats
+    max_step_rad: Floats  # maximum distance of an angle target from the measured angle
+    angle_rate_rad: Floats  # maximum change of an angle target in a period
+    speed_rad_s: Floats
+    acceleration_rad_s2: Floats
+    torque_nm: Floats
+    torque_rate_nm_s: Floats
+    velocity_gain: Floats  # N·m·s/rad, of the torque bounds near the ends
+
+    @staticmethod
+    def allocate(robots: int, joints: int, period_s: float) -> "LimitArrays":
+        """Return limits that `set_robot` fills in."""
+        return LimitArrays(period_s, *(np.ones((robots, joints)) for _ in range(9)))
+
+    def set_robot(self, robot: int, description: Description) -> None:
+        """Fill in the limits of one robot."""
+        for i, joint in enumerate(description.joints):
+            max_speed = max(joint.speed_limit_rad_s, MIN_SPEED_LIMIT_RAD_S)
+            self.angle_min_rad[robot, i] = joint.angle_min_rad
+            self.angle_max_rad[robot, i] = joint.angle_max_rad
+            self.max_step_rad[robot, i] = description.max_step_rad
+            self.angle_rate_rad[robot, i] = joint.speed_limit_rad_s * self.period_s
+            self.speed_rad_s[robot, i] = joint.speed_limit_rad_s
+            self.acceleration_rad_s2[robot, i] = joint.acceleration_limit_rad_s2
+            self.torque_nm[robot, i] = joint.torque_limit_nm
+            self.torque_rate_nm_s[robot, i] = joint.torque_rate_limit_nm_s
+            self.velocity_gain[robot, i] = max(joint.velocity_gain_nm_s_per_rad, joint.torque_limit_nm / max_speed)
+
+
+class MeasuredArrays(NamedTuple):
+    """The measured states of the joints, (robots, joints) each."""
+
+    angle_rad: Floats
+    velocity_rad_s: Floats
+
+
+def limit_torque_limits(last_limit_nm: Floats, torque_fraction: Floats, limits: LimitArrays) -> Floats:
+    """Return the torque limits of commands that request full torque.
+
+    Args:
+        last_limit_nm: the torque limits of the period before.
+        torque_fraction: from 0 to 1; what derating leaves of each torque limit.
+        limits: the limits of the robots.
+    """
+    derated_nm = limits.torque_nm * torque_fraction
+    risen_nm = last_limit_nm + limits.torque_rate_nm_s * limits.period_s
+    highest_nm = np.where(risen_nm < derated_nm, risen_nm, derated_nm)
+    return _clamp(limits.torque_nm, np.zeros_like(derated_nm), highest_nm)
+
+
+def limit_targets(
+    mode: Mode,
+    requested: Floats,
+    last_target: Floats,
+    torque_limit_nm: Floats,
+    measured: MeasuredArrays,
+    limits: LimitArrays,
+) -> Floats:
+    """Return the targets that are nearest to the requested ones within all limits.
+
+    Args:
+        mode: the mode of all joints; not PASSIVE.
+        requested: the targets of the commands.
+        last_target: the limited targets of the period before, in the same mode.
+        torque_limit_nm: the torque limits of this period.
+        measured: the last plausible states of the joints.
+        limits: the limits of the robots.
+    """
+    match mode:
+        case Mode.POSITION:
+            low = _clamp(measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
+            high = _clamp(measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
+            step = limits.angle_rate_rad
+        case Mode.VELOCITY:
+            low, high = _velocity_bounds(measured, limits)
+            low = _clamp(low, -limits.speed_rad_s, limits.speed_rad_s)
+            high = _clamp(high, -limits.speed_rad_s, limits.speed_rad_s)
+            step = limits.acceleration_rad_s2 * limits.period_s
+        case Mode.TORQUE:
+            low, high = _torque_bounds(measured, limits)
+            low = _clamp(low, -torque_limit_nm, torque_limit_nm)
+            high = _clamp(high, -torque_limit_nm, torque_limit_nm)
+            step = limits.torque_rate_nm_s * limits.period_s
+        case Mode.PASSIVE:
+            raise ValueError("passive joints have no targets")
+    return _clamp(_clamp(requested, last_target - step, last_target + step), low, high)
+
+
+def find_active_limits(
+    mode: Mode,
+    requested: Floats,
+    target: Floats,
+    torque_limit_nm: Floats,
+    torque_fraction: Floats,
+    measured: MeasuredArrays,
+    limits: LimitArrays,
+) -> NDArray[np.int64]:
+    """Return the index in LIMIT_NAMES of the tightest limit that each requested target exceeds.
+
+    Args:
+        mode: the mode of all joints.
+        requested: the targets before the limiter.
+        target: the targets after it.
+        torque_limit_nm: the torque limits of this period.
+        torque_fraction: what derating leaves of each torque limit.
+        measured: the states that the limiter used.
+        limits: the limits of the robots.
+    """
+    if mode is Mode.POSITION:
+        within_ends = (limits.angle_min_rad <= requested) & (requested <= limits.angle_max_rad)
+        names = np.where(within_ends, ANGLE_RATE, ANGLE)
+    else:
+        if mode is Mode.VELOCITY:
+            low, high = _velocity_bounds(measured, limits)
+            magnitude_limit, magnitude, rate = limits.speed_rad_s, SPEED, ACCELERATION
+        else:
+            low, high = _torque_bounds(measured, limits)
+            magnitude_limit, magnitude, rate = torque_limit_nm, TORQUE, TORQUE_RATE
+        above_end_bound = (requested > high) & (high < magnitude_limit)
+        below_end_bound = (requested < low) & (low > -magnitude_limit)
+        names = np.where(np.abs(requested) > magnitude_limit, magnitude, rate)
+        names = np.where(above_end_bound | below_end_bound, ANGLE, names)
+    names = np.where(target != requested, names, NO_LIMIT)
+    derated = limits.torque_nm > limits.torque_nm * torque_fraction
+    return np.where(derated & ((names == NO_LIMIT) | (names == TORQUE)), THERMAL, names)
+
+
+def _velocity_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+    """Return the minimum and maximum velocities from which joints can stop before their ends."""
+    to_lower_end, to_upper_end = _stoppable_speeds(measured, limits)
+    return -to_lower_end, to_upper_end
+
+
+def _torque_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+    """Return the minimum and maximum torques that keep joints between their ends."""
+    to_lower_end, to_upper_end = _stoppable_speeds(measured, limits)
+    gain = limits.velocity_gain
+    low = -gain * (to_lower_end + measured.velocity_rad_s)
+    high = gain * (to_upper_end - measured.velocity_rad_s)
+    low = np.where((to_lower_end == 0.0) & (low < 0.0), 0.0, low)
+    high = np.where((to_upper_end == 0.0) & (high > 0.0), 0.0, high)
+    at_upper_end = to_upper_end == 0.0
+    return (
+        np.where(at_upper_end & (high < low), high, low),
+        np.where(at_upper_end | (high > low), high, low),
+    )
+
+
+def _stoppable_speeds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+    """Return the maximum speeds from which joints can stop before their lower and upper ends."""
+    to_lower_end = _stoppable_speed(measured.angle_rad - limits.angle_min_rad, limits)
+    to_upper_end = _stoppable_speed(limits.angle_max_rad - measured.angle_rad, limits)
+    return to_lower_end, to_upper_end
+
+
+def _stoppable_speed(distance_rad: Floats, limits: LimitArrays) -> Floats:
+    """Return the maximum speeds from which joints can stop within distances, as `limiter.stoppable_speed` does."""
+    reaction_s = REACTION_PERIODS * limits.period_s
+    acceleration = limits.acceleration_rad_s2
+    ahead_rad = np.maximum(distance_rad, 0.0)
+    speed = acceleration * (np.sqrt(reaction_s**2 + 2.0 * ahead_rad / acceleration) - reaction_s)
+    return np.where(distance_rad <= 0.0, 0.0, speed)
+
+
+def _clamp(value: Floats, low: Floats, high: Floats) -> Floats:
+    """Return the values within bounds. Unlike `np.clip` it keeps the sign of a zero that equals its bound."""
+    clamped: Any = value.copy()
+    np.copyto(clamped, high, where=value > high)
+    np.copyto(clamped, low, where=value < low)
+    return clamped

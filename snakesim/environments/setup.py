@@ -1,0 +1,171 @@
+"""The arguments of environments, checked, and what follows from them: spaces, and the configuration of each episode."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from gymnasium import spaces
+
+from snakesim.configuration import list_overrides, load_checked
+from snakesim.environments.actions import Commands, corrected_controller
+from snakesim.environments.rewards import complete_weights
+from snakesim_gnc.control.observations import Observer, select_parts
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.randomization import make_randomizations
+from snakesim_hal.model.scenario import Override, RunConfig, describe_run_robot
+from snakesim_hal.wire.messages import Description
+
+RENDER_MODES = ["rgb_array"]
+MAX_SEED = 2**31
+
+
+class EnvironmentSetup:
+    """What all environments with the same arguments share.
+
+    Attributes:
+        config: the configuration of the scenario, without what a seed changes.
+        new_fields: number of random fields that each reset draws again.
+    """
+
+    def __init__(
+        self,
+        *,
+        scenario: str | os.PathLike[str] | None,
+        action: str,
+        observe: Sequence[str] | None,
+        flat: bool,
+        reward: Mapping[str, float] | None,
+        frame_skip: int,
+        duration: float | None,
+        set: Mapping[str, Any] | None,
+        randomize: Mapping[str, Sequence[float]] | None,
+        new_field: bool,
+        safe: bool,
+        residual_rad: float,
+        render_mode: str | None,
+        width: int,
+        height: int,
+    ) -> None:
+        """Load and check the scenario. The arguments are those of `SnakeEnv`.
+
+        Raises:
+            ConfigError: An argument is wrong. The message is that of the command `snakesim run`.
+        """
+        if scenario is None:
+            raise ConfigError(
+                "SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file",
+                code="python/invalid-argument",
+            )
+        if type(frame_skip) is not int or frame_skip < 1:
+            raise ConfigError(
+                f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more",
+                code="python/invalid-argument",
+            )
+        if render_mode not in (None, *RENDER_MODES):
+            raise ConfigError(
+                f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out", code="python/invalid-argument"
+            )
+        if not residual_rad > 0:
+            raise ConfigError(
+                f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad", code="python/invalid-argument"
+            )
+        controller = corrected_controller(action)
+        overrides = list_overrides(set, duration_s=duration)
+        if controller is not None:
+            if not safe:
+                raise ConfigError(
+                    f"action={action!r}: a controller commands through the limiter; leave safe=False out",
+                    code="python/invalid-argument",
+                )
+            overrides.insert(0, Override("controller", controller, f"action={action}"))
+
+        # The scenario, and what each seed changes in it.
+        self._scenario = os.fspath(scenario)
+        self._overrides = overrides
+        self._randomizations = make_randomizations(randomize)
+        self.config: RunConfig = self._load_config(0)
+        self.new_fields = len(self.config.scene.random_field) if new_field else 0
+
+        # Steps, rewards and pictures.
+        self.is_assisted = controller is not None
+        self.is_safe = safe
+        self.frame_skip = frame_skip
+        self.weights = complete_weights(reward)
+        self.render_mode = render_mode
+        self.render_fps = self.config.rate_hz / frame_skip
+        self.picture_size = (width, height)
+
+        self.description = describe_run_robot(self.config)
+        self.commands = Commands.of(self.description, action, residual_rad)
+        self._declare_spaces(observe, flat)
+
+    def _declare_spaces(self, observe: Sequence[str] | None, flat: bool) -> None:
+        """Set the action space and the observation space, and a name and a unit for every number in them."""
+        self.action_space = _make_box(self.commands.low, self.commands.high)
+        self.action_names = list(self.commands.names)
+        self.action_units = [self.commands.unit] * len(self.action_names)
+
+        self.parts = select_parts(self.description, observe)
+        self.observation_names: list[str] = []
+        self.observation_units: list[str] = []
+        slices: dict[str, slice] = {}
+        boxes: dict[str, spaces.Space[Any]] = {}
+        for part_name, part in self.parts.items():
+            start = len(self.observation_names)
+            self.observation_names += [f"{part_name}.{name}" for name in part.names]
+            self.observation_units += [part.unit] * len(part.names)
+            slices[part_name] = slice(start, len(self.observation_names))
+            boxes[part_name] = _make_box(part.low, part.high)
+        self.observation_space: spaces.Space[Any]
+        self.slices: dict[str, slice] | None = None  # of each part in an observation; None: it is one vector
+        if flat:
+            observer = Observer(self.description, self.parts)
+            self.observation_space = spaces.Box(observer.low, observer.high)
+        else:
+            self.observation_space = spaces.Dict(boxes)
+            self.slices = slices
+
+    def make_config(self, seed: int) -> RunConfig:
+        """Return the configuration of the episode of a seed. Raises ConfigError."""
+        if not self._randomizations:  # faster than to load the scenario again
+            return self._replace_seeds(seed)
+        field_keys = [f"scene.random_field.{i}.seed" for i in range(self.new_fields)]
+        return self._load_config(seed, ["seed", *field_keys])
+
+    def describe(self, config: RunConfig) -> Description:
+        """Return the robot of an episode. Nothing reads the hash of its configuration, which may be of another seed."""
+        has_equal_times = (config.period_ns, config.lease_ns) == (self.config.period_ns, self.config.lease_ns)
+        if config.robot is self.config.robot and has_equal_times:
+            return self.description
+        return describe_run_robot(config)
+
+    def split(self, observations: Any) -> Any:
+        """Return observations as the observation space has them: unchanged, or a dict of their parts."""
+        if self.slices is None:
+            return observations
+        return {name: observations[..., part] for name, part in self.slices.items()}
+
+    def _replace_seeds(self, seed: int) -> RunConfig:
+        """Return the configuration of the scenario with another seed, also of its random fields."""
+        if not self.new_fields:
+            return msgspec.structs.replace(self.config, seed=seed)
+        fields = [msgspec.structs.replace(field, seed=seed) for field in self.config.scene.random_field]
+        scene = msgspec.structs.replace(self.config.scene, random_field=fields)
+        return msgspec.structs.replace(self.config, seed=seed, scene=scene)
+
+    def _load_config(self, seed: int, seed_keys: Sequence[str] = ()) -> RunConfig:
+        """Load the scenario with the numbers that are drawn for a seed, and with the seed itself at `seed_keys`.
+
+        Raises ConfigError.
+        """
+        overrides = [*self._overrides]
+        overrides += [Override(key, seed, "seed") for key in seed_keys]
+        for randomization in self._randomizations:
+            overrides += randomization.overrides_for_scene(seed, "randomize")
+        return load_checked(self._scenario, overrides, processes=False)
+
+
+def _make_box(low: Sequence[float], high: Sequence[float]) -> spaces.Box:
+    return spaces.Box(np.array(low, dtype=np.float32), np.array(high, dtype=np.float32))

@@ -1,0 +1,197 @@
+"""Simulations on MuJoCo's `Batch`: all states in one array, stepped by threads in C, with the C version of the laws.
+
+A batch is bit-identical to a loop, with any number of threads. All models of a batch must give MuJoCo's data the same
+sizes, as scenes with equally many obstacles do.
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import BackendError
+from snakesim_sim_backend.actuators import INPUTS
+from snakesim_sim_backend.batch.placed import TOUCH_NUMBERS, PlacedRobot, find_touches, read_rotations
+from snakesim_sim_backend.batch.simulations import (
+    NO_MOTORS,
+    NO_TOUCHES,
+    Mask,
+    MotorArrays,
+    Simulations,
+    TouchArrays,
+)
+from snakesim_sim_backend.laws.native_laws import CONTACT_COUNT, CONTACT_NUMBERS, FOOT_NUMBERS, MEMORY_NUMBERS
+from snakesim_sim_backend.laws.version import FRICTION_INSTANCE
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.state.divergence import (
+    COMPLETE_STATE,
+    MAX_ACCELERATION,
+    MAX_POSITION,
+    MAX_SPEED,
+    DivergenceWatch,
+)
+
+PLUGIN = mujoco.mjtObj.mjOBJ_PLUGIN
+
+
+class BatchedSimulations(Simulations):
+    """The states of all robots are rows of a batch."""
+
+    def __init__(self, robots: int, joints: int, threads: int) -> None:
+        self._count = robots
+        self._joints = joints
+        self._threads = threads
+        self._placed: list[PlacedRobot | None] = [None] * robots
+        self._batch: Batch | None = None
+        self.motors = [NO_MOTORS] * robots
+
+    def load(self, robot: int, placed: PlacedRobot) -> bool:
+        if self._batch is None:
+            self._make_batch(placed)
+        elif not self._fits(robot, placed):
+            return False
+        batch = self._require_batch()
+        data = placed.data
+        self._placed[robot] = placed
+        self.motors[robot] = placed.motors
+        mujoco.mj_getState(placed.sim.model, data, batch.state[robot], COMPLETE_STATE)
+        self._good_states[robot] = batch.state[robot]
+        batch.warning[robot] = 0
+        self.torque_nm[robot] = data.actuator_force[: self._joints]
+        self._start_rotations[robot] = read_rotations(placed)
+        self._is_at_start[robot] = True
+        placed.motors.use_state(MotorArrays(self, robot))
+        return True
+
+    def _make_batch(self, placed: PlacedRobot) -> None:
+        """Make the batch, with the simulation of this robot in every row."""
+        sim = placed.sim
+        model = sim.model
+        joints = self._joints
+        self._steps = sim.steps_per_tick
+        self._links = slice(sim.first_link_body, sim.first_link_body + len(sim.link_geoms))
+        self._models = [model] * self._count
+        batch = Batch(model, self._count, self._threads)
+        batch.set_models(self._models)
+        self._batch = batch
+
+        # Views of the states, and outputs of a step.
+        self._qpos = batch.bind("qpos")
+        self._qvel = batch.bind("qvel")
+        self.base_pose = self._qpos[:, :FREE_QPOS]
+        self.base_velocity = self._qvel[:, :FREE_DOFS]
+        self.angle_rad = self._qpos[:, FREE_QPOS : FREE_QPOS + joints]
+        self.velocity_rad_s = self._qvel[:, FREE_DOFS : FREE_DOFS + joints]
+        self.motor_state = batch.bind("act")
+        self.motor_inputs = batch.bind("ctrl")[:, : INPUTS * joints]
+        self._qacc = batch.bind("qacc")
+        self._all_torques_nm = batch.bind("actuator_force")
+        self._rotations = batch.bind("xmat")
+        self.torque_nm = np.zeros((self._count, joints))
+        self._start_rotations: Floats = np.zeros((self._count, len(sim.link_geoms), 9))
+        self._is_at_start: Mask = np.ones(self._count, dtype=np.bool_)  # not stepped since it was loaded
+
+        # What the laws have written into the states.
+        plugin_state = batch.bind("plugin_state")
+        friction = model.plugin_stateadr[mujoco.mj_name2id(model, PLUGIN, FRICTION_INSTANCE)]
+        touches = find_touches(model)
+        self._contact_counts = plugin_state[:, friction + CONTACT_COUNT]
+        self._touch_counts = plugin_state[:, touches.start]
+        self._touches = plugin_state[:, touches.start + 1 : touches.stop]
+        self._touches = self._touches.reshape(self._count, -1, TOUCH_NUMBERS)
+
+        # The last good states. Contacts come last in a state, and there is room for many more than there are.
+        feet = len(sim.link_geoms) + 1
+        numbers_before_plugins = batch.state.shape[1] - plugin_state.shape[1]
+        self._numbers_before_contacts = numbers_before_plugins + friction + MEMORY_NUMBERS + FOOT_NUMBERS * feet
+        self._good_states = np.empty_like(batch.state)
+
+    def _fits(self, robot: int, placed: PlacedRobot) -> bool:
+        """Use the model of a robot in its row. Returns False if it has other sizes than the others."""
+        sim = placed.sim
+        if sim.steps_per_tick != self._steps or sim.first_link_body != self._links.start:
+            return False
+        models = [*self._models]
+        models[robot] = sim.model
+        try:
+            self._require_batch().set_models(models)
+        except mujoco.FatalError:
+            self._require_batch().set_models(self._models)
+            return False
+        self._models = models
+        return True
+
+    def _require_batch(self) -> Batch:
+        assert self._batch is not None, "no robot has been loaded"
+        return self._batch
+
+    def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+        batch = self._require_batch()
+        diverged: dict[int, str] = {}
+        ids = None if len(robots) == self._count else np.array(robots)
+        rows = slice(None) if ids is None else ids
+        try:
+            batch.step(ids, nstep=self._steps)
+        except SimulationError as error:
+            for robot in error.ids.tolist():
+                diverged[robot] = f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"
+        self.torque_nm[rows] = self._all_torques_nm[rows, : self._joints]
+        self._is_at_start[rows] = False
+        is_good = self._find_good()
+        if not is_good.all():
+            for robot in robots:
+                if not is_good[robot] and robot not in diverged:
+                    diverged[robot] = self._explain_divergence(robot, ticks[robot])
+        self._keep_states()
+        return diverged
+
+    def _keep_states(self) -> None:
+        """Keep the states as the last good ones, without the room for more contacts than there are."""
+        width = self._numbers_before_contacts + CONTACT_NUMBERS * int(self._contact_counts.max())
+        self._good_states[:, :width] = self._require_batch().state[:, :width]
+
+    def _find_good(self) -> Mask:
+        """Return which states are good, by the rule of `DivergenceWatch`."""
+        warnings = self._require_batch().warning[:, :, 1]
+        return (
+            (np.vecdot(self._qpos, self._qpos) < MAX_POSITION**2)
+            & (np.vecdot(self._qvel, self._qvel) < MAX_SPEED**2)
+            & (np.vecdot(self._qacc, self._qacc) < MAX_ACCELERATION**2)
+            & (warnings.sum(axis=1) == 0)
+        )
+
+    def _explain_divergence(self, robot: int, tick: int) -> str:
+        """Return why a simulation has diverged, and restore its last good state."""
+        placed = self._placed[robot]
+        assert placed is not None
+        batch = self._require_batch()
+        model = placed.sim.model
+        data = placed.data
+        bad_state = batch.state[robot].copy()
+        batch.state[robot] = self._good_states[robot]
+        mujoco.mj_setState(model, data, batch.state[robot], COMPLETE_STATE)
+        watch = DivergenceWatch(model, data, placed.physics, self._steps)
+        mujoco.mj_setState(model, data, bad_state, COMPLETE_STATE)
+        data.qacc[:] = self._qacc[robot]
+        data.warning.number[:] = batch.warning[robot, :, 1]
+        batch.warning[robot] = 0
+        try:
+            watch.check(tick)
+        except BackendError as error:
+            return str(error)
+        raise AssertionError("a bad state raises")
+
+    def find_touches(self, robots: Mask) -> TouchArrays:
+        counts = np.where(robots, self._touch_counts, 0.0).astype(np.intp)
+        if not counts.any():
+            return NO_TOUCHES
+        rows = np.repeat(np.arange(self._count), counts)
+        numbers = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        touches = self._touches[rows, numbers]
+        links = touches[:, 0].astype(np.intp)
+        rotations = self._rotations[:, self._links][rows, links]
+        if self._is_at_start.any():
+            rotations = np.where(self._is_at_start[rows, None], self._start_rotations[rows, links], rotations)
+        return TouchArrays(rows, links, touches[:, 1:], rotations)

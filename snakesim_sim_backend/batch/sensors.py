@@ -1,0 +1,363 @@
+"""What environments observe of many robots: joints, pose, contact forces and winding temperatures.
+
+The values have the noise, rates and delays of the sensors of `SimBackend`, and the same bits. All sensors of a robot
+share one stream of random numbers, so the numbers of an IMU are left out although no environment observes it.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.sensors import Sensors
+from snakesim_hal.wire.quantities import MAX_CONTACTS
+from snakesim_sim_backend.batch.noise import NoiseStreams
+from snakesim_sim_backend.batch.samples import DelayedValues, DueTicks, Mask, Ticks
+from snakesim_sim_backend.batch.simulations import NO_TOUCHES, Simulations, TouchArrays
+from snakesim_sim_backend.sensors.timing import round_to_ticks
+
+NUMBERS_OF_POSE = 7
+NUMBERS_OF_VELOCITY = 6
+NUMBERS_OF_RAW_POSE = 19  # those of pose and velocity, and 6 of noise
+NUMBERS_OF_CONTACT = 6  # of noise: of position and force
+ROUNDING_ERROR = 1e-9  # relative; more than that of the size of a force
+
+
+def describe_timing(config: RunConfig) -> bytes:
+    """Return what must be equal for all robots that are simulated together: which sensors they have, and when."""
+    sensors = config.robot.sensors
+    parts: list[object] = [config.period_ns, config.rate_hz, config.robot.chain.modules, sensors.joints.delay_s]
+    parts.append(_has_noise(sensors.joints))
+    for _, sensor in _without_mounted(sensors).published():
+        parts += [type(sensor).__name__, sensor.rate_hz, sensor.delay_s, _has_noise(sensor)]
+    return msgspec.json.encode(parts)
+
+
+@dataclass(frozen=True)
+class ContactSample:
+    """A sample of contacts whose forces are not computed yet."""
+
+    touches: TouchArrays
+    noise: Floats  # (n, 3), of the forces in the frames of the links
+
+
+NO_CONTACTS = ContactSample(NO_TOUCHES, np.empty((0, 3)))
+
+
+class SensorArrays:
+    """The sensors of many robots.
+
+    Attributes:
+        joints: (robots, 3 * joints), angles, velocities and torques as delivered at this tick. A new array in each
+            tick, which never changes afterwards.
+        windings: temperatures, (robots, joints), as the power sensor has delivered them.
+    """
+
+    def __init__(self, everybody: Mask, config: RunConfig, noise: NoiseStreams) -> None:
+        """Make the sensors of robots.
+
+        Args:
+            everybody: the mask of all robots. A call with this object is faster than one with an equal mask.
+            config: configuration of one of the robots; those of the others agree with it in `describe_timing`.
+            noise: the random numbers of the robots.
+        """
+        robots = len(everybody)
+        self._everybody = everybody
+        sensors = config.robot.sensors
+        joints = config.robot.chain.modules
+        self._noise = noise
+        self._count = robots
+        self._joint_count = joints
+        self._period_ns = config.period_ns
+
+        def due_ticks(rate_hz: float) -> DueTicks:
+            return DueTicks(rate_hz, config.rate_hz, config.period_ns)
+
+        # Joints.
+        self.joints: Floats = np.zeros((robots, 3 * joints))
+        self._joint_sigma = np.zeros((robots, 3 * joints))
+        self._is_measured = np.ones((robots, 3 * joints), dtype=np.bool_)
+        self._all_are_measured = True
+        self._joints_have_noise = _has_noise(sensors.joints)
+        self.joint_delay_ticks = round_to_ticks(sensors.joints.delay_s, config.period_ns)
+        self._waiting_joints: deque[Floats] = deque(maxlen=1 + self.joint_delay_ticks)
+
+        # Contacts.
+        self._contact_due: DueTicks | None = None
+        if sensors.contacts is not None:
+            self._contact_due = due_ticks(sensors.contacts.rate_hz)
+            self._contacts_have_noise = _has_noise(sensors.contacts)
+            self._contact_delay_ticks = round_to_ticks(sensors.contacts.delay_s, config.period_ns)
+        self._contact_sigma_n = np.zeros(robots)
+        self._contact_threshold_n = np.zeros(robots)
+        self._waiting_contacts: deque[tuple[ContactSample, Mask]] = deque()
+        self._contacts = NO_CONTACTS
+
+        # Numbers that IMUs would draw.
+        self._imu_due: DueTicks | None = None
+        if sensors.imu is not None and _has_noise(sensors.imu):
+            self._imu_due = due_ticks(sensors.imu.rate_hz)
+        self._imu_numbers = 6 * (joints + 1)
+
+        # Pose.
+        self._pose_due: DueTicks | None = None
+        if sensors.pose is not None:
+            self._pose_due = due_ticks(sensors.pose.rate_hz)
+            self._pose_has_noise = _has_noise(sensors.pose)
+            self._raw_poses = DelayedValues(everybody, NUMBERS_OF_RAW_POSE, sensors.pose.delay_s, config.period_ns)
+            self._raw_poses.values[:, 3] = 1.0  # a quaternion that can be normalized, until there is a pose
+        self._pose_sigma = np.zeros((robots, 6))
+        self._no_pose_noise = np.zeros((robots, 6))
+
+        # Power.
+        self._power_due: DueTicks | None = None
+        self.windings: DelayedValues | None = None
+        if sensors.power is not None:
+            self._power_due = due_ticks(sensors.power.rate_hz)
+            self.windings = DelayedValues(everybody, joints, sensors.power.delay_s, config.period_ns)
+
+    def restart(self, robot: int, config: RunConfig) -> None:
+        """Forget all samples of a robot, and use the noise of its new configuration."""
+        sensors = config.robot.sensors
+        joints = self._joint_count
+        sigma = [sensors.joints.angle_noise_rad, sensors.joints.velocity_noise_rad_s, sensors.joints.torque_noise_nm]
+        self._joint_sigma[robot] = np.repeat(sigma, joints)
+        for i, joint in enumerate(config.robot.joint_table):
+            self._is_measured[robot, 2 * joints + i] = "torque" in joint.drive.measures
+        self._all_are_measured = bool(self._is_measured.all())
+        if sensors.contacts is not None:
+            self._contact_sigma_n[robot] = sensors.contacts.force_noise_n
+            self._contact_threshold_n[robot] = sensors.contacts.threshold_n
+            self._contacts = _leave_out(self._contacts, robot)
+            for age, (sample, due) in enumerate(self._waiting_contacts):
+                others_due = due.copy()
+                others_due[robot] = False
+                self._waiting_contacts[age] = (sample, others_due)
+        if sensors.pose is not None:
+            pose_sigma = [sensors.pose.position_noise_m, 0.5 * sensors.pose.angle_noise_rad]
+            self._pose_sigma[robot] = np.repeat(pose_sigma, 3)
+            self._raw_poses.restart(robot)
+        if self.windings is not None:
+            self.windings.restart(robot)
+
+    def sample(
+        self, ticks: Ticks, active: Mask, simulations: Simulations, winding_c: Floats, *, starts: bool = False
+    ) -> None:
+        """Read the sensors of the active robots at their present ticks, in the order of `Sensors.published`.
+
+        Args:
+            ticks: (robots,), the present tick of each robot.
+            active: which robots are read; the others keep their values.
+            simulations: the states of all robots.
+            winding_c: (robots, joints), temperatures of the windings.
+            starts: whether the active robots have just been reset, while the others go on.
+        """
+        if self._contact_due is not None:
+            self._sample_contacts(self._contact_due.find_due(ticks, active), simulations, starts)
+        if self._imu_due is not None:
+            self._noise.skip(self._imu_numbers, self._imu_due.find_due(ticks, active))
+        if self._pose_due is not None:
+            self._sample_poses(self._pose_due.find_due(ticks, active), simulations, starts)
+        if self._power_due is not None and self.windings is not None:
+            due = self._power_due.find_due(ticks, active)
+            if np.count_nonzero(due):
+                self.windings.add(winding_c.copy(), due, starts=starts)
+            elif not starts:
+                self.windings.add_nothing()
+        self._sample_joints(active, simulations, starts)
+
+    def _sample_contacts(self, due: Mask, simulations: Simulations, starts: bool) -> None:
+        touches = simulations.find_touches(due)
+        sample = NO_CONTACTS if touches is NO_TOUCHES else self._draw_contact_noise(touches)
+        if self._contact_delay_ticks:
+            if starts and self._waiting_contacts:
+                waiting, waiting_due = self._waiting_contacts[-1]  # the others have taken their samples of this tick
+                merged = _replace_contacts(waiting, sample, due)
+                self._waiting_contacts[-1] = (merged, waiting_due | due)
+                return
+            self._waiting_contacts.append((sample, due))
+            if len(self._waiting_contacts) <= self._contact_delay_ticks:
+                return
+            sample, due = self._waiting_contacts.popleft()
+        self._contacts = _replace_contacts(self._contacts, sample, due)
+
+    def _draw_contact_noise(self, touches: TouchArrays) -> ContactSample:
+        """Return the contacts above the threshold with the random numbers of their forces."""
+        is_detected = _find_strong(touches.force_w, self._contact_threshold_n[touches.robot])
+        if not is_detected.all():
+            touches = _select(touches, is_detected)
+        if not len(touches.robot):
+            return NO_CONTACTS
+        contacts_of_robot = np.bincount(touches.robot, minlength=self._count)
+        rank = np.arange(len(touches.robot)) - (np.cumsum(contacts_of_robot) - contacts_of_robot)[touches.robot]
+        noise = np.zeros((len(touches.robot), 3))
+        if self._contacts_have_noise:
+            numbers = self._noise.peek(NUMBERS_OF_CONTACT * int(contacts_of_robot.max()))
+            of_force = NUMBERS_OF_CONTACT * rank[:, None] + np.arange(3, 6)
+            noise = numbers[touches.robot[:, None], of_force]
+            self._noise.skip_each(NUMBERS_OF_CONTACT * contacts_of_robot)
+        if len(rank) > MAX_CONTACTS:
+            fits = rank < MAX_CONTACTS
+            return ContactSample(_select(touches, fits), noise[fits])
+        return ContactSample(touches, noise)
+
+    def _sample_poses(self, due: Mask, simulations: Simulations, starts: bool) -> None:
+        noise = self._no_pose_noise
+        if self._pose_has_noise:
+            noise = self._noise.peek(6)
+            self._noise.skip(6, due)
+        raw = np.concatenate((simulations.base_pose, simulations.base_velocity, noise), axis=1)
+        self._raw_poses.add(raw, due, starts=starts)
+
+    def _sample_joints(self, active: Mask, simulations: Simulations, starts: bool) -> None:
+        joints = self._joint_count
+        values = np.concatenate((simulations.angle_rad, simulations.velocity_rad_s, simulations.torque_nm), axis=1)
+        if self._joints_have_noise:
+            values += self._joint_sigma * self._noise.peek(3 * joints)
+            self._noise.skip(3 * joints, active)
+        if not self._all_are_measured:
+            values[~self._is_measured] = 0.0
+        if starts and self._waiting_joints:
+            # The reading of the start is used until a delayed one is delivered.
+            for age, waiting in enumerate(self._waiting_joints):
+                self._waiting_joints[age] = np.where(active[:, None], values, waiting)
+        else:
+            self._waiting_joints.append(values)
+        delivered = self._waiting_joints[0]
+        if active is not self._everybody:
+            delivered = np.where(active[:, None], delivered, self.joints)
+        self.joints = delivered
+
+    # --- what is observed -----------------------------------------------------------------------------------
+
+    @property
+    def has_poses(self) -> Mask:
+        """Whether a pose has been delivered in this episode, (robots,)."""
+        if self._pose_due is None:
+            return np.zeros(self._count, dtype=np.bool_)
+        return self._raw_poses.is_known
+
+    def read_poses(self) -> Floats:
+        """Return the newest positions and quaternions, (robots, 7); they mean something only where `has_poses`."""
+        if self._pose_due is None:
+            return np.zeros((self._count, NUMBERS_OF_POSE))
+        raw = self._raw_poses.values
+        pose = raw[:, :7].copy()
+        if self._pose_has_noise:
+            error = self._pose_sigma * raw[:, 13:]
+            pose[:, :3] += error[:, :3]
+            pose[:, 3:] = _add_rotation(raw[:, 3:7], error[:, 3:])
+        return pose
+
+    def read_velocities(self) -> Floats:
+        """Return the newest velocities in the world, linear and angular, (robots, 6); only where `has_poses`."""
+        if self._pose_due is None:
+            return np.zeros((self._count, NUMBERS_OF_VELOCITY))
+        raw = self._raw_poses.values
+        velocity = raw[:, 7:13].copy()
+        velocity[:, 3:] = _rotate(raw[:, 3:7], raw[:, 10:13])
+        return velocity
+
+    def read_contact_forces(self) -> Floats:
+        """Return the sum of the sizes of all contact forces on every link, (robots, links) in N."""
+        forces_n = [[0.0] * (self._joint_count + 1) for _ in range(self._count)]
+        touches = self._contacts.touches
+        if not len(touches.robot):
+            return np.array(forces_n)
+        sigma_n = self._contact_sigma_n[touches.robot, None]
+        force_l = _rotate_into(touches.rotation, touches.force_w)
+        if self._contacts_have_noise:
+            force_l = force_l + sigma_n * self._contacts.noise
+        for robot, link, force in zip(touches.robot.tolist(), touches.link.tolist(), force_l.tolist(), strict=True):
+            forces_n[robot][link] += math.hypot(*force)
+        return np.array(forces_n)
+
+
+def _without_mounted(sensors: Sensors) -> Sensors:
+    return msgspec.structs.replace(sensors, depth=[], range=[], custom=[])
+
+
+def _has_noise(sensor: msgspec.Struct) -> bool:
+    """Return whether a sensor of the body draws random numbers."""
+    return any(value for name, value in msgspec.structs.asdict(sensor).items() if "noise" in name)
+
+
+def _find_strong(force_w: Floats, thresholds_n: Floats) -> Mask:
+    """Return which forces, (n, 3), are at least as large as their thresholds, (n,), as `math.hypot` decides it."""
+    x, y, z = force_w.T
+    sizes_n = np.sqrt(x * x + y * y + z * z)
+    is_strong = sizes_n >= thresholds_n
+    is_close = np.abs(sizes_n - thresholds_n) <= ROUNDING_ERROR * thresholds_n
+    for i in np.flatnonzero(is_close).tolist():
+        is_strong[i] = math.hypot(*force_w[i].tolist()) >= thresholds_n[i]
+    return is_strong
+
+
+def _select(touches: TouchArrays, mask: Mask) -> TouchArrays:
+    return TouchArrays(touches.robot[mask], touches.link[mask], touches.force_w[mask], touches.rotation[mask])
+
+
+def _leave_out(contacts: ContactSample, robot: int) -> ContactSample:
+    """Return the contacts without those of one robot."""
+    others = contacts.touches.robot != robot
+    return ContactSample(_select(contacts.touches, others), contacts.noise[others])
+
+
+def _replace_contacts(before: ContactSample, sample: ContactSample, due: Mask) -> ContactSample:
+    """Return the newest contacts of every robot: those of the sample for the robots that are due.
+
+    A delayed sample may hold robots that have been reset since then, which are not due any more.
+    """
+    if before is NO_CONTACTS and sample is NO_CONTACTS:
+        return NO_CONTACTS
+    if due.all():
+        return sample
+    kept = ~due[before.touches.robot]
+    new = due[sample.touches.robot]
+    touches = TouchArrays(
+        np.concatenate((before.touches.robot[kept], sample.touches.robot[new])),
+        np.concatenate((before.touches.link[kept], sample.touches.link[new])),
+        np.concatenate((before.touches.force_w[kept], sample.touches.force_w[new])),
+        np.concatenate((before.touches.rotation[kept], sample.touches.rotation[new])),
+    )
+    return ContactSample(touches, np.concatenate((before.noise[kept], sample.noise[new])))
+
+
+# --- the arithmetic of `sensors.frames` and `sensors.pose` on arrays -------------------------------------------------
+
+
+def _rotate_into(rotation: Floats, vector_w: Floats) -> Floats:
+    """Return the coordinates of world vectors, (n, 3), in the frames whose world_from_frame is (n, 9), row by row."""
+    a, b, c, d, e, f, g, h, i = rotation.T
+    x, y, z = vector_w.T
+    return np.stack((a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z), axis=1)
+
+
+def _rotate(wxyz: Floats, vector: Floats) -> Floats:
+    """Return vectors, (n, 3), rotated by unit quaternions, (n, 4)."""
+    w, x, y, z = wxyz.T
+    vx, vy, vz = vector.T
+    tx = 2 * (y * vz - z * vy)
+    ty = 2 * (z * vx - x * vz)
+    tz = 2 * (x * vy - y * vx)
+    return np.stack(
+        (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx), axis=1
+    )
+
+
+# In the product of a quaternion and (1, a, b, c): the three terms that are added to each component, in order.
+FACTOR_OF_TERM = [[0, 0, 1, 2], [1, 1, 2, 0], [2, 2, 0, 1]]  # index in (a, b, c)
+COMPONENT_OF_TERM = [[1, 0, 0, 0], [2, 3, 1, 2], [3, 2, 3, 1]]  # index in the quaternion
+SIGN_OF_TERM = np.array([[-1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, -1.0]])
+
+
+def _add_rotation(wxyz: Floats, half_angles: Floats) -> Floats:
+    """Return the unit quaternions along wxyz * (1, half angles): small rotations about axes of the base are added."""
+    terms = SIGN_OF_TERM * (half_angles[:, FACTOR_OF_TERM] * wxyz[:, COMPONENT_OF_TERM])
+    quaternion = wxyz + terms[:, 0] + terms[:, 1] + terms[:, 2]
+    squares = np.cumsum(quaternion * quaternion, axis=1)  # in order, so that it does not depend on how many there are
+    return quaternion / np.sqrt(squares[:, 3:])

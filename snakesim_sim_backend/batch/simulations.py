@@ -1,0 +1,200 @@
+"""The seam to MuJoCo: the states of many simulations as arrays, and one call that steps all of them for a period."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import BackendError
+from snakesim_native.libraries import LAWS
+from snakesim_native.load import load
+from snakesim_sim_backend.actuators import INPUTS, Motors
+from snakesim_sim_backend.batch.placed import PlacedRobot, read_rotations
+from snakesim_sim_backend.laws.version import choose_laws
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.state.divergence import DivergenceWatch
+
+Mask = NDArray[np.bool_]  # (robots,)
+
+
+def describe_loop_cost() -> str:
+    """Return what it costs that simulations are stepped in a loop here; empty if they are not."""
+    if choose_laws() == "c":
+        return ""
+    loaded = load(LAWS)
+    return f"many environments are stepped in a loop on one thread, and {LAWS.python_cost}. Reason: {loaded.problem}"
+
+
+@dataclass(frozen=True)
+class TouchArrays:
+    """Contacts of links with obstacles, in the order of robots, and of MuJoCo within a robot."""
+
+    robot: NDArray[np.intp]  # (n,), row of the robot
+    link: NDArray[np.intp]  # (n,), 0 at the tail
+    force_w: Floats  # (n, 3), N, on the link
+    rotation: Floats  # (n, 9), world_from_link, row by row
+
+
+NO_TOUCHES = TouchArrays(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 9)))
+
+
+class Simulations(ABC):
+    """Simulations of robots with equal joints, each in a scene of its own.
+
+    Attributes:
+        base_pose: (robots, 7), position in m and quaternion wxyz of the tail end.
+        base_velocity: (robots, 6), in m/s in the world, and rad/s in the frame of the base.
+        angle_rad: (robots, joints).
+        velocity_rad_s: (robots, joints).
+        torque_nm: (robots, joints), of the motors over the last physics step.
+        motor_state: (robots, n), what the motors remember; n is 0 for motors without lag.
+        motor_inputs: (robots, 3 * joints), position, velocity and feed-forward torque of each motor.
+        motors: the motors of each robot, for what happens seldom: other modes and other limits.
+    """
+
+    base_pose: Floats
+    base_velocity: Floats
+    angle_rad: Floats
+    velocity_rad_s: Floats
+    torque_nm: Floats
+    motor_state: Floats
+    motor_inputs: Floats
+    motors: list[Motors]
+
+    @abstractmethod
+    def load(self, robot: int, placed: PlacedRobot) -> bool:
+        """Make a placed robot the simulation of this row.
+
+        Returns:
+            False if it does not fit: its arrays have other sizes than those of the other rows.
+        """
+
+    @abstractmethod
+    def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+        """Step simulations through one control period.
+
+        Args:
+            robots: their rows.
+            ticks: for every row, number of the control cycle, for messages.
+
+        Returns:
+            Why a simulation has diverged, by its row.
+        """
+
+    @abstractmethod
+    def find_touches(self, robots: Mask) -> TouchArrays:
+        """Return the contacts of these robots with obstacles over the last physics step."""
+
+
+class MotorArrays:
+    """The arrays of one robot that its motors read and write, with the names that MjData gives them."""
+
+    def __init__(self, simulations: Simulations, robot: int) -> None:
+        self.act = simulations.motor_state[robot]
+        self.actuator_force = simulations.torque_nm[robot]
+        self.ctrl = simulations.motor_inputs[robot]
+
+
+NO_MOTORS: Motors = None  # pyright: ignore[reportAssignmentType] - of rows that are not loaded yet
+
+
+class LoopedSimulations(Simulations):
+    """One MuJoCo state for each robot, stepped one after the other.
+
+    For a single robot the arrays are views of MuJoCo's.
+    """
+
+    def __init__(self, robots: int, joints: int) -> None:
+        self._joints = joints
+        self._placed: list[PlacedRobot | None] = [None] * robots
+        self._watches: list[DivergenceWatch | None] = [None] * robots
+        self.motors = [NO_MOTORS] * robots
+        self.base_pose = np.zeros((robots, FREE_QPOS))
+        self.base_velocity = np.zeros((robots, FREE_DOFS))
+        self.angle_rad = np.zeros((robots, joints))
+        self.velocity_rad_s = np.zeros((robots, joints))
+        self.torque_nm = np.zeros((robots, joints))
+        self.motor_state = np.zeros((robots, 0))
+        self.motor_inputs = np.zeros((robots, INPUTS * joints))
+
+    def load(self, robot: int, placed: PlacedRobot) -> bool:
+        data = placed.data
+        if self.motor_state.shape[1] != len(data.act):
+            if any(other is not None for i, other in enumerate(self._placed) if i != robot):
+                return False
+            self.motor_state = np.zeros((len(self._placed), len(data.act)))
+        self._placed[robot] = placed
+        self.motors[robot] = placed.motors
+        self._watches[robot] = DivergenceWatch(placed.sim.model, data, placed.physics, placed.sim.steps_per_tick)
+        if len(self._placed) == 1:
+            self._view(data)
+            return True
+        placed.motors.use_state(MotorArrays(self, robot))
+        self.motor_state[robot] = data.act
+        self._copy_from(data, robot)
+        return True
+
+    def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+        diverged: dict[int, str] = {}
+        is_view = len(self._placed) == 1
+        for robot in robots:
+            tick = ticks[robot]
+            placed = self._placed[robot]
+            watch = self._watches[robot]
+            assert placed is not None and watch is not None
+            if not is_view:
+                placed.data.ctrl[: INPUTS * self._joints] = self.motor_inputs[robot]
+                placed.data.act[:] = self.motor_state[robot]
+            try:
+                placed.physics.step(placed.sim.steps_per_tick)
+                watch.check(tick)
+            except mujoco.FatalError as error:
+                diverged[robot] = f"MuJoCo cannot go on at tick {tick}: {error}"
+            except BackendError as error:
+                diverged[robot] = str(error)
+            if not is_view:
+                self.motor_state[robot] = placed.data.act
+                self._copy_from(placed.data, robot)
+        return diverged
+
+    def find_touches(self, robots: Mask) -> TouchArrays:
+        rows: list[int] = []
+        links: list[int] = []
+        forces_w: list[list[float]] = []
+        rotations: list[Floats] = []
+        for robot, placed in enumerate(self._placed):
+            if placed is None or not robots[robot]:
+                continue
+            for number, *force_w in placed.read_touches():
+                link = int(number)
+                rows.append(robot)
+                links.append(link)
+                forces_w.append(force_w)
+                rotations.append(read_rotations(placed)[link].copy())
+        if not rows:
+            return NO_TOUCHES
+        return TouchArrays(np.array(rows), np.array(links), np.array(forces_w), np.array(rotations))
+
+    def _copy_from(self, data: mujoco.MjData, robot: int) -> None:
+        """Copy what a step has changed into the row of a robot."""
+        joints = self._joints
+        self.base_pose[robot] = data.qpos[:FREE_QPOS]
+        self.base_velocity[robot] = data.qvel[:FREE_DOFS]
+        self.angle_rad[robot] = data.qpos[FREE_QPOS : FREE_QPOS + joints]
+        self.velocity_rad_s[robot] = data.qvel[FREE_DOFS : FREE_DOFS + joints]
+        self.torque_nm[robot] = data.actuator_force[:joints]
+
+    def _view(self, data: mujoco.MjData) -> None:
+        """Make the arrays of a single robot views of MuJoCo's."""
+        joints = self._joints
+        self.base_pose = data.qpos[None, :FREE_QPOS]
+        self.base_velocity = data.qvel[None, :FREE_DOFS]
+        self.angle_rad = data.qpos[None, FREE_QPOS : FREE_QPOS + joints]
+        self.velocity_rad_s = data.qvel[None, FREE_DOFS : FREE_DOFS + joints]
+        self.torque_nm = data.actuator_force[None, :joints]
+        self.motor_state = data.act[None, :]
+        self.motor_inputs = data.ctrl[None, : INPUTS * joints]

@@ -1,0 +1,278 @@
+"""Many environments at once: the bits of each one alone, whatever steps them, and Gymnasium's rules for vectors."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+
+import snakesim
+import snakesim.environments.robots
+from snakesim.environments import SnakeEnv, SnakeVectorEnv
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_sim_backend.batch import robots as batch_robots
+from snakesim_sim_backend.batch.batched import BatchedSimulations
+from snakesim_sim_backend.batch.simulations import LoopedSimulations
+from snakesim_sim_backend.laws.version import choose_laws
+from snakesim_testing.messages import raises_error
+
+ALL_PARTS = (
+    *("time_s", "angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n"),
+    *("position_w_m", "orientation_wxyz", "velocity_w_m_s", "angular_velocity_w_rad_s"),
+)
+QUIET = {
+    "robot.sensors.joints.angle_noise_rad": 0.0,
+    "robot.sensors.joints.velocity_noise_rad_s": 0.0,
+    "robot.sensors.joints.torque_noise_nm": 0.0,
+}
+DELAYS = {
+    "robot.sensors.joints.delay_s": 0.03,
+    "robot.sensors.pose.delay_s": 0.02,
+    "robot.sensors.pose.rate_hz": 40,
+    "robot.sensors.contacts.delay_s": 0.01,
+    "robot.sensors.contacts.rate_hz": 50,
+    "robot.sensors.power.delay_s": 0.02,
+    "robot.sensors.power.rate_hz": 30,
+}
+HOT = {"robot.heat.time_constant_s": 0.03, "robot.heat.rise_at_rated_k": 900.0, "robot.sensors.power.rate_hz": 20}
+Case = tuple[str, dict[str, Any]]
+CASES: dict[str, Case] = {
+    "positions among obstacles": ("surveyed_clutter", {"observe": ALL_PARTS}),
+    "velocities": ("peg_row", {"action": "velocity"}),
+    "torques": ("triplet", {"action": "torque", "frame_skip": 3, "flat": False}),
+    "joints that yaw and pitch": ("mamba_flat", {}),
+    "hills": ("mamba_hills", {}),
+    "no limits": ("triplet", {"safe": False}),
+    "delayed sensors": ("peg_row", {"set": DELAYS, "observe": ALL_PARTS}),
+    "sensors without noise": ("triplet", {"set": QUIET}),
+    "late and rare commands": (
+        "triplet",
+        {"set": {"services.control.decimation": 3, "services.control.latency_ticks": 5}},
+    ),
+    "hot motors": ("triplet", {"action": "torque", "set": HOT}),
+    "hot motors that are isolated": (
+        "triplet",
+        {"action": "torque", "set": {**HOT, "robot.safety.max_isolated_joints": 13}},
+    ),
+    "angles that jump": ("triplet", {"set": {"robot.sensors.joints.angle_noise_rad": 0.06}}),
+    "motors of random strength": ("triplet", {"randomize": {"robot.limits.torque_nm": (2.0, 7.0)}}),
+}
+QUICK = ("positions among obstacles", "torques", "delayed sensors", "hot motors that are isolated", "angles that jump")
+EVERY_CASE = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+
+
+def make(case: Case, **more: Any) -> SnakeEnv:
+    scenario, arguments = case
+    return SnakeEnv(scenario, **{"duration": 0.6, **arguments, **more})
+
+
+def make_many(case: Case, count: int, **more: Any) -> SnakeVectorEnv:
+    scenario, arguments = case
+    return SnakeVectorEnv(count, scenario=scenario, **{"duration": 0.6, **arguments, **more})
+
+
+def draw_actions(env: SnakeEnv, seed: int) -> Iterator[np.ndarray]:
+    """Random actions, at first small and then within the whole range."""
+    random = np.random.default_rng(seed)
+    space = env.action_space
+    assert isinstance(space, gymnasium.spaces.Box)
+    yield random.uniform(space.low, space.high) * 0.2
+    while True:
+        # Torques that last make motors hot.
+        yield space.high * random.choice([-1.0, 1.0], space.shape) * random.uniform(0.8, 1.0)
+
+
+def assert_equal(first: Any, second: Any, path: str = "") -> None:
+    """Both are the same to the bit, also NaN."""
+    assert type(first) is type(second), path
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), path
+        for key, value in first.items():
+            assert_equal(value, second[key], f"{path}/{key}")
+    elif isinstance(first, np.ndarray):
+        assert (first.dtype, first.shape) == (second.dtype, second.shape), path
+        if first.dtype == object:
+            for one, other in zip(first, second, strict=True):
+                assert_equal(one, other, path)
+        else:
+            assert first.tobytes() == second.tobytes(), path
+    elif isinstance(first, float):
+        assert np.float64(first).tobytes() == np.float64(second).tobytes(), path
+    else:
+        assert first == second, path
+
+
+def run_episodes(env: SnakeEnv) -> list[Any]:
+    """Everything that two episodes return."""
+    returned: list[Any] = []
+    actions = draw_actions(env, seed=5)
+    for seed in (3, 4):
+        returned += env.reset(seed=seed)
+        over = False
+        while not over:
+            step = env.step(next(actions))
+            returned += step
+            over = step[2] or step[3]
+    env.close()
+    return returned
+
+
+@pytest.mark.parametrize("name", EVERY_CASE)
+def test_arrays_have_the_bits_of_a_robot_behind_the_limiter_of_the_hal(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = CASES[name]
+    with_arrays = run_episodes(make(case, duration=1.0))
+
+    def never(_config: RunConfig) -> bool:
+        return False
+
+    monkeypatch.setattr(snakesim.environments.robots, "can_arm", never)
+    alone = run_episodes(make(case, duration=1.0))
+    for number, (one, other) in enumerate(zip(with_arrays, alone, strict=True)):
+        assert_equal(one, other, f"{number}")
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=lambda mode: mode.name)
+@pytest.mark.parametrize("name", EVERY_CASE)
+def test_rows_have_the_bits_of_single_environments(name: str, mode: AutoresetMode) -> None:
+    """Gymnasium steps single environments one after the other, and merges their infos."""
+    case = CASES[name]
+    ours = make_many(case, 3, autoreset_mode=mode)
+    theirs = gymnasium.vector.SyncVectorEnv([lambda: make(case)] * 3, autoreset_mode=mode)
+    for one, other in zip(ours.reset(seed=[3, 4, 5]), theirs.reset(seed=[3, 4, 5]), strict=True):
+        assert_equal(one, other)
+    actions = [draw_actions(make(case), seed) for seed in (1, 2, 3)]
+    for number in range(30):  # more than two episodes
+        given = np.array([next(of_env) for of_env in actions], dtype=np.float32)
+        for one, other in zip(ours.step(given), theirs.step(given), strict=True):
+            assert_equal(one, other, f"step {number}")
+    ours.close()
+    theirs.close()
+
+
+def test_without_autoreset_some_environments_are_reset_by_a_mask() -> None:
+    case = CASES["torques"]
+    envs = make_many(case, 3, autoreset_mode="Disabled", duration=0.06)
+    still = np.zeros((3, 13))
+    envs.reset(seed=1)
+    envs.step(still)
+    _, _, _, truncated, infos = envs.step(still)
+    assert truncated.all() and infos["_digest"].all()
+    with raises_error(gymnasium.error.ResetNeeded):
+        envs.step(still)
+    first_two = np.array([True, True, False])
+    _, infos = envs.reset(seed=[7, 8, None], options={"reset_mask": first_two})
+    assert infos["seed"].tolist() == [7, 8, 0] and infos["_seed"].tolist() == first_two.tolist()
+    with raises_error(gymnasium.error.ResetNeeded):
+        envs.step(still)
+    envs.reset(options={"reset_mask": ~first_two})
+    observations, *_ = envs.step(still)
+    alone = make(case, duration=0.06)
+    alone.reset(seed=8)
+    expected, *_ = alone.step(still[0])
+    assert_equal({name: values[1] for name, values in observations.items()}, expected)
+    envs.close()
+
+
+@pytest.mark.parametrize("count", [6, pytest.param(64, marks=pytest.mark.slow)])
+def test_the_number_of_threads_changes_no_bit(count: int) -> None:
+    case = CASES["positions among obstacles"]
+    digests: set[tuple[str, ...]] = set()
+    seen: set[bytes] = set()
+    for threads in (1, 2, 4):
+        envs = make_many(case, count, threads=threads, duration=0.2)
+        actions = draw_actions(make(case), seed=1)
+        envs.reset(seed=1)
+        for _ in range(3):
+            envs.step(np.tile(next(actions), (count, 1)))
+        observations, _, _, _, infos = envs.step(np.tile(next(actions), (count, 1)))
+        envs.close()
+        digests.add(tuple(infos["digest"]))
+        seen.add(observations.tobytes())
+    assert len(digests) == len(seen) == 1 and len({*digests.pop()}) > 1
+
+
+def test_a_loop_has_the_bits_of_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop steps where the laws run in Python."""
+    if choose_laws() == "python":
+        pytest.skip("there is no C version of the laws here")
+
+    def run() -> tuple[Any, type[Any]]:
+        envs = make_many(CASES["delayed sensors"], 3)
+        envs.reset(seed=1)
+        actions = draw_actions(make(CASES["delayed sensors"]), seed=1)
+        returned = [envs.step(np.tile(next(actions), (3, 1))) for _ in range(16)]
+        simulations = envs._episodes.robots._armed.simulated._simulations  # pyright: ignore
+        envs.close()
+        return returned, type(simulations)
+
+    batched, batch_type = run()
+    monkeypatch.setattr(batch_robots, "choose_laws", lambda: "python")
+    looped, loop_type = run()
+    assert (batch_type, loop_type) == (BatchedSimulations, LoopedSimulations)
+    for of_batch, of_loop in zip(batched, looped, strict=True):
+        for one, other in zip(of_batch, of_loop, strict=True):
+            assert_equal(one, other)
+
+
+def test_a_simulation_that_diverges_stops_only_its_environment() -> None:
+    still = np.zeros(13)
+    reasons: list[str] = []
+    for envs in (SnakeVectorEnv(3, scenario="triplet"), SnakeEnv("triplet")):
+        envs.reset(seed=1)
+        action = still if isinstance(envs, SnakeEnv) else np.tile(still, (3, 1))
+        envs.step(action)
+        episodes = envs._episodes
+        simulations = episodes.robots._armed.simulated._simulations  # pyright: ignore
+        simulations.base_velocity[0, 0] = 1e4
+        _, _, terminated, _, infos = envs.step(action)
+        if isinstance(envs, SnakeEnv):
+            reasons.append(infos["reason"])
+        else:
+            assert np.array_equal(terminated, [True, False, False]) and infos["_reason"].tolist() == [
+                True,
+                False,
+                False,
+            ]
+            reasons.append(infos["reason"][0])
+            _, _, terminated, _, infos = envs.step(action)
+            assert not terminated.any() and infos["time_s"].round(6).tolist() == [0.0, 0.15, 0.15]
+        envs.close()
+    assert reasons[0] == reasons[1] and "diverged at tick 6" in reasons[0]
+
+
+def test_scenes_of_different_sizes_are_stepped_side_by_side() -> None:
+    case: Case = ("surveyed_clutter", {"randomize": {"scene.random_field.0.density_per_m2": (5.0, 12.0)}})
+    envs = make_many(case, 4, duration=0.1)
+    envs.reset(seed=1)
+    still = np.zeros((4, 13))
+    envs.step(still)
+    _, _, _, _, infos = envs.step(still)
+    envs.close()
+    for row, seed in enumerate((1, 2, 3, 4)):
+        alone = make(case, duration=0.1)
+        alone.reset(seed=seed)
+        alone.step(still[0])
+        assert alone.step(still[0])[4]["digest"] == infos["digest"][row]
+
+
+def test_wrappers_of_gymnasium_accept_it() -> None:
+    envs = DictInfoToList(RecordEpisodeStatistics(make_many(CASES["torques"], 2, duration=0.06)))
+    envs.reset(seed=1)
+    envs.step(np.zeros((2, 13)))
+    _, _, _, _, infos = envs.step(np.zeros((2, 13)))
+    envs.close()
+    assert [info["ended"] for info in infos] == ["time", "time"] and infos[0]["episode"]["l"] == 2
+
+
+WRONG = [{"num_envs": 0}, {"num_envs": 2.0}, {"threads": 0}, {"threads": 1.5}, {"autoreset_mode": "sometimes"}]
+
+
+@pytest.mark.parametrize("given", WRONG)
+def test_wrong_arguments_are_refused(given: dict[str, Any]) -> None:
+    with raises_error(snakesim.ConfigError, code="python/invalid-argument"):
+        SnakeVectorEnv(**{"num_envs": 2, "scenario": "triplet", **given})
