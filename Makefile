@@ -66,6 +66,7 @@ verify: compiled ## Run the campaign, nightly and before a release: what takes h
 
 # Once: each worker would compile all that it imports, and the emulated machine would take many times as long.
 compiled: .venv/.compiled
+	@$(bin)/python -m snakesim_native.compile
 	-@$(bin)/python -m compileall -qq -j 0 $(packages) tests verification
 
 .venv/.compiled: $(stamp)
@@ -120,7 +121,7 @@ bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link bes
 golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
 	$(bin)/python -m verification.golden
 
-schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables of faults and errors
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, tables, Python API
 	$(bin)/snakesim schema --out schemas
 	$(bin)/python -m docs.site.kinds_table
 	$(bin)/python -m docs.site.error_pages

@@ -68,6 +68,7 @@ def set_up(requested: str) -> None:
     options = ("--quiet", "--python", VENV_PYTHON)
     run(UV, "pip", "sync", *options, "--require-hashes", "--only-binary", ":all:", LOCK)
     run(UV, "pip", "install", *options, "--no-deps", "--no-build-isolation", "--editable", ".")
+    run(VENV_PYTHON, "-m", "snakesim_native.compile")
     run(UV, "pip", "check", *options, advice="requirements.lock is out of date: run `make lock`")
     STAMP.write_text(f"{ROOT}\n{requested}\n", encoding="utf-8")
     print(f"setup: .venv is ready (Python {python_version(VENV_PYTHON)})")

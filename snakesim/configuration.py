@@ -9,21 +9,21 @@ from snakesim_hal.model.scenario import Override, RunConfig, load
 from snakesim_hal.programs.preflight import check_plugins
 
 
-def list_overrides(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
+def list_overrides(values: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
     """Return the values that a caller sets, as overrides of the scenario.
 
     Args:
-        given: The argument `set` of the caller: values by their dotted keys.
+        values: The argument `set` of the caller: values by their dotted keys.
         **arguments: Other arguments of the caller, by the key that they stand for. None is left out.
 
     Raises:
-        ConfigError: `given` is no mapping of keys.
+        ConfigError: `values` is no mapping of keys.
     """
-    if given is None:
-        given = {}
-    if not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
+    if values is None:
+        values = {}
+    if not (isinstance(values, Mapping) and all(isinstance(key, str) for key in values)):
         raise ConfigError(
-            f"set={given!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}",
+            f"set={values!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}",
             code="python/invalid-argument",
         )
     overrides: list[Override] = []
@@ -31,7 +31,7 @@ def list_overrides(given: Mapping[str, Any] | None, **arguments: Any) -> list[Ov
         if value is not None:
             flag = f"{key.removesuffix('_s')}={value!r:.60}"
             overrides.append(Override(key, _to_plain(value), flag))
-    for key, value in given.items():
+    for key, value in values.items():
         flag = f"set={{{key!r}: {value!r:.60}}}"
         overrides.append(Override(key, _to_plain(value), flag))
     return overrides

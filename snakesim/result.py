@@ -186,7 +186,15 @@ class Result:
         """
         from snakesim_operator.playback.video import film
 
-        film(self.record, Path(path), size=(width, height), fps=fps, speed=speed, span_s=span_s, say=lambda _line: None)
+        film(
+            self.record,
+            Path(path),
+            size=(width, height),
+            fps=fps,
+            speed=speed,
+            span_s=span_s,
+            print_text=lambda _line: None,
+        )
         return Path(path)
 
     def compare(self, other: "Result") -> str:

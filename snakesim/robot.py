@@ -118,7 +118,7 @@ class Robot:
             The open connection. Use it in a `with` statement, or call `close`.
 
         Raises:
-            ConfigError: An argument is malformed, or both `endpoint` and `session` are given.
+            ConfigError: An argument is malformed, or both `endpoint` and `session` are set.
             NotConnectedError: No robot answers within CONNECT_TIMEOUT_S.
             RefusedError: Several robots answer.
         """
@@ -332,7 +332,7 @@ class Robot:
         Raises:
             ConfigError: There is no such parameter.
             RefusedError: Control refuses a value.
-            ControllerError: Control has accepted the values and has ended, for the controller cannot go on with them.
+            ControllerError: Control has set the values and has ended, because the controller cannot continue with them.
         """
         change_parameters(self._session, changes, get_user_name())
 

@@ -45,7 +45,7 @@ from snakesim_hal.run_log.host_record import BLACK_BOX
 
 OK, FAILED = 0, 1
 MODULES = "can"  # the backend of joint modules
-LISTEN_S = 0.3  # for others on a bus; most devices say something five times a second or more
+LISTEN_S = 0.3  # for others on a bus; most devices send something five times a second or more
 COLUMNS = (
     *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
     *("voltage", "motor", "board", "shaft"),
@@ -151,13 +151,15 @@ def scan_channels(arguments: argparse.Namespace) -> int:
     """List the modules that answer on some buses. Returns 1 if none answers."""
     found: list[dict[str, str]] = []
     in_use: list[str] = []
-    say = discard_line if arguments.json else print_line
+    print_text = discard_line if arguments.json else print_line
     for channel in arguments.channel:
-        if not arguments.anyway and (others := overheard(channel, arguments.bit_rate)):
+        if not arguments.anyway and (others := list_unknown_senders(channel, arguments.bit_rate)):
             in_use.append(channel)
-            say(f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway")
+            print_text(
+                f"{channel}: others use this bus, and nothing was sent; add --anyway to request modules all the same"
+            )
             for other in others:
-                say(f"  {other}")
+                print_text(f"  {other}")
             continue
         wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
@@ -165,15 +167,15 @@ def scan_channels(arguments: argparse.Namespace) -> int:
         finally:
             wire.close()
         for line in align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
-            say(line)
+            print_text(line)
         found += rows
     if arguments.json:
         print_json({"drives": found, "in_use_by_others": in_use})
     return OK if found else FAILED
 
 
-def overheard(channel: str, bit_rate: int) -> list[UnknownFrames]:
-    """Who else is on a bus. Sends nothing."""
+def list_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
+    """Listen to a bus, without sending, and return what it carries that is not from joint modules."""
     check_channel(channel)
     bus = open_bus(channel, bit_rate)
     try:

@@ -38,7 +38,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
 
     emulators: Literal["here", "process", "none"] | None = None
     """Where emulated joint modules run: `here`, in a `process` that the driver starts, or `none` for real modules and
-    those of `snakesim drive emulate can`; not given: `here` without channels, `none` with them.
+    those of `snakesim drive emulate can`; default: `here` without channels, `none` with them.
     """
 
     physics_model: str = "mujoco"

@@ -33,7 +33,7 @@ class Service(ABC):
     """A service of a robot: the class behind an entry point in the group `snakesim.services`, and `[services.NAME]`.
 
     Derive from it, give it a `name`, and implement `outputs`. One thread makes all calls, one after the other: the
-    constructor, then `configure`, then for every due tick `outputs`. While the clock is silent it calls `silence`, and
+    constructor, then `configure`, then `outputs` for each due tick. While the clock is silent it calls `silence`, and
     while a simulator is paused `pause`. An exception of any call ends the service, and its log names the call.
     """
 

@@ -1,7 +1,7 @@
 """A half-duplex serial bus: a port behind a USB adapter, or a pseudo terminal with emulated drives at its other end.
 
 After a request the driver waits for the answer before it sends the next one. An FTDI adapter holds back received bytes
-until its latency timer expires, 16 ms by default; opening a port asks its driver for 1 ms.
+until its latency timer expires, 16 ms by default; opening a port sets it to 1 ms.
 """
 
 import contextlib

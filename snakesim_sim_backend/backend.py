@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import mujoco
 import numpy as np
 
@@ -15,16 +16,16 @@ from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import ClockMode, Description, Fault, LifecycleState
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.contacts import TouchReader
-from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
-from snakesim_sim_backend.model import FREE_QPOS, SimModel, build, of_joints
+from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, build, of_joints
+from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.registry import check_models
 from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.start import place_robot
-from snakesim_sim_backend.tether import TetherRope
-from snakesim_sim_backend.truth import TrueState
+from snakesim_sim_backend.state.contacts import TouchReader
+from snakesim_sim_backend.state.divergence import MAX_SPEED, DivergenceWatch, log_warnings
+from snakesim_sim_backend.state.start import place_robot
+from snakesim_sim_backend.state.truth import TrueState
 
 NAME = "sim"
 CLOSED = "the simulation is closed; open a new backend"
@@ -62,7 +63,7 @@ class SimBackend(Backend):
         Raises:
             ConfigError: the settings do not match the robot or the scene.
         """
-        self._description = describe_robot(
+        description = describe_robot(
             config.robot,
             backend=NAME,
             period_ns=config.period_ns,
@@ -78,6 +79,7 @@ class SimBackend(Backend):
 
         # Physics and motors, with the snake at rest.
         self._sim = build(config, settings)
+        self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)
         self._physics = Physics(self._sim, self._data)

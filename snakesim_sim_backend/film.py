@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP
-from snakesim_sim_backend.model import FOOT_GROUP, build, of_joints
+from snakesim_sim_backend.model.build import FOOT_GROUP, build, of_joints
+from snakesim_sim_backend.model.ground import GROUND, HILLS, PLANE_GROUP
 from snakesim_sim_backend.sensors.rendered import opened_context
 from snakesim_sim_backend.settings import SimSettings
 

@@ -15,15 +15,15 @@ from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
-from snakesim_sim_backend.loads import LoadReader
-from snakesim_sim_backend.model import FREE_DOFS, SimModel, build, of_joints
+from snakesim_sim_backend.model.build import FREE_DOFS, SimModel, build, of_joints
+from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
-from snakesim_sim_backend.start import place_robot
-from snakesim_sim_backend.tether import TetherRope
+from snakesim_sim_backend.state.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
+from snakesim_sim_backend.state.loads import LoadReader
+from snakesim_sim_backend.state.start import place_robot
 
 STEPS_PER_CHECK = 10  # the search for the cause of a divergence repeats them under the last torques
 MAX_ACCELERATION_SQUARED = MAX_ACCELERATION**2

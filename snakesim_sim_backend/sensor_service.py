@@ -13,7 +13,7 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, JointState, Message, Pose
-from snakesim_sim_backend.model import FREE_QPOS, build, of_joints
+from snakesim_sim_backend.model.build import FREE_QPOS, build, of_joints
 from snakesim_sim_backend.sensors.registry import mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import Reader, Scope
 from snakesim_sim_backend.settings import SimSettings

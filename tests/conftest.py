@@ -1,10 +1,12 @@
 """Every test runs with a state folder of its own and tries the same examples each time. A failure is shown at once."""
 
+import gc
 import random
 
 import pytest
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
+from snakesim_native.compile import SHIPPED_FOLDER, compile_all
 from snakesim_testing.hypothesis_profiles import load_profile
 
 pytest_plugins = ["snakesim_testing.contract.plugin", "snakesim_testing.messages"]
@@ -35,6 +37,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         random.Random(seed).shuffle(items)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Exclude the collected tests from garbage collection, which would visit all of them in every test."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):  # a worker of pytest-xdist prints nothing
         config.pluginmanager.register(FailuresAtOnce(config), "failures-at-once")
+        compile_all(SHIPPED_FOLDER)  # here, because a unit test may not start a compiler

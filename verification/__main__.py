@@ -35,6 +35,7 @@ PARTS = {
         ("verification.mutation", "--files", "lease.py", "lifecycle.py", "stop_ramp.py"),
     ),
     "decoders": Part("100,000 damaged payloads into every decoder", 1, ("verification.fuzz", "--payloads", "100000")),
+    "sanitizers": Part("physics tests with a C library that checks itself", 6, ("verification.sanitize",)),
     "contracts": Part(
         "tools of the campaign, and the rules of who may import whom",
         1,

@@ -17,7 +17,7 @@ CAN = "Subpackages of the CAN backend"
 PURE = "What keeps a robot safe is pure"
 WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_gnc", "mujoco", "Only the simulator runs MuJoCo"),
-    ("snakesim_gnc", "snakesim_sim_backend.model", NEIGHBORS),
+    ("snakesim_gnc", "snakesim_sim_backend.model.build", NEIGHBORS),
     ("snakesim_hal/host", "snakesim_gnc.guidance.service", NEIGHBORS),
     ("snakesim_operator/run", "zenoh", "Only the HAL's network room talks Zenoh"),
     ("snakesim_hal/host", "zenoh", "Only the HAL's network room talks Zenoh"),

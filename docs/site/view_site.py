@@ -28,8 +28,9 @@ COPY = ROOT / "build" / "viewed"  # so that a build meanwhile changes nothing
 SHEETS = ROOT / "build" / "view"
 WIDTHS_PX = {1400: 1000, 400: 1800}  # width: how much of the page's height a sheet shows
 SCHEMES = ("light", "dark")
-COLUMNS, ROWS = 3, 3
-TILE_PX = {1400: 700, 400: 400}  # width of a page on a sheet
+PAGES_PER_SHEET = 9
+COLUMNS = {1400: 3, 400: 9}
+TILE_PX = {1400: 700, 400: 280}  # width of a page on a sheet
 MIN_CONTRAST = 3.0  # WCAG for large text; the theme's small gray text is near 4
 LOAD_LIMIT_S = 60.0
 
@@ -91,9 +92,7 @@ def main() -> int:
         sys.exit("view: build/docs has no such page; run `make docs`")
     problems = [f"{page}: {problem}" for page in pages for problem in find_broken_links(page)]
     SHEETS.mkdir(parents=True, exist_ok=True)
-    for width in WIDTHS_PX:
-        for scheme in SCHEMES:
-            problems += view(pages, width, scheme, with_sheets=not arguments.no_sheets)
+    problems += view(pages, with_sheets=not arguments.no_sheets)
     for problem in problems:
         print(problem)
     print(f"{len(pages)} pages, {len(problems)} problems; sheets in {SHEETS.relative_to(ROOT)}")
@@ -123,24 +122,37 @@ def find_broken_links(page: Path) -> Iterator[str]:
                 yield f"broken anchor: {link}"
 
 
-def view(pages: list[Path], width: int, scheme: str, *, with_sheets: bool) -> Iterator[str]:
-    """Yield the problems of all pages at one width and color scheme, and write their contact sheets."""
-    tiles: list[tuple[Path, bytes]] = []
+def view(pages: list[Path], *, with_sheets: bool) -> Iterator[str]:
+    """Yield the problems of all pages at every width and color scheme, and write their contact sheets."""
+    tiles: dict[tuple[int, str], list[tuple[Path, bytes]]] = {
+        (width, scheme): [] for scheme in SCHEMES for width in WIDTHS_PX
+    }
     with chromium() as browser:
-        tab = browser.open("about:blank", width, WIDTHS_PX[width])
-        tab.size(width, WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
-        tab.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        tab = browser.open("about:blank")
+        tab.send("Network.enable")
+        tab.send("Network.setBlockedURLs", urls=["*search_index.js*"])  # large, and not needed here
         for page in pages:
             open_page(tab, page)
-            for problem in json.loads(tab.value(CHECK) or "[]"):
-                yield f"{page} ({width}, {scheme}): {problem}"
-            yield from (f"{page} ({width}, {scheme}): {error}" for error in tab.errors)
+            for width, scheme in tiles:
+                show(tab, width, scheme)
+                for problem in json.loads(tab.value(CHECK) or "[]"):
+                    yield f"{page} ({width}, {scheme}): {problem}"
+                if with_sheets:
+                    tiles[width, scheme].append((page, tab.picture()))
+            yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
             tab.errors.clear()
-            if with_sheets:
-                tiles.append((page, tab.picture()))
-    for number in range(0, len(tiles), COLUMNS * ROWS):
-        name = f"{width}-{scheme}-{number // (COLUMNS * ROWS):02}.png"
-        make_sheet(tiles[number : number + COLUMNS * ROWS], width).save(SHEETS / name)
+    for (width, scheme), pictures in tiles.items():
+        for number in range(0, len(pictures), PAGES_PER_SHEET):
+            name = f"{width}-{scheme}-{number // PAGES_PER_SHEET:02}.png"
+            make_sheet(pictures[number : number + PAGES_PER_SHEET], width).save(SHEETS / name)
+
+
+def show(tab: Tab, width: int, scheme: str) -> None:
+    """Give the window a width, and the page a color scheme."""
+    tab.size(width, WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
+    attribute = json.dumps("slate" if scheme == "dark" else "default")
+    tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")  # as the theme's own button does
+    time.sleep(0.3)  # until it is laid out, and colors have faded over
 
 
 def open_page(tab: Tab, page: Path) -> None:
@@ -159,11 +171,13 @@ def make_sheet(tiles: list[tuple[Path, bytes]], width: int) -> Image.Image:
     """Return pictures side by side, each under its page's path."""
     tile_width = TILE_PX[width]
     tile_height = WIDTHS_PX[width] * tile_width // width
-    sheet = Image.new("RGB", (COLUMNS * (tile_width + 8), ROWS * (tile_height + 24)), "gray")
+    columns = COLUMNS[width]
+    rows = PAGES_PER_SHEET // columns
+    sheet = Image.new("RGB", (columns * (tile_width + 8), rows * (tile_height + 24)), "gray")
     draw = ImageDraw.Draw(sheet)
     for number, (page, picture) in enumerate(tiles):
-        left = number % COLUMNS * (tile_width + 8)
-        top = number // COLUMNS * (tile_height + 24)
+        left = number % columns * (tile_width + 8)
+        top = number // columns * (tile_height + 24)
         draw.text((left + 4, top + 4), str(page), fill="white", font_size=14)
         with Image.open(io.BytesIO(picture)) as opened:
             sheet.paste(opened.convert("RGB").crop((0, 0, tile_width, tile_height)), (left, top + 24))

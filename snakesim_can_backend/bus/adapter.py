@@ -53,7 +53,7 @@ NEEDS = {
     "serial": SERIAL_PORT,
     "slcan": SERIAL_PORT,
     "socketcan": "an interface of the kernel, such as can0",
-    "socketcand": "a host and a port, which a channel cannot say; use another interface",
+    "socketcand": "a host and a port, which a channel cannot name; use another interface",
     "systec": WINDOWS,
     "usb2can": WINDOWS,
     "vector": WINDOWS,
@@ -292,7 +292,7 @@ class AdapterWire:
             return False
         if not self._fd and (message.is_extended_id or message.is_fd):
             return False
-        if self._echoes and self._echoes[frame] > 0:  # UDP does not say which end sent a datagram
+        if self._echoes and self._echoes[frame] > 0:  # UDP does not report which end sent a datagram
             self._echoes[frame] -= 1
             return False
         return self._only is None or message.arbitration_id >> NODE_BITS in self._only

@@ -3,7 +3,7 @@
 `SocketCanWire` is an interface of the kernel (can0, vcan0). python-can opens and filters it; frames go through its
 socket directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends
 in one process, for machines whose kernel has no CAN. It does *not* simulate arbitration and bit rate. It has errors, a
-full queue and an interface that goes down only as injected faults: see `bus_faults`.
+full queue and an interface that is down only as injected faults: see `bus_faults`.
 """
 
 import contextlib

@@ -169,19 +169,19 @@ def joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
             f"robot {config.robot.name!r} has {joints} joints; node ids of protocol version 1 go to {LAST_NODE}",
             code="drive/unsupported-setting",
         )
-    given = settings.joints_per_channel
-    if given and (len(given) != buses or sum(given) != joints):
+    joint_counts = settings.joints_per_channel
+    if joint_counts and (len(joint_counts) != buses or sum(joint_counts) != joints):
         raise ConfigError(
-            f"`backends.can.joints_per_channel` = {given} must be {buses} numbers that add up to the {joints} joints "
-            f"of robot {config.robot.name!r}",
+            f"`backends.can.joints_per_channel` = {joint_counts} must be {buses} numbers that add up to the {joints} "
+            f"joints of robot {config.robot.name!r}",
             code="bus/invalid-channel",
         )
     if buses > joints:
         raise ConfigError(
             f"`backends.can.channels` names {buses} channels for {joints} joints", code="bus/invalid-channel"
         )
-    if given:
-        return list(given)
+    if joint_counts:
+        return list(joint_counts)
     each, left_over = divmod(joints, buses)
     return [each + (bus < left_over) for bus in range(buses)]
 

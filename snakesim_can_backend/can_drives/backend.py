@@ -93,7 +93,7 @@ class CanDriveBackend(DriverTypeBackend):
             if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
                     f"{joint_label(config, joint)}: `id` = {joint.id}, and {cls.plural_noun} have ids of "
-                    f"{cls.first_id} to {cls.last_id}: {cls.reserved_ids}. Give its drive another id, and say that as "
+                    f"{cls.first_id} to {cls.last_id}: {cls.reserved_ids}. Give its drive another id, and set it as "
                     f"`id` of the joint",
                     code="drive/unsupported-setting",
                 )

@@ -7,6 +7,6 @@
 `reports`         the newest reports of all modules, in raw numbers
 `module_monitor`  detects faults of modules and buses
 `sensors`         makes the sensor messages: joint state, contacts, IMU, power
-`own_emulators`   emulated joint modules, if the scenario asks for them
+`own_emulators`   emulated joint modules, if the scenario requires them
 `offline`         replays a log of the bus
 """

@@ -172,7 +172,7 @@ def _identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) 
 
 def configure_modules(
     buses: Sequence[ModuleBus],
-    wanted: Mapping[int, Mapping[ModuleParameter, float]],
+    new_values: Mapping[int, Mapping[ModuleParameter, float]],
     limit_s: float,
     on_frame: Callable[[Frame], None] | None = None,
 ) -> dict[int, dict[ModuleParameter, float]]:
@@ -182,7 +182,7 @@ def configure_modules(
 
     Args:
         buses: the buses, with the nodes on them.
-        wanted: parameters to write, by node.
+        new_values: parameters to write, by node.
         limit_s: how long to wait at most.
         on_frame: gets all frames that are no expected answers.
 
@@ -195,9 +195,9 @@ def configure_modules(
     wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
     answer_layout = load_layouts()[Opcode.PARAMETER_ANSWER]
-    due = {node: list(ModuleParameter) for node in wanted}  # not answered yet
-    asked_at_s: dict[int, float] = {}  # when the request that a node has not answered was sent
-    in_force: dict[int, dict[ModuleParameter, float]] = {node: {} for node in wanted}
+    due = {node: list(ModuleParameter) for node in new_values}  # not answered yet
+    requested_at_s: dict[int, float] = {}  # when the request that a node has not answered was sent
+    in_force: dict[int, dict[ModuleParameter, float]] = {node: {} for node in new_values}
     end_s = time.monotonic() + limit_s
     while due:
         now_s = time.monotonic()
@@ -207,11 +207,11 @@ def configure_modules(
                 code="drive/silent",
             )
         for node, parameters in due.items():
-            if now_s - asked_at_s.get(node, -1.0) > ASK_EVERY_S:
+            if now_s - requested_at_s.get(node, -1.0) > ASK_EVERY_S:
                 parameter = parameters[0]
-                request = _make_request(node, parameter, wanted[node].get(parameter))
+                request = _make_request(node, parameter, new_values[node].get(parameter))
                 if wire_of[node].send(request):
-                    asked_at_s[node] = now_s
+                    requested_at_s[node] = now_s
         for _, frame in receive_frames(wires):
             node = parse_node(frame.id)
             is_answer = parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_layout.length
@@ -224,8 +224,8 @@ def configure_modules(
             if answer["index"] != parameter:
                 continue
             due[node].pop(0)
-            asked_at_s.pop(node, None)
-            _check_result(node, parameter, wanted[node].get(parameter), int(answer["result"]))
+            requested_at_s.pop(node, None)
+            _check_result(node, parameter, new_values[node].get(parameter), int(answer["result"]))
             in_force[node][parameter] = answer["value"]
         due = {node: parameters for node, parameters in due.items() if parameters}
     return in_force

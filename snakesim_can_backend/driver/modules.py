@@ -1,6 +1,6 @@
 """The joint modules of a robot on their buses, as `snakesim_drivers.kit.drives.Drives`.
 
-In every control cycle the driver sends a Sync. Every module answers with its samples of that instant, and then follows
+In every control cycle the driver sends a Sync. Every module answers with its samples of that moment, and then follows
 the setpoint that it received in the period before. So a command acts exactly one period after the state that it
 answers, whatever the load of the bus.
 """
@@ -59,7 +59,7 @@ class JointModules(Drives):
     def __init__(
         self, config: RunConfig, settings: CanSettings, clock: DriverClock, pose: str | None, readings: DriveReadings
     ) -> None:
-        """Open the buses. No module is asked for anything yet.
+        """Open the buses. Nothing is requested from a module yet.
 
         Args:
             config: the run, with the robot.

@@ -182,7 +182,7 @@ class EmulatorProcess:
             ) from error
 
     def stop(self) -> None:
-        """Terminate the child, and kill it if it does not end. Its output goes to this process's stderr."""
+        """Terminate the child, and kill it if it does not end. Its output is this process's stderr."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:

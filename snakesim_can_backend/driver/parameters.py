@@ -60,8 +60,8 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
             )
         if joint.limits.cable_turns is not None:
             raise ConfigError(
-                f"robot {robot.name!r}: `cable_turns` of {joint.name}: modules on CAN say angles up to 3.2767 rad, so "
-                f"turns cannot be counted; give the joint end stops, and leave `cable_turns` out",
+                f"robot {robot.name!r}: `cable_turns` of {joint.name}: modules on CAN report angles up to 3.2767 rad, "
+                f"so turns cannot be counted; give the joint end stops, and leave `cable_turns` out",
                 code="drive/unsupported-setting",
             )
         if joint.drive.port and joint.drive.port not in settings.channels:

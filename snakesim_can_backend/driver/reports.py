@@ -216,7 +216,7 @@ class ModuleReports:
             self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
     def _is_identify(self, frame: Frame) -> bool:
-        """Return whether a frame of another host only asks modules for their identity, which disturbs nothing."""
+        """Return whether a frame of another host only requests the identity of modules, which disturbs nothing."""
         if parse_opcode(frame.id) != Opcode.COMMAND or len(frame.data) != self._command_length:
             return False
         return self._read_action(frame.data) == (CommandAction.IDENTIFY,)

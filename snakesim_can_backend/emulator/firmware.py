@@ -206,7 +206,7 @@ class ModuleFirmware:
         return min(max(angle_rad, -limit_rad), limit_rad)
 
     def sync(self, count: int, reading: ModuleReadings) -> None:
-        """Answer a Sync with the sensor readings of that instant, then follow the newest setpoint.
+        """Answer a Sync with the sensor readings of that moment, then follow the newest setpoint.
 
         Args:
             count: number of the Sync, modulo 256.

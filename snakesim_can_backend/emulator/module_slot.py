@@ -101,7 +101,7 @@ class ModuleSlot:
 def assign_node_ids(robot: RobotFile, settings: CanSettings) -> list[int]:
     """Return the node id of every emulated module, tail to head.
 
-    A module has the number of its joint, unless the settings say that it is mounted with another id.
+    A module has the number of its joint, unless the settings give it another id.
 
     Raises:
         ConfigError: an id occurs more than once, or not at all.

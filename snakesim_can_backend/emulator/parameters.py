@@ -93,8 +93,8 @@ class ParameterStore:
 
     def _write(self, parameter: ModuleParameter, raw: int) -> ParameterResult:
         """Set the present value of a parameter to the float with these bits, if it is allowed."""
-        (wanted,) = _single.unpack((raw & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
-        value = clamp_to_range(PARAMETERS[parameter], wanted)
+        (requested,) = _single.unpack((raw & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
+        value = clamp_to_range(PARAMETERS[parameter], requested)
         if value is None:
             return ParameterResult.OUT_OF_RANGE
         if parameter in INTEGER_PARAMETERS and value != int(value):

@@ -48,7 +48,7 @@ class MoteusBackend(CanDriveBackend):
         if are_unknown or are_too_low:
             raise ConfigError(
                 f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {needed_kp:.4g} N·m/turn on, and "
-                f"`.kd` from {needed_kd:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
+                f"`.kd` from {needed_kd:.4g} N·m·s/turn: configure all controllers alike, and state their values in "
                 f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`",
                 code="drive/unsupported-setting",
             )

@@ -35,7 +35,7 @@ from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-TURN = 2 * math.pi  # rad
+REVOLUTION_RAD = 2 * math.pi  # rad
 LATCHED_MODES = (MoteusMode.FAULT, MoteusMode.TIMEOUT)  # until a stop, which also clears the reason
 NO_LIMIT = -1.0
 MODE_UNKNOWN = -1
@@ -73,7 +73,7 @@ class Controllers(CanDrives):
     """All controllers of a bus."""
 
     missing_identity_reason = (
-        "does not say its register map: it is off, has another id, or the bus another bit rate or sample point"
+        "does not report its register map: it is off, has another id, or the bus another bit rate or sample point"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
@@ -127,7 +127,9 @@ class Controllers(CanDrives):
         fault = int(registers[Register.FAULT])
         self._mode[i] = mode
         self.readings.mark_checked(i)
-        self.readings.set_motion(i, registers[Register.POSITION] * TURN, registers[Register.VELOCITY] * TURN)
+        self.readings.set_motion(
+            i, registers[Register.POSITION] * REVOLUTION_RAD, registers[Register.VELOCITY] * REVOLUTION_RAD
+        )
         self.readings.set_torque(i, registers[Register.TORQUE])
         self.states.note_report(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
         self.states.drives[i].errors = describe_fault(mode, fault)
@@ -194,11 +196,11 @@ class Controllers(CanDrives):
         kd = 0.0
         match mode:
             case Mode.POSITION:
-                position = target / TURN
+                position = target / REVOLUTION_RAD
                 kp = gains.stiffness
                 kd = gains.damping
             case Mode.VELOCITY:
-                velocity = target / TURN
+                velocity = target / REVOLUTION_RAD
                 kd = gains.velocity
             case Mode.TORQUE | Mode.PASSIVE:
                 torque = target
@@ -247,7 +249,7 @@ def describe_fault(mode: int, fault: int) -> str:
 def shaft_gains(joint: Joint) -> ShaftGains:
     """Return the gains of a joint at the shaft of its controller."""
     motor = joint.motor
-    joint_to_shaft = TURN / joint.drive.gear**2
+    joint_to_shaft = REVOLUTION_RAD / joint.drive.gear**2
     return ShaftGains(
         stiffness=motor.stiffness_nm_per_rad * joint_to_shaft,
         damping=motor.damping_nm_s_per_rad * joint_to_shaft,

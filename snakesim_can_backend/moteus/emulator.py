@@ -8,13 +8,13 @@ import math
 from dataclasses import dataclass, field
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
-from snakesim_can_backend.moteus.controllers import SERIAL_WORDS, TURN, configured_gains
+from snakesim_can_backend.moteus.controllers import REVOLUTION_RAD, SERIAL_WORDS, configured_gains
 from snakesim_can_backend.moteus.protocol import (
     BROADCAST_ID,
     FLOAT,
     REGISTER_MAP,
     REPLY,
-    REPLY_WANTED,
+    REPLY_REQUESTED,
     TYPES,
     WRITE,
     MoteusMode,
@@ -107,7 +107,7 @@ class EmulatedMoteus(CanEmulator):
         if Register.MODE in written:
             mode = int(written.pop(Register.MODE))
             self._obey(i, mode, written)
-        if frame.id & REPLY_WANTED:
+        if frame.id & REPLY_REQUESTED:
             answers = [self._answer(i, subframe) for subframe in subframes if subframe.kind not in (WRITE, REPLY)]
             source, _ = split_addresses(frame)
             self.send_frame(i, make_frame(self.controllers[i].id, source, *answers))
@@ -166,9 +166,9 @@ class EmulatedMoteus(CanEmulator):
             case Register.MODE:
                 return controller.mode
             case Register.POSITION:
-                return angle_rad / TURN
+                return angle_rad / REVOLUTION_RAD
             case Register.VELOCITY:
-                return velocity_rad_s / TURN
+                return velocity_rad_s / REVOLUTION_RAD
             case Register.TORQUE:
                 return torque_nm
             case Register.POWER | Register.VOLTAGE | Register.MOTOR_TEMPERATURE | Register.BOARD_TEMPERATURE:
@@ -211,10 +211,10 @@ class EmulatedMoteus(CanEmulator):
             target = 0.0
         elif kp:
             mode = Mode.POSITION
-            target = self.body.read_shaft(i)[0] if math.isnan(position) else position * TURN
+            target = self.body.read_shaft(i)[0] if math.isnan(position) else position * REVOLUTION_RAD
         elif kd:
             mode = Mode.VELOCITY
-            target = velocity * TURN
+            target = velocity * REVOLUTION_RAD
         else:
             mode = Mode.TORQUE
             target = torque
@@ -225,7 +225,7 @@ class EmulatedMoteus(CanEmulator):
             mode,
             target,
             limit_nm=limit_nm,
-            stiffness=kp * self._kp_nm_per_turn / TURN,
-            damping=kd * self._kd_nm_s_per_turn / TURN,
+            stiffness=kp * self._kp_nm_per_turn / REVOLUTION_RAD,
+            damping=kd * self._kd_nm_s_per_turn / REVOLUTION_RAD,
             speed_rad_s=joint.limits.speed_rad_s * joint.drive.gear,
         )

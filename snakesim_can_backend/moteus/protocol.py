@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import Frame
 HOST_ID = 0
 LAST_ID = 126
 BROADCAST_ID = 127  # every controller receives its frames
-REPLY_WANTED = 0x8000
+REPLY_REQUESTED = 0x8000
 REGISTER_MAP = 5  # the version of the register map that this file describes
 # Kinds of subframes: the high bits of their first byte.
 WRITE = 0x00
@@ -142,7 +142,7 @@ def make_frame(source: int, destination: int, *subframes: bytes, reply: bool = F
     data = b"".join(subframes)
     length = next(length for length in LENGTHS if length >= len(data))
     padded = data.ljust(length, bytes([NOTHING]))
-    reply_bit = REPLY_WANTED if reply else 0
+    reply_bit = REPLY_REQUESTED if reply else 0
     return Frame(reply_bit | source << 8 | destination, padded)
 
 

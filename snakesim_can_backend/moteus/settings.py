@@ -8,7 +8,7 @@ from snakesim_can_backend.can_drives.backend import CanDriveSettings
 
 
 class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
-    """The scenario's `[backends.moteus]` section. `watchdog_s` goes into every command."""
+    """The scenario's `[backends.moteus]` section. Every command has `watchdog_s`."""
 
     data_bit_rate: Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})] = 5_000_000
     """Bit rate of the data of a CAN FD frame."""

@@ -33,7 +33,7 @@ from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-TURN = 2 * math.pi  # rad
+REVOLUTION_RAD = 2 * math.pi  # rad
 EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of emulated axes whose robot file names none
 UNKNOWN_MAX_CURRENT_A = 1.0  # used if an axis' own limit cannot be read: even a small motor withstands it
 NO_LIMIT_SENT = -1.0
@@ -59,7 +59,7 @@ class Axis:
     damping: float  # N·m / (turn/s), position mode
     velocity_gain: float  # N·m / (turn/s), velocity mode
     speed_limit: float  # turns/s
-    torque_nm: float  # that the joint may ask for
+    torque_nm: float  # that the joint may command
     # What the axis reports.
     max_current_a: float  # the driver never sends a higher limit
     configured: dict[AxisSetting, float] = field(default_factory=dict[AxisSetting, float])  # read in bring-up
@@ -73,7 +73,7 @@ class Axes(CanDrives):
     """All axes of a bus."""
 
     missing_identity_reason = (
-        "does not say its version: it is off, has another id or bit rate, or firmware 0.5, which does not say it"
+        "does not report its version: it is off, has another id or bit rate, or firmware 0.5, which does not report it"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
@@ -120,7 +120,7 @@ class Axes(CanDrives):
         values = PAYLOADS[message].unpack(frame.data)
         match message:
             case MessageId.MOTION:
-                self.readings.set_motion(i, values[0] * TURN, values[1] * TURN)
+                self.readings.set_motion(i, values[0] * REVOLUTION_RAD, values[1] * REVOLUTION_RAD)
             case MessageId.CURRENT:
                 self.readings.set_torque(i, values[1] * self.axes[i].torque_constant)
             case MessageId.SUPPLY:
@@ -198,7 +198,7 @@ class Axes(CanDrives):
             )
         missing = self._missing_settings(i)
         if missing:
-            return f"does not say `{missing[0]}`: is `backends.odrive.endpoints` of its firmware?"
+            return f"does not report `{missing[0]}`: is `backends.odrive.endpoints` of its firmware?"
         axis = self.axes[i]
         axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._allowed_a)
         return "; ".join(find_objections(axis, self._watchdog_s))
@@ -279,9 +279,9 @@ class Axes(CanDrives):
             self._send_limits(i, limit_nm)
         match mode:
             case Mode.POSITION:
-                self._send(i, MessageId.SET_POSITION, target / TURN, 0, 0)
+                self._send(i, MessageId.SET_POSITION, target / REVOLUTION_RAD, 0, 0)
             case Mode.VELOCITY:
-                self._send(i, MessageId.SET_VELOCITY, target / TURN, 0.0)
+                self._send(i, MessageId.SET_VELOCITY, target / REVOLUTION_RAD, 0.0)
             case Mode.TORQUE | Mode.PASSIVE:
                 self._send(i, MessageId.SET_TORQUE, target)
         if mode != axis.mode:
@@ -331,9 +331,9 @@ def make_axis(joint: Joint, max_current_a: float) -> Axis:
     return Axis(
         torque_constant=motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
         position_gain=motor.stiffness_nm_per_rad / motor.damping_nm_s_per_rad,
-        damping=motor.damping_nm_s_per_rad / gear**2 * TURN,
-        velocity_gain=motor.velocity_gain_nm_s_per_rad / gear**2 * TURN,
-        speed_limit=joint.limits.speed_rad_s * gear / TURN,
+        damping=motor.damping_nm_s_per_rad / gear**2 * REVOLUTION_RAD,
+        velocity_gain=motor.velocity_gain_nm_s_per_rad / gear**2 * REVOLUTION_RAD,
+        speed_limit=joint.limits.speed_rad_s * gear / REVOLUTION_RAD,
         torque_nm=joint.limits.torque_nm / gear,
         max_current_a=max_current_a,
     )
@@ -360,7 +360,7 @@ def find_objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
     if not axis.torque_nm / axis.torque_constant <= current_a * (1 + ROUNDING):
         yield (
             f"has a current limit (`current_soft_max`) of {current_a:.4g} A, which is "
-            f"{current_a * axis.torque_constant:.3g} N·m, and its joint may ask for {axis.torque_nm:.3g} N·m: raise "
+            f"{current_a * axis.torque_constant:.3g} N·m, and its joint may command {axis.torque_nm:.3g} N·m: raise "
             f"the one, or lower `torque_nm`. If a driver was killed, it may have left a lower limit: restart the axis"
         )
     speed = configured[AxisSetting.SPEED]

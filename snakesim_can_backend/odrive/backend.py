@@ -54,7 +54,7 @@ class OdriveBackend(CanDriveBackend):
             )
         if joint.motor.torque_constant_nm_per_a is None and cls.has_real_bus(settings):
             raise ConfigError(
-                f"{where}: `torque_constant_nm_per_a` is not given, and ODrives measure and limit amperes: take it "
+                f"{where}: `torque_constant_nm_per_a` is missing, and ODrives measure and limit amperes: take it "
                 f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it",
                 code="drive/unsupported-setting",
             )
@@ -79,7 +79,7 @@ class OdriveBackend(CanDriveBackend):
         if settings.max_current_a is None:
             fix = (
                 "name the flat_endpoints.json of the axes' firmware in `backends.odrive.endpoints`, so that the driver "
-                "reads what each axis is configured for; or say it in `backends.odrive.max_current_a`"
+                "reads what each axis is configured for; or set it in `backends.odrive.max_current_a`"
             )
         raise ConfigError(
             f"{joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A "

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
-from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, TURN, needed_current_a
+from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, REVOLUTION_RAD, needed_current_a
 from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, read_all_endpoints
 from snakesim_can_backend.odrive.protocol import (
     PAYLOADS,
@@ -211,8 +211,8 @@ class EmulatedOdrive(CanEmulator):
             case MessageId.ERROR:
                 values = (axis.errors, axis.disarm_reason)
             case MessageId.MOTION:
-                counts = round(angle_rad / TURN * COUNTS_PER_TURN)
-                values = (counts / COUNTS_PER_TURN, velocity_rad_s / TURN)
+                counts = round(angle_rad / REVOLUTION_RAD * COUNTS_PER_TURN)
+                values = (counts / COUNTS_PER_TURN, velocity_rad_s / REVOLUTION_RAD)
             case MessageId.CURRENT:
                 current_a = torque_nm / axis.torque_constant
                 values = (current_a, current_a)
@@ -234,9 +234,9 @@ class EmulatedOdrive(CanEmulator):
         target = 0.0
         if axis.state == AxisState.CLOSED_LOOP:
             mode = MODES[control]
-            unit = 1.0 if control == ControlMode.TORQUE else TURN
+            unit = 1.0 if control == ControlMode.TORQUE else REVOLUTION_RAD
             target = axis.inputs[control - 1] * unit
-        damping = axis.velocity_gain / TURN
+        damping = axis.velocity_gain / REVOLUTION_RAD
         self.body.drive_motor(
             i,
             mode,
@@ -244,7 +244,7 @@ class EmulatedOdrive(CanEmulator):
             limit_nm=axis.current_soft_max_a * axis.torque_constant,
             stiffness=axis.position_gain * damping,
             damping=damping,
-            speed_rad_s=axis.vel_limit_turns_s * TURN,
+            speed_rad_s=axis.vel_limit_turns_s * REVOLUTION_RAD,
         )
 
     def _fail(self, i: int, axis: EmulatedAxis, error: AxisError) -> None:
@@ -263,7 +263,7 @@ def make_configuration(joint: Joint, settings: OdriveSettings) -> AxisConfigurat
     current_soft_max_a = needed_current_a(joint)
     if mounted.current_soft_max_a is not None:
         current_soft_max_a = mounted.current_soft_max_a
-    vel_limit_turns_s = joint.limits.speed_rad_s * joint.drive.gear / TURN
+    vel_limit_turns_s = joint.limits.speed_rad_s * joint.drive.gear / REVOLUTION_RAD
     if mounted.vel_limit_turns_s is not None:
         vel_limit_turns_s = mounted.vel_limit_turns_s
     return AxisConfiguration(

@@ -91,5 +91,5 @@ def read_endpoints(path: str) -> Endpoints:
                 code="file/not-readable",
             )
         ids[setting] = endpoint.id
-    firmware = file.fw_version.partition("-")[0]  # a release may have a suffix, which axes do not say
+    firmware = file.fw_version.partition("-")[0]  # a release may have a suffix, which axes do not report
     return Endpoints(firmware, file.hw_version, ids)

@@ -76,7 +76,7 @@ class Signal:
     def encode(self, value: float) -> int:
         """Return the raw number that is nearest to a value. Raises CodecError for a value out of range."""
         if not self.low <= value <= self.high:  # which NaN fails too
-            raise CodecError(f"{self.name} = {value} {self.unit} does not fit; it goes from {self.low} to {self.high}")
+            raise CodecError(f"{self.name} = {value} {self.unit} does not fit; allowed are {self.low} to {self.high}")
         if self.is_float:
             return int.from_bytes(_single.pack(value), "little")
         return round((value - self.offset) / self.scale)

@@ -150,7 +150,7 @@ class InlineBus:
         return True
 
     def _read_drives(self) -> None:
-        """Read all drives. Drives that have been silent for long are asked for their state as well."""
+        """Read all drives. Drives that have been silent for long get a request for their state as well."""
         silent = [i for i in range(len(self.spec.joints)) if self.readings.age_ns(i) > self._gap_ns]
         self.readings.require_check(silent)
         self.readings.count_request()

@@ -28,7 +28,7 @@ from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Messa
 
 LATCHED_STATES = ("fault", "estop")  # only the operator's reset ends them
 SILENT_AFTER_REQUESTS = 3  # unanswered ones: a single lost answer is no fault
-HEALTH_ROUNDS = 3  # one round asks each drive for its health once; after so many without an answer it is unknown
+HEALTH_ROUNDS = 3  # one round requests the health of each drive once; after so many without an answer it is unknown
 
 
 class DriverClock:

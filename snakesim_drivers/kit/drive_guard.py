@@ -55,19 +55,19 @@ class DriveGuard:
 
     # --- which drives are driven -----------------------------------------------------------------------------
 
-    def drives_to_command(self, wanted: frozenset[int], *, may_enable: bool) -> frozenset[int]:
-        """Return those of the wanted drives that get setpoints now.
+    def drives_to_command(self, requested: frozenset[int], *, may_enable: bool) -> frozenset[int]:
+        """Return those of the requested drives that get setpoints now.
 
         Args:
-            wanted: The drives that should follow setpoints.
+            requested: The drives that should follow setpoints.
             may_enable: Whether the robot is armed. Otherwise only drives that are driven already stay driven.
         """
         if self._starved:
             self._driven = NO_DRIVES
         elif may_enable:
-            self._driven = wanted - self._stopped
+            self._driven = requested - self._stopped
         else:
-            self._driven &= wanted - self._stopped
+            self._driven &= requested - self._stopped
         return self._driven
 
     def release_drives(self) -> bool:

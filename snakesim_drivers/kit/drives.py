@@ -24,7 +24,7 @@ Errors
     followers, and then closes. A drive that is silent or reports an error is no exception but a `Finding`.
 
 All drives are numbered by their place on this bus, from tail to head. All values are those at the shafts of the drives,
-in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure goes into the
+in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure is stored in the
 `DriveReadings` that the driver type gets when the bus is opened; a value that is not finite counts as not measured.
 """
 

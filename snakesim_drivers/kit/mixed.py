@@ -61,10 +61,10 @@ def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     """
     driver = joint.drive.driver
     where = f"robot {robot.name!r}, {joint.name}: `driver`"
-    fix = f"say it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
+    fix = f"set it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
     if not driver:
         raise ConfigError(
-            f"{where} is not given, and the backend `mixed` drives each joint by its driver type: {fix}",
+            f"{where} is missing, and the backend `mixed` drives each joint by its driver type: {fix}",
             code="drive/unknown-type",
         )
     try:
@@ -83,15 +83,15 @@ def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBacke
     """Return the joints of a driver type, and its settings from the scenario."""
     name = driver.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
     section = f"backends.{name}"
-    given = config.backends.get(name, {})
-    robot_wide = sorted(given.keys() & {*BodySettings.__struct_fields__})
+    section_values = config.backends.get(name, {})
+    robot_wide = sorted(section_values.keys() & {*BodySettings.__struct_fields__})
     if robot_wide:
         raise ConfigError(
             f"`{section}.{robot_wide[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-            f"say `backends.mixed.{robot_wide[0]}`",
+            f"set `backends.mixed.{robot_wide[0]}`",
             code="config/conflict",
         )
-    settings = plugin_settings(driver_type, given, f"scenario {config.name!r}", section)
+    settings = plugin_settings(driver_type, section_values, f"scenario {config.name!r}", section)
     joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
     return DriverTypePart(driver_type, settings, section, joints)
 

@@ -44,7 +44,7 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
 
     Args:
         config: The run.
-        pose_listen: The setting; None or empty: not given.
+        pose_listen: The setting; None or empty: no receiver.
 
     Raises:
         ConfigError: The robot file has no pose sensor.
@@ -115,7 +115,7 @@ class MocapReceiver:
         """Return the newest pose since the last call, with the robot time of its capture; None without a valid one.
 
         Args:
-            tick: Number of the control cycle, which goes into the pose.
+            tick: Number of the control cycle, which the pose carries.
             timestamp_ns: The present robot time.
 
         Raises:

@@ -6,7 +6,7 @@ target that keeps its present torque,
     target = q + (tau + kd q') / kp
 
 and the offset between this target and the reference fades to zero. A joint that enters torque mode starts from its
-present torque, and the wanted torque fades in. Both fades advance by the same fraction in a tick.
+present torque, and the requested torque fades in. Both fades advance by the same fraction in a tick.
 """
 
 from typing import Annotated
@@ -40,7 +40,7 @@ class HandOver:
         # Torque mode.
         self._torque_joint: int | None = None
         self._start_torque_nm = 0.0
-        self._faded_in = 1.0  # fraction of the wanted torque, 0 to 1
+        self._faded_in = 1.0  # fraction of the requested torque, 0 to 1
 
     def start(self, joints: JointState, reference_rad: Floats) -> None:
         """Put all joints in position mode, with targets that keep the present torques."""
@@ -55,7 +55,7 @@ class HandOver:
         self._offset_rad -= change_rad
 
     def fade(self, fraction: float) -> None:
-        """Reduce the position offsets by a fraction, and fade the wanted torque in by the same fraction."""
+        """Reduce the position offsets by a fraction, and fade the requested torque in by the same fraction."""
         self._offset_rad *= max(0.0, 1.0 - fraction)
         self._faded_in = min(1.0, self._faded_in + fraction)
 
@@ -68,7 +68,7 @@ class HandOver:
             torque_joint: index of the joint that is in torque mode from now on; None for no joint.
             joints: measured joint states.
             reference_rad: reference angles of all joints.
-            anew: fade in again even if the joint is the same, because the wanted torque may have jumped.
+            anew: fade in again even if the joint is the same, because the requested torque may have jumped.
         """
         if torque_joint == self._torque_joint and not anew:
             return
@@ -87,9 +87,9 @@ class HandOver:
         """Return the targets of the joints in position mode."""
         return reference_rad + self._offset_rad
 
-    def torque_nm(self, wanted_nm: float) -> float:
+    def torque_nm(self, requested_nm: float) -> float:
         """Return the target of the joint in torque mode."""
-        return (1.0 - self._faded_in) * self._start_torque_nm + self._faded_in * wanted_nm
+        return (1.0 - self._faded_in) * self._start_torque_nm + self._faded_in * requested_nm
 
 
 class BumplessReference:

@@ -1,7 +1,7 @@
 """The net force of the measured contacts on a body, and why a body does not move.
 
 All forces on a stationary body are in balance: the ground friction takes up the sum of the contact forces.
-Forces are means over FELT_OVER_S, because the force of one instant depends on how hard the surfaces are
+Forces are means over FORCE_MEAN_S, because the force of one moment depends on how hard the surfaces are
 (see `measured_force`).
 """
 
@@ -36,7 +36,7 @@ class MeasuredContacts:
     def add_world(self, world: World) -> None:
         """Add the contacts of a world model; the same contacts may come again.
 
-        Contacts that were estimated from joint torques say where the body touches, but not how hard, so they clear
+        Contacts that were estimated from joint torques show where the body touches, but not how hard, so they clear
         the average.
         """
         timestamp_ns = world.contacts_timestamp_ns

@@ -67,19 +67,19 @@ class ContactSearch:
         self.changed = False  # a wave began or ended in this tick
 
     def decide(
-        self, observation: Observation, center_w: Floats, *, wanted_m_s: float, near: bool
+        self, observation: Observation, center_w: Floats, *, desired_m_s: float, near: bool
     ) -> LateralUndulation | None:
         """Return the wave by which to move at this tick; None: follow the path.
 
         Args:
             observation: inputs of this tick.
             center_w: (2,) m, center of the body.
-            wanted_m_s: wanted speed along the path.
+            desired_m_s: desired speed along the path.
             near: obstacles are within reach of the body.
         """
         last_wave = self._wave
         if last_wave is None:
-            if self._stands_still(observation, center_w, abs(wanted_m_s)):
+            if self._stands_still(observation, center_w, abs(desired_m_s)):
                 self._begin_s = observation.time_s
                 self._begin_wave(self._choose_first_wave(center_w, near=near), observation)
         elif observation.time_s - self._begin_s >= self._for_s:
@@ -124,8 +124,8 @@ class ContactSearch:
             self._nearest_m = distance_m
         return observation.time_s - self._progress_s < PROGRESS_S
 
-    def _stands_still(self, observation: Observation, center_w: Floats, wanted_m_s: float) -> bool:
+    def _stands_still(self, observation: Observation, center_w: Floats, desired_m_s: float) -> bool:
         if self._origin_w is None:
             self._origin_w = center_w
-        max_distance_m = min(STANDSTILL_M, 0.5 * wanted_m_s * self._after_s)
+        max_distance_m = min(STANDSTILL_M, 0.5 * desired_m_s * self._after_s)
         return self._standstill.update(observation.time_s, observation.period_s, center_w, max_distance_m)

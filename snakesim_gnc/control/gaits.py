@@ -54,7 +54,7 @@ class _Gait(Controller[GaitParametersT]):
         self._missing = _explain_missing_joints(self._yaw, self._pitch)
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Advance the gait while motion is wanted; a robot without the necessary joints holds its pose."""
+        """Advance the gait while motion is requested; a robot without the necessary joints holds its pose."""
         if self._missing or not motion_wanted(observation):
             return self._bumpless.hold(observation, self._missing)
         self._phase_rad += math.tau * observation.period_s / self.parameters.period_s

@@ -33,7 +33,7 @@ class JointCheckParameters(FileStruct, frozen=True):
     """Speed of a joint's target."""
 
     give_up_rad: Annotated[float, bounded(0.02, 0.5, "rad")] = 0.15
-    """Distance of the target at which a joint that has not moved is given up, and the next one follows."""
+    """Distance of the target at which a joint that has not moved counts as stuck, and the next one follows."""
 
     rest_s: Annotated[float, bounded(0.02, 5.0, "s")] = 0.15
     """Rest before each of a joint's two motions, and after them."""

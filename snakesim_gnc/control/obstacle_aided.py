@@ -12,7 +12,7 @@ If the obstacles can balance the push and the drives have a torque mode, the joi
     tau = tau_push + tau_shape,    tau_shape = k (theta(s) - q) + d (theta' v - q')
 
 with gains k and d so low that obstacles decide the shape. The component of tau_shape along theta' is removed, so that
-the shape does not push along the path and the wanted forces come true.
+the shape does not push along the path and the desired forces are reached.
 
 Otherwise the joints are in position mode, with the target theta(s + l) + tau_push / kp. The torques then only close
 gaps, and the shape itself pushes, by its look-ahead l: tau_i = kp_i (theta_i(s + l) - theta_i(s)), hence by virtual
@@ -178,18 +178,18 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._search = ContactSearch(robot, after_s=parameters.search_after_s, for_s=parameters.search_s)
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return torques, or angles of the body further along the path, as far as the wanted speed needs it."""
+        """Return torques, or angles of the body further along the path, as far as the desired speed needs it."""
         located = self._progress.update(observation)
         if isinstance(located, str):
             self._holding = True
             return self._bumpless.hold(observation, located)
         self._contacts.add_world(located.world)
-        wanted_m_s = located.trajectory.speed_m_s
-        if wanted_m_s == 0.0:  # whatever path is planned meanwhile
+        desired_m_s = located.trajectory.speed_m_s
+        if desired_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(observation)
         lift_rad = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
         center_w = located.nodes_w.mean(axis=1)
-        wave = self._search.decide(observation, center_w, wanted_m_s=wanted_m_s, near=self._has_near_obstacles())
+        wave = self._search.decide(observation, center_w, desired_m_s=desired_m_s, near=self._has_near_obstacles())
         if wave is not None:
             return self._undulate(observation, wave, lift_rad)
 
@@ -279,7 +279,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         return ControllerCommand(setpoints, Telemetry(reason=why, reference_rad=reference.tolist()))
 
     def _rest(self, observation: Observation) -> ControllerCommand:
-        """Keep every joint where it is, without a push: the wanted speed is 0."""
+        """Keep every joint where it is, without a push: the desired speed is 0."""
         self._stop_pushing()
         self._look_ahead_integral_m = 0.0
         self._moved_at_s = observation.time_s
@@ -314,13 +314,13 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _update_push_torques(self, observation: Observation, located: Located, theta_prime: Floats) -> Floats:
         """Return tau_push: the joint torques, (n_joints,), of the force F = lag_kp integral e dt + speed_kp e."""
         parameters = self.parameters
-        wanted_m_s = located.trajectory.speed_m_s
-        if wanted_m_s <= 0.0 or parameters.max_push_n == 0.0:
+        desired_m_s = located.trajectory.speed_m_s
+        if desired_m_s <= 0.0 or parameters.max_push_n == 0.0:
             self._push_integral_n = 0.0
             self._force_n = 0.0
             self._snapshot = None
             return np.zeros(len(self.robot.joints))
-        error_m_s = wanted_m_s - located.speed_m_s
+        error_m_s = desired_m_s - located.speed_m_s
         gain = 1.0
         if abs(located.speed_m_s) < CREEP_SPEED_M_S:
             gain = CREEP_GAIN

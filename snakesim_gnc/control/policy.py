@@ -45,7 +45,7 @@ SUFFIX = ".onnx"
 
 
 class Model:
-    """A model from a file, with what its metadata say. Calling it computes targets from an observation."""
+    """A model from a file, with its metadata. Calling it computes targets from an observation."""
 
     def __init__(self, robot: Description, file: str) -> None:
         """Load the model and check that it fits the robot.

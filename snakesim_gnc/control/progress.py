@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
-from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
+from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_time_ns
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.model.route import Route
@@ -30,7 +30,7 @@ class Located:
     tail_s_m: float  # arc length of the tail end
     speed_m_s: float
 
-    # At the instant of the last pose.
+    # At the time of the last pose.
     nodes_w: Floats  # (2, n_nodes) m, tail to head
     measured_s_m: float  # arc length of the tail end
 
@@ -41,7 +41,7 @@ class Located:
 
 
 class PathProgress:
-    """Tracks the body along the path with an alpha-beta filter over poses, each with the joint angles of its instant.
+    """Tracks the body along the path with an alpha-beta filter over poses, each with the joint angles at its time.
 
     Only the yaw joints bend; all others count as straight. Between poses the arc length is extrapolated at the last
     speed, so that the result is always for the present. A world model that repeats a pose is not a new measurement:
@@ -65,10 +65,10 @@ class PathProgress:
 
         # The last world model and the last pose.
         self._world_tick: int | None = None
-        self._measured_ns: int | None = None  # instant of the pose; None: the body's position is unknown
+        self._measured_ns: int | None = None  # time of the pose; None: the body's position is unknown
         self._nodes = np.empty((2, 0))
 
-        # The state of the filter at that instant.
+        # The state of the filter at that time.
         self._s_m = 0.0
         self._speed_m_s = 0.0
 
@@ -109,9 +109,9 @@ class PathProgress:
         )
 
     def _measure(self, body: BodyOnPath, world: World, observation: Observation, *, is_new_path: bool) -> int:
-        """Localize the body if the path or the pose is new. Return the instant of the newest pose in ns."""
+        """Localize the body if the path or the pose is new. Return the time of the newest pose in ns."""
         last_ns = self._measured_ns
-        pose_ns = pose_instant_ns(world)
+        pose_ns = pose_time_ns(world)
         measured_ns = pose_ns
         if last_ns is None or pose_ns > last_ns:
             self._nodes = self._planar.nodes_w(world, self._angles.nearest_to(pose_ns))

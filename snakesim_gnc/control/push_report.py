@@ -20,7 +20,7 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: UnitPush
         world: the world model in which the contacts were found.
         touches: contacts of the body.
         push: forces for 1 N along the body.
-        force_n: wanted force along the body.
+        force_n: desired force along the body.
     """
     points: list[WorldContact] = []
     for k in np.argsort(touches.body_s_m, kind="stable").tolist():
@@ -73,7 +73,7 @@ def explain_push_standstill(
     Args:
         touches: contacts of the body.
         push: forces for 1 N along the body.
-        force_n: wanted force along the body.
+        force_n: desired force along the body.
         max_force_n: what torques and contacts allow of it.
         net_force: measured contact forces along the body; None without a sensor.
         push_points: names of the obstacles that should be pushed.

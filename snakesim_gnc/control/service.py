@@ -34,7 +34,7 @@ from snakesim_hal.wire.messages import (
     World,
 )
 
-# Sensor samples that a controller may ask for.
+# Sensor samples that a controller may request.
 SENSED: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 Outputs = list[tuple[str, Message]]  # messages to publish, with their keys
@@ -59,8 +59,8 @@ class Control(Service):
         self._statuses = client.session.reader(keys.STATUS, Status)
         self._last_clock: Clock | None = None
 
-        # Inputs of a controller that asks for sensor samples.
-        self._task: Task | None = None  # None: the controller does not ask for samples
+        # Inputs of a controller that requests sensor samples.
+        self._task: Task | None = None  # None: the controller requests no samples
         self._sensor_feeds: dict[str, Feed[Message]] = {}
         self._sensor_samples: dict[str, Message] = {}  # the newest of each key
         if self._parameters.uses_sensors:
@@ -131,7 +131,7 @@ class Control(Service):
     def silence(self) -> Outputs:
         """Report why no clock arrives: time is paused, or the HAL is silent altogether, which is PowerOff.
 
-        The controller is kept. The next tick decides whether it goes on.
+        The controller stays. The next tick decides whether it continues.
         """
         clock = self._last_clock
         if clock is None:
@@ -206,7 +206,7 @@ class Control(Service):
         return world, trajectory, "; ".join(late)
 
     def _read_sensor_samples(self, clock: Clock) -> SensorSamples | None:
-        """Return the newest sensor samples, and which are too old; None for a controller that does not ask for them."""
+        """Return the newest sensor samples, and which are too old; None for a controller that requests none."""
         if self._task is None:
             return None
         for key, feed in self._sensor_feeds.items():

@@ -63,7 +63,7 @@ class StateReports:
             clock: the last clock.
             telemetry: the controller's telemetry; None if the controller was not called.
             silent: why neither clock nor status arrives; see `locomotion_state`.
-            paused: why no clock arrives. If `silent` or `paused` is given, the message is always due, because robot
+            paused: why no clock arrives. If `silent` or `paused` is set, the message is always due, because robot
                 time does not advance.
             armed: see `locomotion_state`.
             missing: see `locomotion_state`.

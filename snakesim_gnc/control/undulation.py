@@ -203,8 +203,8 @@ class CompliantUndulation(HeadSteeredUndulation):
         assert isinstance(parameters, CompliantUndulationParameters)
         # Drives measure their own torque; the torque from outside is opposite to it.
         generalized_force_nm = -float(waves @ np.array(observation.joints.torque_nm)[self._body.bends])
-        wanted_rad = parameters.amplitude_rad + parameters.softness_rad_per_nm * generalized_force_nm
-        bounded_rad = min(max(wanted_rad, 0.0), 2.0 * parameters.amplitude_rad)
+        desired_rad = parameters.amplitude_rad + parameters.softness_rad_per_nm * generalized_force_nm
+        bounded_rad = min(max(desired_rad, 0.0), 2.0 * parameters.amplitude_rad)
         gain = 1.0 - math.exp(-abs(passed_s) / parameters.yield_s)
         self._yielded_amplitude_rad += gain * (bounded_rad - self._yielded_amplitude_rad)
         return self._yielded_amplitude_rad

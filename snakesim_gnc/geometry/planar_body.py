@@ -15,7 +15,7 @@ from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
 
-TICKS_KEPT = 128  # of joint angles: more than the latency of any pose
+MAX_TICKS = 128  # of joint angles: more than the latency of any pose
 
 
 class PlanarBody:
@@ -56,7 +56,7 @@ class PlanarBody:
 
         Args:
             world: the pose of the base.
-            angles_rad: of all joints, at the instant of that pose.
+            angles_rad: of all joints, at the time of that pose.
         """
         if not self._all_bend:
             # A link that is pitched up is shorter, as seen from above.
@@ -84,7 +84,7 @@ class RecentAngles:
     """Stores the joint angles of the last ticks, for a pose that is some ticks old."""
 
     def __init__(self) -> None:
-        self._entries: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
+        self._entries: deque[tuple[int, list[float]]] = deque(maxlen=MAX_TICKS)
 
     def __bool__(self) -> bool:
         return bool(self._entries)
@@ -95,12 +95,12 @@ class RecentAngles:
             self._entries.append((timestamp_ns, angles_rad))
 
     def nearest_to(self, timestamp_ns: int) -> list[float]:
-        """Return the angles that were measured nearest to an instant."""
+        """Return the angles that were measured nearest to a time."""
         _, angles_rad = min(self._entries, key=lambda entry: abs(entry[0] - timestamp_ns))
         return angles_rad
 
 
-def pose_instant_ns(world: World) -> int:
+def pose_time_ns(world: World) -> int:
     """Return when the body was at the world's base pose.
 
     A measured pose has the timestamp of the sensor. A dead-reckoned pose has that of the world model itself.

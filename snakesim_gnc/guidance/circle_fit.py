@@ -60,7 +60,7 @@ def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: 
     error_m = np.hypot(offset[..., 0], offset[..., 1]) - radius[:, None]
     misfit = np.minimum(weight * error_m * error_m, OUTLIER_SD**2).sum(axis=1)
     surplus_points = np.maximum((weight > 0).sum(axis=1) - 3, 1)
-    # If the points scatter more than their weights say, the result is less certain by that.
+    # If the points scatter more than their weights imply, the result is less certain by that.
     excess = np.maximum(misfit / surplus_points, 1.0)
     return Circles(center, radius, np.linalg.inv(information) * excess[:, None, None], misfit)
 

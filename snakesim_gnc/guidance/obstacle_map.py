@@ -1,8 +1,8 @@
 """The map: obstacles from scans, touches and the body's own path. Pure.
 
-Each measured point goes to the obstacle on whose outline it lies; points that lie on none begin a new obstacle. Where a
-scan sees through an obstacle, or the body lies in it, the obstacle loses that part of its surface. An obstacle without
-a surface is dropped.
+Each measured point belongs to the obstacle on whose outline it lies; points that lie on none begin a new obstacle.
+Where a scan sees through an obstacle, or the body lies in it, the obstacle loses that part of its surface. An obstacle
+without a surface is dropped.
 """
 
 import math
@@ -66,7 +66,7 @@ SKIN_SD_M = 0.004
 
 # Memory.
 MAX_TRACKS = 1024
-KEPT_M = 4.0  # from the body; obstacles farther away are forgotten
+FORGET_DISTANCE_M = 4.0  # from the body; obstacles farther away are forgotten
 SCAN_MARGIN_M = 1.0  # beyond the range of a scan: obstacles whose center is within it may be seen
 
 
@@ -163,9 +163,11 @@ class ObstacleMap:
 
     def forget(self, axis_w: Floats) -> None:
         """Forget obstacles far from the body's axis (n, 2), and the least believed ones if there are too many."""
-        kept = [track for track in self.tracks if _distance_m(track, axis_w) < KEPT_M + _size_m(track)]
-        kept.sort(key=lambda track: -track.log_odds)
-        self.tracks = sorted(kept[:MAX_TRACKS], key=lambda track: track.number)
+        near_tracks = [
+            track for track in self.tracks if _distance_m(track, axis_w) < FORGET_DISTANCE_M + _size_m(track)
+        ]
+        near_tracks.sort(key=lambda track: -track.log_odds)
+        self.tracks = sorted(near_tracks[:MAX_TRACKS], key=lambda track: track.number)
 
     def _divide_cluster(
         self, cluster: Indices, scan: Scan, near: Sequence[Track], outlines: Outlines, sd_m: float
@@ -191,7 +193,7 @@ class ObstacleMap:
         if not owners:
             return self._claim_for_new_track(cluster, scan)
 
-        # Every point goes to the nearest owner, except for points well off a circle whose shape is sure.
+        # Every point is assigned to the nearest owner, except for points well off a circle whose shape is sure.
         owner = np.array(owners)[distance_m[:, owners].argmin(axis=1)]
         is_apart = np.zeros(len(cluster), dtype=bool)
         for index in owners:

@@ -67,16 +67,16 @@ class Surface:
         """Add the cells of another surface."""
         self.add(other.points_w, 1.0 / np.sqrt(other.weight), other.outward_w, other.normal_weight)
 
-    def keep(self, is_kept: NDArray[np.bool_]) -> None:
-        """Drop the cells that are not kept, (n,)."""
-        if is_kept.all():
+    def keep(self, selected: NDArray[np.bool_]) -> None:
+        """Drop the cells that are not selected, (n,)."""
+        if selected.all():
             return
-        self.points_w = self.points_w[is_kept]
-        self.weight = self.weight[is_kept]
-        self.outward_w = self.outward_w[is_kept]
-        self.normal_weight = self.normal_weight[is_kept]
-        self.count = self.count[is_kept]
-        self.doubts = self.doubts[is_kept]
+        self.points_w = self.points_w[selected]
+        self.weight = self.weight[selected]
+        self.outward_w = self.outward_w[selected]
+        self.normal_weight = self.normal_weight[selected]
+        self.count = self.count[selected]
+        self.doubts = self.doubts[selected]
 
     def drift(self, variance_m2: float) -> None:
         """Lower the information, because the robot's position has become less certain since the measurements."""

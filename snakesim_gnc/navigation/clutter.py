@@ -19,6 +19,7 @@ import numpy as np
 
 from snakesim_gnc.geometry.planar import space_evenly
 from snakesim_gnc.navigation.intents import DesiredMotion
+from snakesim_gnc.navigation.native_growth import is_native_available
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.plan import (
     BACKED_OUT,
@@ -90,6 +91,8 @@ class ClutterPlanner:
             search: the robot, and the costs of the search.
             turn_s: from one update to the next, or the latency of the service if that is less.
         """
+        is_native_available()  # loads the C library now, which may take seconds and must not happen in an update
+
         # Configuration.
         self._goal = PlanningGoal(goal, search.body_length_m)
         self._known = None if known is None else ObstacleGrid(known)

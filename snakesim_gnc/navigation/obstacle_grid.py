@@ -58,32 +58,32 @@ class ObstacleGrid:
             return
         outlines = self.outlines
         reach_m = outlines.reach_m + MAX_DISTANCE_M
-        self._low_w = (outlines.center_w - reach_m[:, None]).min(axis=0)
+        self.low_w = (outlines.center_w - reach_m[:, None]).min(axis=0)
         high_w = (outlines.center_w + reach_m[:, None]).max(axis=0)
-        columns, rows = (np.ceil((high_w - self._low_w) / CELL_M).astype(int) + 1).tolist()
-        self._shape = (columns, rows)
-        nearest = np.full(self._shape, NO_OBSTACLE, dtype=np.intp)
-        distance_m = np.full(self._shape, MAX_DISTANCE_M)
+        columns, rows = (np.ceil((high_w - self.low_w) / CELL_M).astype(int) + 1).tolist()
+        self.shape = (columns, rows)
+        nearest = np.full(self.shape, NO_OBSTACLE, dtype=np.intp)
+        distance_m = np.full(self.shape, MAX_DISTANCE_M)
         for index, (center_w, radius_m) in enumerate(zip(outlines.center_w, reach_m, strict=True)):
             if index % OBSTACLES_PER_STEP == 0:
                 yield NODES_PER_OBSTACLE * min(OBSTACLES_PER_STEP, len(outlines) - index)
             self._mark_obstacle(index, center_w, radius_m, nearest, distance_m)
-        self._nearest = nearest.ravel()
-        self._distance_m = distance_m.ravel()
+        self.cell_nearest = nearest.ravel()
+        self.cell_distance_m = distance_m.ravel()
 
     def _fill_empty(self) -> None:
         """Make a grid of one cell, which is free."""
-        self._low_w = np.zeros(2)
-        self._shape = (1, 1)
-        self._nearest = np.full(1, NO_OBSTACLE, dtype=np.intp)
-        self._distance_m = np.full(1, MAX_DISTANCE_M)
+        self.low_w = np.zeros(2)
+        self.shape = (1, 1)
+        self.cell_nearest = np.full(1, NO_OBSTACLE, dtype=np.intp)
+        self.cell_distance_m = np.full(1, MAX_DISTANCE_M)
 
     def _mark_obstacle(self, index: int, center_w: Floats, radius_m: float, nearest: Ints, distance_m: Floats) -> None:
         """Write an obstacle into the cells within a radius of its center that have no nearer one."""
-        first = np.maximum(((center_w - radius_m - self._low_w) / CELL_M).astype(int), 0)
-        last = np.minimum(((center_w + radius_m - self._low_w) / CELL_M).astype(int) + 2, self._shape)
-        x = self._low_w[0] + CELL_M * np.arange(first[0], last[0])
-        y = self._low_w[1] + CELL_M * np.arange(first[1], last[1])
+        first = np.maximum(((center_w - radius_m - self.low_w) / CELL_M).astype(int), 0)
+        last = np.minimum(((center_w + radius_m - self.low_w) / CELL_M).astype(int) + 2, self.shape)
+        x = self.low_w[0] + CELL_M * np.arange(first[0], last[0])
+        y = self.low_w[1] + CELL_M * np.arange(first[1], last[1])
         cells_w = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
         to_obstacle_m, _ = self.outlines.distance_and_normal(cells_w, np.full(cells_w.shape[:2], index))
         window = (slice(first[0], last[0]), slice(first[1], last[1]))
@@ -97,13 +97,13 @@ class ObstacleGrid:
         Points without an obstacle within MAX_DISTANCE_M get MAX_DISTANCE_M.
         """
         is_inside, cell = self._find_cells(x, y)
-        return np.where(is_inside, self._distance_m[cell], MAX_DISTANCE_M)
+        return np.where(is_inside, self.cell_distance_m[cell], MAX_DISTANCE_M)
 
     def find_nearest(self, x: Floats, y: Floats) -> NearestObstacles:
         """Find the obstacle nearest to each point of the world, with the exact distance. x, y: arrays of one shape."""
         shape = np.shape(x)
         is_inside, cell = self._find_cells(x, y)
-        obstacle = np.where(is_inside, self._nearest[cell], NO_OBSTACLE)
+        obstacle = np.where(is_inside, self.cell_nearest[cell], NO_OBSTACLE)
         distance_m = np.full(shape, MAX_DISTANCE_M)
         normal_w = np.zeros((*shape, 2))
         has_obstacle = obstacle >= 0
@@ -116,8 +116,8 @@ class ObstacleGrid:
 
     def _find_cells(self, x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Ints]:
         """Return which points are in the grid, and the index of their cell, 0 for points outside."""
-        columns, rows = self._shape
-        column = ((x - self._low_w[0]) / CELL_M + 0.5).astype(int)
-        row = ((y - self._low_w[1]) / CELL_M + 0.5).astype(int)
+        columns, rows = self.shape
+        column = ((x - self.low_w[0]) / CELL_M + 0.5).astype(int)
+        row = ((y - self.low_w[1]) / CELL_M + 0.5).astype(int)
         is_inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
         return is_inside, np.where(is_inside, column * rows + row, 0)

@@ -36,16 +36,23 @@ class ArcTable:
     """The arcs of all curvatures, computed once."""
 
     def __init__(self, parameters: SearchParameters) -> None:
-        self._parameters = parameters
         self.curvatures_per_m = np.array(parameters.curvatures_per_m)  # (c,)
+
+        # The distance from obstacles that the body needs. Straight links cut the corners of the path, so the inner side
+        # of an arc needs more room. Most poses are decided by the approximate distance.
+        corner_cut_m = parameters.segment_m**2 * np.abs(self.curvatures_per_m) / 8  # (c,)
+        self.needed_m = parameters.radius_m + parameters.clearance_m
+        self.needed_inside_m = self.needed_m + corner_cut_m  # (c,)
+        self.surely_clear_m = self.needed_inside_m + CELL_ERROR_M  # (c,)
+        self.surely_blocked_m = self.needed_m - CELL_ERROR_M
 
         # (2, c): the end and the middle of a child's arc, ahead and to the left of its parent. The chord of an arc
         # of length s and curvature k has the length s sinc(k s / 2) and the direction k s / 2.
         half_turn_rad = 0.5 * self.curvatures_per_m * STEP_M
         chord_m = STEP_M * np.sinc(half_turn_rad / np.pi)
-        self._end_m = np.stack([chord_m * np.cos(half_turn_rad), chord_m * np.sin(half_turn_rad)])
+        self.end_m = np.stack([chord_m * np.cos(half_turn_rad), chord_m * np.sin(half_turn_rad)])
         middle_chord_m = 0.5 * STEP_M * np.sinc(0.5 * half_turn_rad / np.pi)
-        self._middle_m = np.stack(
+        self.middle_m = np.stack(
             [middle_chord_m * np.cos(0.5 * half_turn_rad), middle_chord_m * np.sin(0.5 * half_turn_rad)]
         )
 
@@ -57,30 +64,27 @@ class ArcTable:
         y_m = parents.y_m[:, None]
         heading_rad = parents.heading_rad[:, None] + self.curvatures_per_m * STEP_M
         return SearchArcs(
-            middle_x_m=x_m + cosine * self._middle_m[0] - sine * self._middle_m[1],
-            middle_y_m=y_m + sine * self._middle_m[0] + cosine * self._middle_m[1],
+            middle_x_m=x_m + cosine * self.middle_m[0] - sine * self.middle_m[1],
+            middle_y_m=y_m + sine * self.middle_m[0] + cosine * self.middle_m[1],
             middle_heading_rad=heading_rad - 0.5 * self.curvatures_per_m * STEP_M,
-            x_m=x_m + cosine * self._end_m[0] - sine * self._end_m[1],
-            y_m=y_m + sine * self._end_m[0] + cosine * self._end_m[1],
+            x_m=x_m + cosine * self.end_m[0] - sine * self.end_m[1],
+            y_m=y_m + sine * self.end_m[0] + cosine * self.end_m[1],
             heading_rad=heading_rad,
         )
 
     def clears_obstacles(self, obstacles: ObstacleGrid, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Bools:
         """Return whether the body clears all obstacles at poses on the arcs, (n, c). x_m, y_m, heading_rad: (n, c).
 
-        Straight links cut the corners of the path, so the inner side of an arc needs more room. Most poses are decided
-        by the approximate distance; the exact one, with its normal, is computed for the others.
+        Most poses are decided by the approximate distance; the exact one, with its normal, is computed for the others.
         """
-        corner_cut_m = self._parameters.segment_m**2 * np.abs(self.curvatures_per_m) / 8  # (c,)
-        needed_m = self._parameters.radius_m + self._parameters.clearance_m
         approximate_m = obstacles.approximate_distance_m(x_m, y_m)
-        is_clear = approximate_m >= needed_m + corner_cut_m + CELL_ERROR_M
-        unsure = np.nonzero(~is_clear & (approximate_m >= needed_m - CELL_ERROR_M))
+        is_clear = approximate_m >= self.surely_clear_m
+        unsure = np.nonzero(~is_clear & (approximate_m >= self.surely_blocked_m))
         nearest = obstacles.find_nearest(x_m[unsure], y_m[unsure])
         heading = heading_rad[unsure]
         curvature_index = unsure[1]
         normal_to_left = np.cos(heading) * nearest.normal_w[:, 1] - np.sin(heading) * nearest.normal_w[:, 0]
         is_inner_side = normal_to_left * np.sign(self.curvatures_per_m[curvature_index]) < 0
-        cut_m = np.where(is_inner_side, corner_cut_m[curvature_index], 0.0)
-        is_clear[unsure] = nearest.distance_m >= needed_m + cut_m
+        needed_m = np.where(is_inner_side, self.needed_inside_m[curvature_index], self.needed_m)
+        is_clear[unsure] = nearest.distance_m >= needed_m
         return is_clear

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_instant_ns
+from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_time_ns
 from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion, Intents
 from snakesim_gnc.navigation.known_path import KnownPath
@@ -82,7 +82,7 @@ class Navigation(Service):
         """Return the clutter planner's trajectory, or None while there is none to follow."""
         if world is None or not self._recent_angles:
             return None
-        angles_rad = self._recent_angles.nearest_to(pose_instant_ns(world))
+        angles_rad = self._recent_angles.nearest_to(pose_time_ns(world))
         nodes_w = self._body.nodes_w(world, angles_rad)
         trajectory = self._planner.update(clock.tick, world, nodes_w.T, desired)
         is_paused = clock.clock_mode == "lockstep" and clock.arm_session == 0

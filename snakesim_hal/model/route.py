@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,7 +48,13 @@ class Route:
         self._last_direction = steps[-1] / lengths[-1]
         self._segment_direction = steps / lengths[:, None]  # (n - 1, 2)
 
-        # The same as lists, for `at`: Python floats are faster for a single point.
+        # How far along a segment its points are, (n - 1,): the first and the last one have no end.
+        self._min_along = np.zeros(len(steps))
+        self._max_along = np.diff(self._s)
+        self._min_along[0] = -np.inf
+        self._max_along[-1] = np.inf
+
+        # The same as lists, for `point_at`: Python floats are faster for a single point.
         self._s_list: list[float] = self._s.tolist()
         self._start_list: list[tuple[float, float]] = [(x, y) for x, y in self.points_w.tolist()]
         self._direction_list: list[tuple[float, float]] = [(x, y) for x, y in self._segment_direction.tolist()]
@@ -99,24 +105,18 @@ class Route:
         Returns:
             Arc length in m; negative before the route's start, and more than its length beyond its end.
         """
-        starts = self.points_w[:-1]
         first, last = self._segments_near(near_s_m, window_m)
-
-        # Distance along each segment to the foot of the perpendicular, clipped to the segment.
+        starts = self.points_w[first:last]
         directions = self._segment_direction[first:last]
-        along = np.einsum("ij,ij->i", point_w - starts[first:last], directions)
-        lengths = np.diff(self._s[first : last + 1])
-        low = np.zeros_like(lengths)
-        high = lengths.copy()
-        if first == 0:
-            low[0] = -np.inf
-        if last == len(starts):
-            high[-1] = np.inf
-        along = np.clip(along, low, high)
 
-        gaps = starts[first:last] + along[:, None] * directions - point_w
+        # Distance along each segment to the foot of the perpendicular, limited to the segment.
+        along = np.einsum("ij,ij->i", point_w - starts, directions)
+        along = np.maximum(along, self._min_along[first:last])
+        along = np.minimum(along, self._max_along[first:last])
+
+        gaps = starts + along[:, None] * directions - point_w
         squared_distances = np.einsum("ij,ij->i", gaps, gaps)
-        nearest = int(np.argmin(squared_distances))
+        nearest = int(squared_distances.argmin())
         return float(self._s[first + nearest] + along[nearest])
 
     def _segments_near(self, near_s_m: float | None, window_m: float) -> tuple[int, int]:
@@ -124,8 +124,8 @@ class Route:
         count = len(self._s) - 1
         if near_s_m is None:
             return 0, count
-        first = max(int(np.searchsorted(self._s, near_s_m - window_m)) - 1, 0)
-        last = min(int(np.searchsorted(self._s, near_s_m + window_m)) + 1, count)
+        first = max(bisect_left(self._s_list, near_s_m - window_m) - 1, 0)
+        last = min(bisect_left(self._s_list, near_s_m + window_m) + 1, count)
         first = min(first, count - 1)
         last = max(last, first + 1)
         return first, last

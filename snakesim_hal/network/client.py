@@ -144,7 +144,7 @@ class Client:
         self.session.declare_alive(self.service)
 
     def ticks(self, silence_s: float | None = None, *, pauses: bool = False) -> Iterator[Clock | None]:
-        """Iterate over the robot's clock, for ever.
+        """Iterate over the robot's clock, without an end.
 
         Args:
             silence_s: how long to wait for a clock before None is yielded instead; None: wait without a limit.

@@ -21,7 +21,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
-Take = Callable[[Arrival], None]
+SampleHandler = Callable[[Arrival], None]
 
 
 class LocalNetwork:
@@ -31,13 +31,13 @@ class LocalNetwork:
         """Start without sessions."""
         self.answer: Callable[[], None] = lambda: None  # runs the parts that answer queries
         # Callbacks, each with the key or pattern that it is for.
-        self.subscribers: list[tuple[str, Take]] = []
+        self.subscribers: list[tuple[str, SampleHandler]] = []
         self.queryables: list[tuple[str, Callable[[Query], None]]] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         # What sessions have published.
         self.tokens: list[str] = []
         self.latched: dict[str, Arrival] = {}  # by key
-        self._takers: dict[str, list[Take]] = {}  # cache of `takers`, by key
+        self._handlers: dict[str, list[SampleHandler]] = {}  # cache of `handlers_for`, by key
 
     def session(self) -> "LocalSession":
         """Return a new session."""
@@ -47,23 +47,23 @@ class LocalNetwork:
         """Drop the reference to the parts that answer queries, because they refer to this network."""
         self.answer = lambda: None
 
-    def takers(self, key: str) -> list[Take]:
+    def handlers_for(self, key: str) -> list[SampleHandler]:
         """Return the callbacks of all subscribers of a key."""
-        takers = self._takers.get(key)
-        if takers is None:
-            takers = [handle for pattern, handle in self.subscribers if intersects(pattern, key)]
-            self._takers[key] = takers
-        return takers
+        handlers = self._handlers.get(key)
+        if handlers is None:
+            handlers = [handler for pattern, handler in self.subscribers if intersects(pattern, key)]
+            self._handlers[key] = handlers
+        return handlers
 
-    def subscribe(self, pattern: str, handle: Take) -> Callable[[], None]:
-        """Call `take` for all samples that are published from now on. Returns a function that ends it."""
-        subscriber = (pattern, handle)
+    def subscribe(self, pattern: str, handler: SampleHandler) -> Callable[[], None]:
+        """Call `handler` for all samples that are published from now on. Returns a function that ends it."""
+        subscriber = (pattern, handler)
         self.subscribers.append(subscriber)
-        self._takers.clear()
+        self._handlers.clear()
 
         def unsubscribe() -> None:
             self.subscribers.remove(subscriber)
-            self._takers.clear()
+            self._handlers.clear()
 
         return unsubscribe
 
@@ -73,9 +73,9 @@ class LocalNetwork:
             self.tokens.append(key)
         else:
             self.tokens.remove(key)
-        for pattern, handle in self.watchers:
+        for pattern, handler in self.watchers:
             if intersects(pattern, key):
-                handle(key, present)
+                handler(key, present)
 
 
 @dataclass
@@ -145,11 +145,11 @@ class LocalSession(Session):
             arrival = Arrival(key, payload, encoding, time.monotonic_ns())
             if latched:
                 network.latched[key] = arrival
-            for handle in network.takers(key):
-                handle(arrival)
+            for handler in network.handlers_for(key):
+                handler(arrival)
 
         def has_subscribers() -> bool:
-            return bool(network.takers(key))
+            return bool(network.handlers_for(key))
 
         return self._register_publisher(key, Publisher(message, send, has_subscribers))
 
@@ -165,22 +165,22 @@ class LocalSession(Session):
         declared = self._subscribe(key, arrivals.append)
         return LocalReader(declared, arrivals, message, self.rejected)
 
-    def on_arrival(self, key: str, handle: Take) -> None:
-        """Call `take` for every sample, in the publisher's thread."""
-        self._subscribe(key, handle)
+    def on_arrival(self, key: str, handler: SampleHandler) -> None:
+        """Call `handler` for every sample, in the publisher's thread."""
+        self._subscribe(key, handler)
 
     on_urgent_arrival = on_arrival  # every sample arrives at once
 
-    def on_latched_arrival(self, key: str, handle: Take) -> None:
-        """Call `take` as `on_arrival` does, and also for the values that were latched before."""
+    def on_latched_arrival(self, key: str, handler: SampleHandler) -> None:
+        """Call `handler` as `on_arrival` does, and also for the values that were latched before."""
         for latched_key, arrival in list(self._network.latched.items()):
             if intersects(key, latched_key):
-                handle(arrival)
-        self._subscribe(key, handle)
+                handler(arrival)
+        self._subscribe(key, handler)
 
-    def on_query(self, key: str, handle: Callable[[Query], None]) -> None:
-        """Call `take` for every query, in the thread of the session that sends it."""
-        queryable = (key, handle)
+    def on_query(self, key: str, handler: Callable[[Query], None]) -> None:
+        """Call `handler` for every query, in the thread of the session that sends it."""
+        queryable = (key, handler)
         self._network.queryables.append(queryable)
         self._declare(lambda: self._network.queryables.remove(queryable))
 
@@ -188,14 +188,14 @@ class LocalSession(Session):
         self._network.set_token(key, True)
         self._declare(lambda: self._network.set_token(key, False))
 
-    def on_alive(self, handle: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
-        """Call `take(key, present)` for every token that exists, appears or vanishes, in the declaring thread."""
-        watcher = (key, handle)
+    def on_alive(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+        """Call `handler(key, present)` for every token that exists, appears or vanishes, in the declaring thread."""
+        watcher = (key, handler)
         self._network.watchers.append(watcher)
         self._declare(lambda: self._network.watchers.remove(watcher))
         for token in self._network.tokens:
             if intersects(key, token):
-                handle(token, True)
+                handler(token, True)
 
     def close(self) -> None:
         """Undeclare everything."""
@@ -203,8 +203,8 @@ class LocalSession(Session):
             declared.undeclare()
         self._declared.clear()
 
-    def _subscribe(self, key: str, handle: Take) -> Declared:
-        return self._declare(self._network.subscribe(key, handle))
+    def _subscribe(self, key: str, handler: SampleHandler) -> Declared:
+        return self._declare(self._network.subscribe(key, handler))
 
     def _declare(self, undeclare: Callable[[], None]) -> Declared:
         declared = Declared(undeclare)
@@ -213,10 +213,10 @@ class LocalSession(Session):
 
     def send_query(self, pattern: str, request: Message) -> LocalQuery:
         """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
-        matching = [(key, handle) for key, handle in self._network.queryables if intersects(pattern, key)]
+        matching = [(key, handler) for key, handler in self._network.queryables if intersects(pattern, key)]
         query = LocalQuery(len(matching))
-        for key, handle in matching:
-            handle(Query(key, encode(request), format_encoding(type(request)), query))
+        for key, handler in matching:
+            handler(Query(key, encode(request), format_encoding(type(request)), query))
         return query
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:

@@ -53,7 +53,7 @@ class HostEnd:
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
     def serve(self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
-        """Call `take(request, reply)` for each request, from a separate thread."""
+        """Call `handle(request, reply)` for each request, from a separate thread."""
         opened = self._socket
         if opened is None:
             return

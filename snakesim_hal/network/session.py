@@ -206,8 +206,8 @@ class Session:
         The control loop waits for one thread less than with `on_arrival`. While `handler` runs, the session receives
         nothing else, so it must only store the sample.
         """
-        handler = handlers.Callback(_keep_thread_state(_arrival_handler(handler)), indirect=False)
-        self._declared.append(self._zenoh.declare_subscriber(key, handler))
+        callback = handlers.Callback(_keep_thread_state(_arrival_handler(handler)), indirect=False)
+        self._declared.append(self._zenoh.declare_subscriber(key, callback))
 
     def on_latched_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
         """Call `handler` as `on_arrival` does, and also for the values that were latched before."""

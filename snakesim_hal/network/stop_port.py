@@ -79,12 +79,12 @@ def open_stop_port(host: str, port: int) -> socket.socket:
 
 
 def serve_stops(opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]) -> None:
-    """Call `take(requester, reply)` for every request, from the thread `stop port`.
+    """Call `handle(requester, reply)` for every request, from the thread `stop port`.
 
     Args:
         opened: the bound socket; closing it ends the thread.
         robot: its namespace, for the answers.
-        take: gets the name of the requester and a function that sends the answer.
+        handle: gets the name of the requester and a function that sends the answer.
     """
 
     def serve() -> None:

@@ -416,6 +416,10 @@ class Description(Message, frozen=True, kw_only=True):
         Meta(max_length=8),
         about("hashes of what the host's BLAS, NumPy and C library compute: where they are equal, digests can be"),
     ] = {}
+    laws: Annotated[
+        Literal["c", "python"] | None,
+        about("in which language a simulator computes ground and friction, with equal results; null: no simulator"),
+    ] = None
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
     links: Annotated[
         list[LinkDescription],
@@ -442,7 +446,7 @@ class Fault(Message, frozen=True, kw_only=True):
 
     tick: q.Tick
     what: Annotated[q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")]
-    cause: Annotated[q.Reason, about("in words, for the operator")]
+    cause: q.Reason
     joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
     reach: Annotated[
         Reach,
@@ -683,11 +687,11 @@ class WorldContact(Message, frozen=True, kw_only=True):
     link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
     obstacle: Annotated[q.Name | None, about("touched obstacle; null: unknown")]
     body_s_m: Annotated[q.Length, about("arc length from the tail end along the chain")]
-    position_w: Annotated[q.Vector, about("where the body touches the obstacle")]
+    position_w: q.Vector
     normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
     tangent_w: Annotated[q.UnitVector, about("across the normal, towards the head")]
     force_w: Annotated[q.ForceVector, about("on the body")]
-    confidence: Annotated[q.Fraction, about("1: measured; less: estimated")] = 1.0
+    confidence: q.Fraction = 1.0
 
 
 class World(Message, frozen=True, kw_only=True):
@@ -695,11 +699,11 @@ class World(Message, frozen=True, kw_only=True):
 
     tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
     timestamp_ns: Annotated[q.Stamp, about("of the joint state that it was computed from")]
-    base_position_w: Annotated[q.Vector, about("of the tail end")]
-    base_orientation_wxyz: Annotated[q.Quaternion, about("of the tail link")]
-    base_confidence: Annotated[q.Fraction, about("of the base's pose")]
-    contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")]
-    obstacles: Annotated[list[Obstacle], Meta(max_length=4096), about("in the neighborhood of the body")]
+    base_position_w: q.Vector
+    base_orientation_wxyz: q.Quaternion
+    base_confidence: q.Fraction
+    contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS)]
+    obstacles: Annotated[list[Obstacle], Meta(max_length=4096)]
     pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
     contacts_timestamp_ns: Annotated[
         q.Stamp | None, about("of the contacts in it; null: no sample yet, and no estimate")
@@ -801,7 +805,6 @@ class ControlState(Message, frozen=True, kw_only=True):
     torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push; null: none pushes")] = None
     saturated: Annotated[bool, about("the push is at its torque limit")] = False
     jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
-    custom: Annotated[dict[q.Name, q.Scalar], Meta(max_length=32), about("numbers that the controller defines")] = {}
     failed: Annotated[bool, about("the last message of a controller that cannot go on; `reason` is why")] = False
     too_slow: Annotated[
         q.Reason, about("in real time: what shows that the controller misses its deadlines; empty: nothing does")

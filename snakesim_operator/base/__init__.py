@@ -3,7 +3,8 @@
 `robot_selection`, `targets`   which robots a command addresses: those of this computer, or of a network
 `extras`         what each extra of the package installs
 `worker_pool`, `dask_cluster`   processes that compute side by side, here or on a Dask cluster
-`console_port`   the port of the console, opened before the console starts
+`console_port`   what the console listens on, opened before its processes start
 `page_origin`    which web pages may connect to a server of ours
+`byte_relay`     copies bytes between two connections
 `png`            writes PNG images
 """

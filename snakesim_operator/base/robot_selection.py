@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RobotSelection:
-    """Which robots a command addresses: those on the given endpoint, else all that run on this computer."""
+    """The robots that a command addresses: those on the named endpoint, else all that run on this computer."""
 
     endpoint: str | None = None  # None: every network of a robot on this computer, and the default endpoint
     namespace: str | None = None  # None: every robot there

@@ -29,7 +29,7 @@ from typing import Any, Self
 from snakesim_hal.base import arithmetic
 from snakesim_hal.base.process import child_environment, die_with_parent, python_command
 
-MAX_DEATHS = 5  # workers that may die while they run a call, before the call is given up
+MAX_DEATHS = 5  # workers that may die while they run a call, before the call fails
 MAX_RAISES = 3  # attempts of a call that raises an exception: the cause may have been the worker
 NICENESS = 10  # robots and consoles on the same computer have priority
 TEMPORARY_FOLDER_VARIABLE = "TMPDIR"  # of the environment

@@ -19,7 +19,9 @@ from snakesim_operator.monitoring.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
 ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
-KEY_COLUMNS = f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'heard':>8}"
+KEY_COLUMNS = (
+    f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'received':>8}"
+)
 TIMES_COLUMNS = (
     f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  {'histogram, from the shortest to the longest'}"
 )
@@ -36,7 +38,7 @@ def top(where: RobotSelection, report: PrintLine = print_line, *, once: bool, as
         as_json: print a line of JSON for each table.
 
     Returns:
-        0; or 1 if `once` was given and nothing arrived.
+        0; or 1 with `once`, if nothing arrived.
 
     Raises:
         NotConnectedError: no robot is reachable.
@@ -166,8 +168,8 @@ def _format_timing(name: str, timing: Timing) -> str:
 def _format_latency(latency: Latency) -> str:
     """Return the line of a robot's latency."""
     text = (
-        f"state to command, as measured here: {latency.heard_median_ms:.2f} ms in the median, "
-        f"at most {latency.heard_p99_ms:.2f} ms for 99 % of {latency.count} commands"
+        f"state to command, as measured here: {latency.arrival_median_ms:.2f} ms in the median, "
+        f"at most {latency.arrival_p99_ms:.2f} ms for 99 % of {latency.count} commands"
     )
     if latency.motors_median_ms is not None:
         text += f"; to the motors, in robot time: {latency.motors_median_ms:.0f} and {latency.motors_p99_ms:.0f} ms"
@@ -181,7 +183,7 @@ def _format_key(line: KeyTraffic) -> str:
     jitter = _format_number(line.jitter_ms, ".2f", " ms")
     max_gap = _format_number(line.gap_max_ms, ".1f", " ms")
     age = _format_number(line.age_ms, ".0f", " ms")
-    last_arrival = _format_number(line.heard_ago_s, ".1f", " s")
+    last_arrival = _format_number(line.received_ago_s, ".1f", " s")
     failure = f"  {line.failure}" if line.failure else ""
     return (
         f"{line.key[:29]:<29} {writer[:17]:<17} {rate:>7} {jitter:>9} {max_gap:>9} {line.bytes:>8} "

@@ -1,6 +1,6 @@
 """Measures what arrives on a network: rate, jitter, size and age for each key, and the latency of commands.
 
-The memory is bounded: only the newest arrivals of each key are kept.
+The memory is bounded: it holds only the newest arrivals of each key.
 """
 
 import itertools
@@ -28,15 +28,15 @@ from snakesim_hal.wire.messages import (
 )
 
 MAX_KEYS = 512  # an unknown client may invent more; arrivals on those are only counted
-KEPT = 256  # newest arrivals of a key
+MAX_ARRIVALS = 256  # newest arrivals of a key
 WINDOW_NS = 5_000_000_000  # rates are computed over this duration
 TIMED: dict[str, type[Message]] = {
     keys.JOINTS: JointState,
     keys.JOINT_COMMAND: JointCommand,
     keys.APPLIED: AppliedCommand,
 }
-TIMED_KEPT = 1024  # newest states and commands, from which the latency is computed
-TIMED_BYTES = 16384  # larger ones are not kept; a command of 256 joints has 4 kB
+MAX_TIMED = 1024  # newest states and commands, from which the latency is computed
+TIMED_BYTES = 16384  # larger ones are dropped; a command of 256 joints has 4 kB
 
 decoder_of = cache(Decoder)
 
@@ -52,7 +52,7 @@ class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
     jitter_ms: float | None  # standard deviation of the gaps
     gap_max_ms: float | None
     bytes: int  # of the newest message
-    heard_ago_s: float
+    received_ago_s: float
     age_ms: float | None  # of the newest data, by its timestamp and the robot's clock
 
 
@@ -63,8 +63,8 @@ class Latency(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     robot: str
-    heard_median_ms: float  # from the state's arrival here to the command's
-    heard_p99_ms: float
+    arrival_median_ms: float  # from the state's arrival here to the command's
+    arrival_p99_ms: float
     motors_median_ms: float | None  # from the state's timestamp to the first tick that applied the command; robot time
     motors_p99_ms: float | None
     count: int
@@ -89,7 +89,7 @@ class Traffic:
                 self.keys_left_out += 1
                 return
             self._newest[arrival.key] = arrival
-            self._times_ns.setdefault(arrival.key, deque(maxlen=KEPT)).append(arrival.monotonic_ns)
+            self._times_ns.setdefault(arrival.key, deque(maxlen=MAX_ARRIVALS)).append(arrival.monotonic_ns)
             if len(arrival.payload) <= TIMED_BYTES:
                 self._add_timed(arrival)
 
@@ -98,7 +98,7 @@ class Traffic:
         for suffix, message in TIMED.items():
             if f"/{arrival.key}".endswith(f"/{suffix}"):
                 prefix = arrival.key.removesuffix(suffix)
-                self._timed.setdefault((prefix, message), deque(maxlen=TIMED_KEPT)).append(arrival)
+                self._timed.setdefault((prefix, message), deque(maxlen=MAX_TIMED)).append(arrival)
 
     def lines(self, now_ns: int) -> list[KeyTraffic]:
         """Return the traffic of every key, sorted by robot and key. now_ns: of the monotonic clock."""
@@ -122,7 +122,7 @@ class Traffic:
                     failure=content if isinstance(content, str) else "",
                     **_measure_rhythm(recent_ns[key]),
                     bytes=len(arrival.payload),
-                    heard_ago_s=max(now_ns - arrival.monotonic_ns, 0) * 1e-9,
+                    received_ago_s=max(now_ns - arrival.monotonic_ns, 0) * 1e-9,
                     age_ms=_age_ms(content, clocks_ns.get(robot)),
                 )
             )
@@ -191,8 +191,8 @@ class Traffic:
         motors_median_ms, motors_p99_ms = _median_and_p99(motors_ms)
         return Latency(
             robot=self._namespace or prefix.rstrip("/"),
-            heard_median_ms=arrival_median_ms or 0.0,
-            heard_p99_ms=arrival_p99_ms or 0.0,
+            arrival_median_ms=arrival_median_ms or 0.0,
+            arrival_p99_ms=arrival_p99_ms or 0.0,
             motors_median_ms=motors_median_ms,
             motors_p99_ms=motors_p99_ms,
             count=len(arrival_ms),

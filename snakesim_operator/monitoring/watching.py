@@ -144,7 +144,7 @@ def _record_episodes(arguments: argparse.Namespace) -> int:
     task = (arguments.task or "").strip()
     if not 0 < len(task) <= MAX_TASK:
         raise ConfigError(
-            f"--task: say what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'",
+            f"--task: describe what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'",
             code="command/invalid-option",
         )
     from snakesim_operator.playback.demonstrations import record_demonstrations

@@ -118,9 +118,9 @@ def _add_video(parser: argparse.ArgumentParser) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.playback.info import show
+    from snakesim_operator.playback.info import show_recording
 
-    return show(arguments.recording, print_line, as_json=arguments.json)
+    return show_recording(arguments.recording, print_line, as_json=arguments.json)
 
 
 def _report(arguments: argparse.Namespace) -> int:
@@ -131,12 +131,12 @@ def _report(arguments: argparse.Namespace) -> int:
     from snakesim_operator.results.run_reader import REPORT
     from snakesim_operator.results.summary import summarise
 
-    given: Path = arguments.recording
-    record = RunRecord.load(given)
-    out = arguments.out or (given / REPORT if given.is_dir() else given.with_suffix(".html"))
+    path: Path = arguments.recording
+    record = RunRecord.load(path)
+    out = arguments.out or (path / REPORT if path.is_dir() else path.with_suffix(".html"))
     write_text(out, page(record, summarise(record, record.ending)))
     print_line(str(out))
-    return exit_code(given, record.missing)
+    return exit_code(path, record.missing)
 
 
 def _compare(arguments: argparse.Namespace) -> int:

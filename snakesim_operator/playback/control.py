@@ -341,7 +341,7 @@ class Replay:
 
 
 def replay_control(
-    path: Path, overrides: list[Override], out: Path | None, say: PrintLine, *, run_recorded_code: bool = False
+    path: Path, overrides: list[Override], out: Path | None, print_text: PrintLine, *, run_recorded_code: bool = False
 ) -> int:
     """Replay a recording, and print how the commands differ: `snakesim replay --control`.
 
@@ -349,7 +349,7 @@ def replay_control(
         path: The recording.
         overrides: Changes of its configuration.
         out: A folder for a run that `compare` reads; None: the replay is not recorded.
-        say: Prints a line.
+        print_text: Prints a line.
         run_recorded_code: Allow Python files that only the recording names.
 
     Returns:
@@ -371,29 +371,31 @@ def replay_control(
     comparison = replay.run()
     if out is not None:
         write_config(replay.config, out / CONFIG)
-        say(f"replayed: {out}; `snakesim study compare {path} {out}` shows the difference")
+        print_text(f"replayed: {out}; `snakesim study compare {path} {out}` shows the difference")
     if replay.stopped:
-        say(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
+        print_text(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
     elif not comparison.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
-    are_same = _print_comparison(comparison, replay, say)
+    are_same = _print_comparison(comparison, replay, print_text)
     if are_same or replay.changed or replay.missing:
         return exit_code(path, replay.missing)
     return exit_code(path, replay.missing, 1)
 
 
-def _print_comparison(comparison: Comparison, replay: Replay, say: PrintLine) -> bool:
+def _print_comparison(comparison: Comparison, replay: Replay, print_text: PrintLine) -> bool:
     """Print how the commands differ, and return whether they are the same."""
     different = comparison.different
     count = len(comparison.recorded.keys() | comparison.replayed.keys())
     if not different:
-        say(f"{count} commands, the same to the bit")
+        print_text(f"{count} commands, the same to the bit")
         return True
-    say(f"{len(different)} of {count} commands differ, the first answers tick {different[0]}")
+    print_text(f"{len(different)} of {count} commands differ, the first answers tick {different[0]}")
     largest = comparison.largest()
     if largest is not None:
         tick, joint, size = largest
-        say(f"largest difference of a target: {size:.4g} at {replay.robot.joints[joint].name}, tick {tick}")
+        print_text(f"largest difference of a target: {size:.4g} at {replay.robot.joints[joint].name}, tick {tick}")
     if replay.clock_mode != "lockstep":
-        say(f"the run was {replay.clock_mode}: there a service acts on what has arrived, which only lockstep repeats")
+        print_text(
+            f"the run was {replay.clock_mode}: there a service acts on what has arrived, which only lockstep repeats"
+        )
     return False

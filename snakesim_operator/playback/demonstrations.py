@@ -106,7 +106,7 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
     print_line(
-        f"{demonstrations.kept} episodes; `snakesim recording export {folder} --format lerobot` makes a dataset "
+        f"{demonstrations.saved_count} episodes; `snakesim recording export {folder} --format lerobot` makes a dataset "
         f"of {folder}"
     )
     return 1 if demonstrations.failure else 0
@@ -120,7 +120,7 @@ class _Demonstrations:
         self._folder = folder
         self._task = task
         self._keyboard = keyboard
-        self.kept = 0
+        self.saved_count = 0
         self.failure = ""
 
     def record_episode(self) -> None:
@@ -161,6 +161,6 @@ class _Demonstrations:
     def _keep(self, label: EpisodeLabel) -> None:
         with (self._folder / EPISODES).open("ab") as file:
             file.write(msgspec.json.encode(label) + b"\n")
-        self.kept += 1
+        self.saved_count += 1
         result = "succeeded" if label.success else "failed"
         print_line(f"{label.file}: {result}. Enter begins the next one")

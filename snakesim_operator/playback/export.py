@@ -59,14 +59,14 @@ UNITS = {
 }
 
 
-def export(runs: Sequence[Path], form: str, out: Path | None, say: PrintLine) -> int:
+def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine) -> int:
     """Write a run in a format.
 
     Args:
         runs: The run, as the only item.
         form: "csv", "parquet", "npz" or "mcap".
         out: The file; None: beside the recording.
-        say: Prints a line.
+        print_text: Prints a line.
 
     Returns:
         The exit code.
@@ -84,7 +84,7 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: PrintLine) ->
     if form == "mcap":
         with exported(path) as partial:
             count, missing = recover_recording(find_recording(run), partial)
-        say(f"{count} messages: {path}")
+        print_text(f"{count} messages: {path}")
         return exit_code(run, missing)
     record = RunRecord.load(run)
     with exported(path) as partial:
@@ -97,19 +97,19 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: PrintLine) ->
                 columns = {name: values.tolist() for name, values in table(record).items()}
                 metadata = {MISSING: json.dumps(record.missing).encode()} if record.missing else None
                 write_parquet(columns, partial, metadata)
-    say(f"{len(record.time_s)} ticks: {path}")
+    print_text(f"{len(record.time_s)} ticks: {path}")
     return exit_code(run, record.missing)
 
 
 def export_dataset(
-    runs: Sequence[Path], out: Path | None, say: PrintLine, *, images: bool, task: str | None, fps: float | None
+    runs: Sequence[Path], out: Path | None, print_text: PrintLine, *, images: bool, task: str | None, fps: float | None
 ) -> int:
     """Write a LeRobot dataset: an episode for each run or demonstration, and one more for each gap.
 
     Args:
         runs: Folders of runs or demonstrations, or recordings.
         out: Folder of the dataset; None: beside the first run.
-        say: Prints a line.
+        print_text: Prints a line.
         images: Whether the pictures of the cameras are included.
         task: The task of all episodes; None: the one of each run.
         fps: Frames a second; None: the robot's rate.
@@ -125,8 +125,8 @@ def export_dataset(
     with exported(path) as partial:
         size = write_lerobot(episodes, partial, write_parquet, fps)
     for sentence in describe_gaps(episodes):
-        say(sentence)
-    say(f"{size.episodes} episodes, {size.frames} frames: {path}")
+        print_text(sentence)
+    print_text(f"{size.episodes} episodes, {size.frames} frames: {path}")
     return max(exit_code(episode.record.folder, episode.record.missing) for episode in episodes)
 
 

@@ -180,29 +180,31 @@ def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
     }
 
 
-def show(given: Path, say: PrintLine, *, as_json: bool = False) -> int:
+def show_recording(path: Path, print_text: PrintLine, *, as_json: bool = False) -> int:
     """Print what a recording holds, and return the exit code: 3 if it is incomplete."""
-    info = inspect_recording(find_recording(given))
+    info = inspect_recording(find_recording(path))
     if as_json:
-        say(msgspec.json.encode(info).decode())
-        return exit_code(given, info.missing)
-    say(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
-    say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}")
-    say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
-    say(f"  ended     {info.lifecycle or 'unknown'}")
+        print_text(msgspec.json.encode(info).decode())
+        return exit_code(path, info.missing)
+    print_text(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
+    print_text(
+        f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}"
+    )
+    print_text(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
+    print_text(f"  ended     {info.lifecycle or 'unknown'}")
     digest = format_digest(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
     of_what = " of these ticks alone" if info.missing else ""
-    say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
+    print_text(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
     for change in info.parameter_changes:
         changes = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
-        say(f"  set       at {change.time_s:.2f} s by {change.requester}: {changes}")
-    say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
+        print_text(f"  set       at {change.time_s:.2f} s by {change.requester}: {changes}")
+    print_text(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]
-        say(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
+        print_text(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
     for sentence in info.missing:
-        say(f"  missing: {sentence}")
-    return exit_code(given, info.missing)
+        print_text(f"  missing: {sentence}")
+    return exit_code(path, info.missing)
 
 
 def _describe_skipped(by_key: dict[str, KeyInfo], lost: Counter[str], irregular: Sequence[str]) -> list[str]:

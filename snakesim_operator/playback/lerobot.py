@@ -73,15 +73,15 @@ def write_lerobot(
     step = _step(robot_hz, fps)
     content = _Content.of(episodes)
     chosen = [(episode, *_rows(episode, content, step)) for episode in episodes]
-    kept = [(episode, rows, shown) for episode, rows, shown in chosen if len(rows)]
+    non_empty = [(episode, rows, shown) for episode, rows, shown in chosen if len(rows)]
     for episode in episodes:
-        if not any(one.record is episode.record for one, _, _ in kept):
+        if not any(one.record is episode.record for one, _, _ in non_empty):
             raise ConfigError(
                 f"{episode.record.folder}: no picture came while it was armed; export it without --images",
                 code="recording/missing-data",
             )
     dataset = _Dataset(folder, write_table, content, seconds_per_frame=step / robot_hz)
-    for episode, rows, shown in kept:
+    for episode, rows, shown in non_empty:
         dataset.add(episode, rows, shown)
     dataset.finish(_info(episodes[0], content, robot_hz // step))
     return DatasetSize(len(dataset.rows), dataset.frame_count)

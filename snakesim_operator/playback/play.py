@@ -48,7 +48,7 @@ def in_robot_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
 def play(
     path: Path,
     lines: Iterator[str],
-    say: PrintLine,
+    print_text: PrintLine,
     *,
     endpoint: str | None,
     namespace: str | None,
@@ -60,7 +60,7 @@ def play(
     Args:
         path: The recording.
         lines: Lines that the user types.
-        say: Prints a line.
+        print_text: Prints a line.
         endpoint: Zenoh endpoint to listen on; None: the default one.
         namespace: Namespace to publish in; None: the robot's name.
         rate: Robot time over wall time.
@@ -81,19 +81,19 @@ def play(
     messages = in_robot_order(reader)
     with open_session(link) as session:
         how = "Enter plays a tick" if step else f"{rate:g} x real time"
-        say(f"playing {path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
+        print_text(f"playing {path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
         player = _Player(session)
         timing = _Timing(rate)
         for time_ns, simultaneous in groupby(messages, lambda recorded: recorded.time_ns):
             if step:
-                say(f"{time_ns * 1e-9:.3f} s")
+                print_text(f"{time_ns * 1e-9:.3f} s")
                 if next(lines, None) is None:
                     break
             else:
                 timing.wait_until(time_ns)
             for recorded in simultaneous:
                 player.publish(recorded)
-        say(f"{player.count} messages played")
+        print_text(f"{player.count} messages played")
     return exit_code(path, reader.missing)
 
 

@@ -50,12 +50,19 @@ Span = tuple[float, float]  # from and to in seconds, since the first tick
 def video(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span) -> int:
     """Film a run from its folder or recording, and return the exit code. Takes and raises what `film` does."""
     record = RunRecord.load(run)
-    film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=print_line)
+    film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, print_text=print_line)
     return exit_code(run, record.missing)
 
 
 def film(
-    record: RunRecord, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: PrintLine
+    record: RunRecord,
+    out: Path,
+    *,
+    size: tuple[int, int],
+    fps: float,
+    speed: float,
+    span_s: Span,
+    print_text: PrintLine,
 ) -> None:
     """Film a record.
 
@@ -66,7 +73,7 @@ def film(
         fps: Pictures a second.
         speed: Robot time over the film's time.
         span_s: The part of the run that is filmed, from and to, since the first tick.
-        say: Prints a line.
+        print_text: Prints a line.
 
     Raises:
         ConfigError: The record has no pose, `out` is no film, or something that a film needs is not installed.
@@ -77,7 +84,7 @@ def film(
     times = times_of_pictures(record, fps, speed, span_s)
     picture_s = speed / fps
     for sentence in standstills_in_words(times, picture_s, record.config.period_ns * 1e-9):
-        say(sentence)
+        print_text(sentence)
     camera: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
     progress_step = max(round(PROGRESS_STEP * len(times)), 1)
     with (
@@ -99,8 +106,8 @@ def film(
             write(picture)
             count = i + 1
             if count % progress_step == 0:
-                say(f"{100 * count // len(times)} %: {count} of {len(times)} pictures")
-    say(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
+                print_text(f"{100 * count // len(times)} %: {count} of {len(times)} pictures")
+    print_text(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
 
 
 def _center(record: RunRecord, row: int) -> Floats:
@@ -125,9 +132,9 @@ def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span)
             f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s",
             code="command/invalid-option",
         )
-    wanted = np.arange(first, last, speed / fps)
+    picture_times = np.arange(first, last, speed / fps)
     rounding_s = 0.5 * record.config.period_ns * 1e-9
-    newest = np.searchsorted(known, wanted + rounding_s, side="right") - 1
+    newest = np.searchsorted(known, picture_times + rounding_s, side="right") - 1
     return known[newest]
 
 

@@ -187,7 +187,7 @@ class FoxgloveChannels:
         return [self._encode_json("contact_forces", forces)]
 
     def _make_state(self, time_ns: int, *, with_reference: bool = False) -> list[FoxgloveMessage]:
-        """Return the state of host and controller, what is new of it as a log, and the reference if it is wanted."""
+        """Return the state of host and controller, what is new of it as a log, and the reference if it is selected."""
         self._state_due_ns = time_ns + MOTION_PERIOD_NS
         status = self._read_fresh(keys.STATUS, time_ns)
         control = self._read_fresh(keys.CONTROL_STATE, time_ns)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 MAX_KEYS_SHOWN = 8
 MAX_GAPS_SHOWN = 3
-MAX_GAPS = 1000  # that are kept apart; later losses are counted with the last one
+MAX_GAPS = 1000  # that are counted separately; later losses are counted with the last one
 VIEWER_PREFIXES = ("/", "foxglove/")  # topics made from other messages; `foxglove/` is that of older recordings
 UNKNOWN_KEYS = "keys that are not known"  # of messages whose channel is lost too
 

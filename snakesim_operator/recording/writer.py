@@ -105,7 +105,7 @@ class RecordingWriter:
             self._set_failure(error)
 
     def close(self, about: dict[str, object]) -> None:
-        """Write metadata and index, and close the file. about: metadata of the recording itself, kept as JSON."""
+        """Write metadata and index, and close the file. about: metadata of the recording itself, stored as JSON."""
         self._write_early_samples()
         if not self.failure:
             self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})

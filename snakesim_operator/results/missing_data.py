@@ -26,11 +26,11 @@ POSE = ("position_w", "orientation_wxyz")
 CONTACTS = ("contact_peak_n", "contact_count")
 
 
-def exit_code(given: Path, missing: Sequence[str], code: int = 0) -> int:
+def exit_code(path: Path, missing: Sequence[str], code: int = 0) -> int:
     """Return the exit code of a command, and print on stderr what its record does not hold.
 
     Args:
-        given: The run or recording, as the user named it.
+        path: The run or recording, as the user named it.
         missing: Sentences about missing data.
         code: Exit code that the command has for other reasons.
 
@@ -39,7 +39,7 @@ def exit_code(given: Path, missing: Sequence[str], code: int = 0) -> int:
     """
     if not missing:
         return code
-    print_stderr(f"snakesim: {given} is incomplete: {'; '.join(missing)} [{INCOMPLETE_CODE}]")
+    print_stderr(f"snakesim: {path} is incomplete: {'; '.join(missing)} [{INCOMPLETE_CODE}]")
     return code or INCOMPLETE
 
 

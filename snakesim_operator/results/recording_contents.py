@@ -62,7 +62,7 @@ class RunOutputs:
     trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns that sensors and controllers define
-    replay_of: str = ""  # the recording whose sensors the services were given; empty: a run
+    replay_of: str = ""  # the recording whose sensors the services read; empty: a run
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
     unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
 
@@ -123,9 +123,9 @@ class RecordingContents:
             case World() | Trajectory() | ControlState():
                 if isinstance(message, Trajectory):
                     self.searched_nodes[message.tick] = message.searched_nodes
-                kept = self.streams[key]
-                if not kept or _is_kept(kept[-1], message):
-                    kept.append(message)
+                stored = self.streams[key]
+                if not stored or _is_stored(stored[-1], message):
+                    stored.append(message)
             case _:
                 self.messages_by_tick[key][message.tick] = message
                 if isinstance(message, Clock) and message.arm_session:
@@ -334,13 +334,13 @@ def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def read_recording(
-    path: Path, wanted: Collection[str] = ALL, on_message: Callable[[RecordedMessage], None] | None = None
+    path: Path, selected_keys: Collection[str] = ALL, on_message: Callable[[RecordedMessage], None] | None = None
 ) -> RecordingContents:
     """Read a recording's messages at some keys.
 
     Args:
         path: The recording.
-        wanted: The keys.
+        selected_keys: The keys to read.
         on_message: Called with every message, at any key, so that the file need not be read again.
 
     Raises:
@@ -350,14 +350,14 @@ def read_recording(
 
     contents = RecordingContents(path)
     reader = RecordingReader(path)
-    read_keys = {*wanted, keys.APPLIED} if on_message is None else None
+    read_keys = {*selected_keys, keys.APPLIED} if on_message is None else None
     for recorded in reader.read_messages(read_keys):
         if recorded.key == keys.APPLIED:
             contents.ticks += 1
             contents.last_tick_ns = recorded.time_ns
         if on_message is not None:
             on_message(recorded)
-        if recorded.key in wanted or keys.find_row_key(recorded.key) in wanted:
+        if recorded.key in selected_keys or keys.find_row_key(recorded.key) in selected_keys:
             contents.add(recorded)
     contents.missing += describe_undecodable(contents.refused)
     contents.missing += [f"recording: {sentence}" for sentence in reader.missing]
@@ -380,8 +380,8 @@ def _count_lost_ticks(reader: "RecordingReader") -> int | None:
     return losses.lost_by_key[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
 
 
-def _is_kept(before: Any, message: Any) -> bool:
-    """Return whether a message is kept: worlds are thinned, and a path is kept once."""
+def _is_stored(before: Any, message: Any) -> bool:
+    """Return whether a message is stored: worlds are thinned, and a path is stored once."""
     match message:
         case World():
             return message.timestamp_ns >= before.timestamp_ns + round(1e9 / MAX_WORLDS_PER_S)

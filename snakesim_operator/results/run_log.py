@@ -57,7 +57,7 @@ class RunRecord:
     # More of the recording.
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # (n,) columns of custom sensors and telemetry
-    replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
+    replay_of: str = ""  # the recording whose sensors its services read; empty: a run
 
     # How much of the run is known.
     ending: str = COMPLETE  # COMPLETE, or a sentence on how the run ended

@@ -41,7 +41,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     scene: str
     backend: str
-    emulated: Annotated[bool | None, Meta(description="whether nothing real moved; null: the host did not say")] = None
+    emulated: Annotated[bool | None, Meta(description="whether nothing real moved; null: unknown")] = None
     controller: str
     seed: int
     clock_mode: ClockMode
@@ -64,10 +64,10 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     contacts_from: Annotated[
         str | None, Meta(description="what guidance had contacts from: sensor or joint_torques; null: none, or unknown")
     ] = None
-    reckoned_distance_m: Annotated[float | None, _number("m", "advance by dead reckoning; null: it was measured")] = (
-        None
-    )
-    reckoned_off_m: Annotated[
+    dead_reckoned_distance_m: Annotated[
+        float | None, _number("m", "advance by dead reckoning; null: it was measured")
+    ] = None
+    dead_reckoning_error_m: Annotated[
         float | None, _number("m", "largest error of the pose by dead reckoning; null: one of the poses is unknown")
     ] = None
     locomoting_fraction: Annotated[
@@ -91,7 +91,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     torque_saturated_fraction: Annotated[float | None, _number("1", "ticks with a joint at its torque limit")]
     peak_contact_force_n: Annotated[
         float | None,
-        _number("N", "largest force of one contact, mean over 50 ms; where a sensor does not tell that, at an instant"),
+        _number("N", "largest force of one contact, mean over 50 ms; or at one time, if the sensor does not average"),
     ]
     desired_force_correlation: Annotated[
         float | None,
@@ -191,7 +191,9 @@ def distance_m(summary: RunSummary) -> float | None:
 
 def estimates_of(summary: RunSummary) -> Estimates:
     """Return what guidance estimated in the run."""
-    return Estimates(summary.pose_from, summary.contacts_from, summary.reckoned_distance_m, summary.reckoned_off_m)
+    return Estimates(
+        summary.pose_from, summary.contacts_from, summary.dead_reckoned_distance_m, summary.dead_reckoning_error_m
+    )
 
 
 def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:

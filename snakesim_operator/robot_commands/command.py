@@ -26,15 +26,15 @@ DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "cha
 
 
 def arm(
-    robot: str, backend: str, where: RobotSelection, say: PrintLine = print_line, *, unchecked: bool = False
+    robot: str, backend: str, where: RobotSelection, print_text: PrintLine = print_line, *, unchecked: bool = False
 ) -> int:
-    """Arm a robot, if its name and its backend are those that the operator has given.
+    """Arm a robot, if its name and its backend are those that the operator names.
 
     Args:
         robot: name of the robot.
         backend: its backend.
         where: selects the robot's network.
-        say: prints a line for the operator.
+        print_text: prints a line for the operator.
         unchecked: whether to arm also without a check of the joints.
 
     Raises:
@@ -55,16 +55,16 @@ def arm(
                 code="robot/wrong-robot",
             )
         request = make_arm_request(description, get_user_name(), unchecked=unchecked)
-        return request_from_host(session, keys.LIFECYCLE, request, "armed", link, say)
+        return request_from_host(session, keys.LIFECYCLE, request, "armed", link, print_text)
 
 
-def disarm(where: RobotSelection, say: PrintLine = print_line) -> int:
+def disarm(where: RobotSelection, print_text: PrintLine = print_line) -> int:
     """Make the joints passive; later commands do not move them."""
     request = LifecycleRequest(action="disarm", requester=get_user_name())
-    return _request_from_robot(only_robot(where, "robot disarm"), keys.LIFECYCLE, request, "disarmed", say)
+    return _request_from_robot(only_robot(where, "robot disarm"), keys.LIFECYCLE, request, "disarmed", print_text)
 
 
-def reset(where: RobotSelection, say: PrintLine = print_line) -> int:
+def reset(where: RobotSelection, print_text: PrintLine = print_line) -> int:
     """Reset a fault or an emergency stop. The robot is disarmed then.
 
     If no robot runs, an emergency stop stored by the last run is removed.
@@ -72,37 +72,44 @@ def reset(where: RobotSelection, say: PrintLine = print_line) -> int:
     try:
         link = only_robot(where, "robot reset")
     except NotConnectedError:
-        kept = [path for path in find_latched_stops() if where.namespace in (None, path.parent.name)]
-        if not kept or where.endpoint is not None:
+        latched_stops = [path for path in find_latched_stops() if where.namespace in (None, path.parent.name)]
+        if not latched_stops or where.endpoint is not None:
             raise
-        for path in kept:
-            say(
+        for path in latched_stops:
+            print_text(
                 f"{path.parent.name}: {remove_latched_stop(path)}; reset by {get_user_name()}. No robot of "
                 "that name runs here"
             )
         return 0
     return _request_from_robot(
-        link, keys.LIFECYCLE, LifecycleRequest(action="reset", requester=get_user_name()), "reset", say
+        link, keys.LIFECYCLE, LifecycleRequest(action="reset", requester=get_user_name()), "reset", print_text
     )
 
 
-def simulator(order: SimulatorOrder, where: RobotSelection, say: PrintLine = print_line) -> int:
+def simulator(order: SimulatorOrder, where: RobotSelection, print_text: PrintLine = print_line) -> int:
     """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses."""
     request = SimulatorRequest(
         action=order.action, requester=order.requester or get_user_name(), ticks=order.ticks, speed=order.speed
     )
-    return _request_from_robot(only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], say)
+    return _request_from_robot(
+        only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], print_text
+    )
 
 
 def _request_from_robot(
-    link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, say: PrintLine
+    link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, print_text: PrintLine
 ) -> int:
     with open_session(link, CONNECT_S) as session:
-        return request_from_host(session, key, request, done, link, say)
+        return request_from_host(session, key, request, done, link, print_text)
 
 
 def request_from_host(
-    session: Session, key: str, request: LifecycleRequest | SimulatorRequest, done: str, link: Link, say: PrintLine
+    session: Session,
+    key: str,
+    request: LifecycleRequest | SimulatorRequest,
+    done: str,
+    link: Link,
+    print_text: PrintLine,
 ) -> int:
     """Query the robot's host, and check who answers. done: in words. Raises RefusedError, NotConnectedError."""
     statuses = session.latched_reader(keys.STATUS, Status)
@@ -121,7 +128,7 @@ def request_from_host(
         )
     if not answers[0].ok:
         raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
-    say(f"{name}: {done}: {answers[0].reason}")
+    print_text(f"{name}: {done}: {answers[0].reason}")
     return 0
 
 
@@ -145,14 +152,14 @@ def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | No
     """
     if len(answers) > 1:
         return f"{len(answers)} answered in its name; at least one is an impostor", _wait_for_status(statuses, None)
-    wanted = answers[0].lifecycle if answers else None
-    shown = _wait_for_status(statuses, wanted)
+    announced = answers[0].lifecycle if answers else None
+    shown = _wait_for_status(statuses, announced)
     hosts = {answer.host for answer in answers}
     if shown is not None:
         hosts.add(shown.host)
     if len(hosts) > 1:
         return "the answer is not from the host that publishes its status; one of them is an impostor", shown
-    if shown is None or shown.lifecycle != wanted:
+    if shown is None or shown.lifecycle != announced:
         return "its status does not show it; the host may hang, and the answer be from an impostor", shown
     return None, shown
 

@@ -168,8 +168,8 @@ def change_parameters(
 
     Raises:
         ConfigError: There is no such parameter.
-        RefusedError: Control refuses a value, with its reason; or does not show what it has accepted.
-        ControllerError: The controller cannot go on with what it has accepted, so control has ended.
+        RefusedError: Control refuses a value, with its reason; or does not report the new values.
+        ControllerError: The controller cannot continue with the new values, so control has ended.
         NotConnectedError: No controller publishes its parameters.
     """
     before = read_parameters_in_force(session)
@@ -207,12 +207,12 @@ def _wait_for_change(session: Session, before: ControlParameters) -> ControlPara
 def _check_controller_continues(
     states: Reader[ControlState], now: ControlParameters | None, changes: Mapping[str, Any]
 ) -> None:
-    """Raise ControllerError if the controller cannot go on with these changes.
+    """Raise ControllerError if the controller cannot continue with these changes.
 
     While the robot is armed, control reports its state 20 times a second. Otherwise nothing shows it before the arming.
 
     Args:
-        states: Control's reports since the changes were asked for.
+        states: Control's reports since the changes were requested.
         now: The parameters in force with them; None: control publishes none any more.
         changes: Values by name.
     """
@@ -221,9 +221,9 @@ def _check_controller_continues(
         reported = states.drain()
         for state in reported:
             if state.failed:
-                given = ", ".join(f"{name}={format_value(value)}" for name, value in changes.items())
+                values_text = ", ".join(f"{name}={format_value(value)}" for name, value in changes.items())
                 raise ControllerError(
-                    f"{given}: accepted, and then control has ended: {state.reason}. The robot stops. Start control "
+                    f"{values_text}: set, and then control has ended: {state.reason}. The robot stops. Start control "
                     "again with another value"
                 )
         if now is not None and any(state.tick > now.tick for state in reported):

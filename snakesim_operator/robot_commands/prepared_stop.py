@@ -237,11 +237,11 @@ class PreparedStop:
         return stopped, "; ".join(searched)
 
     def _ask_ports(self) -> _PortResults:
-        def ask(address: Address) -> StopAnswer | None:
+        def request(address: Address) -> StopAnswer | None:
             return self._requester.request_stop(address, self._user, LIMIT_S)
 
-        here = [stop_at_port(ask, address, robot) for address, robot in self._local.items()]
-        there = [stop_at_port(ask, address, robot) for address, robot in self._elsewhere.items()]
+        here = [stop_at_port(request, address, robot) for address, robot in self._local.items()]
+        there = [stop_at_port(request, address, robot) for address, robot in self._elsewhere.items()]
         return _PortResults(
             tuple(result for result in here if result is not None),
             tuple(result for result in there if result is not None),
@@ -255,12 +255,12 @@ class PreparedStop:
             return ask_session(part, self._link, LIMIT_S)
 
 
-def _result_of(asked: "Future[ResultT]", limit_s: float, otherwise: ResultT) -> tuple[ResultT, list[str]]:
+def _result_of(pending: "Future[ResultT]", limit_s: float, otherwise: ResultT) -> tuple[ResultT, list[str]]:
     """Wait for one way. Its error does not end the stop: it becomes a line of the result."""
     try:
-        error = asked.exception(limit_s)
+        error = pending.exception(limit_s)
     except FutureTimeoutError:
         return otherwise, []
     if error is not None:
         return otherwise, [f"{type(error).__name__}: {error}"]
-    return asked.result(), []
+    return pending.result(), []

@@ -171,14 +171,16 @@ def _as_json(robot: _Robot) -> dict[str, Any]:
 
 
 def processes_in_words(processes: Sequence[Process]) -> list[str]:
-    """Return lines for each process: machine, version, age, and how its configuration differs from the host's."""
+    """Return lines for each process: machine, version, uptime, and how its configuration differs from the host's."""
     host = next((entry for entry in processes if entry.name == HOST), None)
     lines: list[str] = []
     for entry in sorted(processes, key=lambda entry: (entry.name != HOST, entry.name, entry.machine, entry.pid)):
-        age_s = time.time() - entry.started_unix_s
-        age = f"for {timedelta(seconds=round(age_s))}" if age_s >= 0 else "its clock is ahead of this one's"
+        uptime_s = time.time() - entry.started_unix_s
+        uptime = "its clock is ahead of this one's"
+        if uptime_s >= 0:
+            uptime = f"for {timedelta(seconds=round(uptime_s))}"
         lines.append(
-            f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {age}"
+            f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {uptime}"
         )
         if host is not None:
             lines += [f"    DIFFERS: {difference}" for difference in find_differences(entry, host)]
@@ -211,9 +213,9 @@ def _describe_limits(status: Status) -> list[str]:
     """Return what keeps the robot from its full performance; empty if there is nothing."""
     lines: list[str] = []
     if status.paused_by is not None:
-        lines.append(f"  PAUSED by {status.paused_by}; `snakesim sim resume` or `step` go on")
+        lines.append(f"  PAUSED by {status.paused_by}; `snakesim sim resume` or `step` continues")
     elif status.speed != 1.0:
-        lines.append(f"  speed {status.speed:g} is wanted")
+        lines.append(f"  speed {status.speed:g} is requested")
     for joint, fraction in sorted(status.derated.items()):
         lines.append(f"  derated: {joint} has {100 * fraction:.0f} % of its torque left")
     if status.isolated:
@@ -231,12 +233,12 @@ def _describe_faults(status: Status) -> list[str]:
     """Return a line for each kind of fault, with its first tick and its count."""
     ticks: dict[tuple[str, str, str], list[int]] = {}
     for fault in status.faults:
-        place = f" at {fault.joint}" if fault.joint else ""
-        ticks.setdefault((fault.what, place, fault.cause), []).append(fault.tick)
+        joint_text = f" at {fault.joint}" if fault.joint else ""
+        ticks.setdefault((fault.what, joint_text, fault.cause), []).append(fault.tick)
     lines: list[str] = []
-    for (what, place, cause), fault_ticks in ticks.items():
-        more = f" and {len(fault_ticks) - 1} times more" if len(fault_ticks) > 1 else ""
-        lines.append(f"  fault {what}{place} at tick {fault_ticks[0]}{more}: {cause}")
+    for (what, joint_text, cause), fault_ticks in ticks.items():
+        repetitions = f" and {len(fault_ticks) - 1} times more" if len(fault_ticks) > 1 else ""
+        lines.append(f"  fault {what}{joint_text} at tick {fault_ticks[0]}{repetitions}: {cause}")
     if status.faults_left_out:
         lines.append(f"  and {status.faults_left_out} more faults, between the first and the newest of these")
     return lines

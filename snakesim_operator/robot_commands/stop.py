@@ -21,7 +21,7 @@ Named = tuple[str, str | None]  # endpoint and namespace of a robot
 AskPort = Callable[[Address], StopAnswer | None]  # raises NotConnectedError when the port is closed
 
 
-def estop(where: RobotSelection, say: PrintLine = print_line) -> int:
+def estop(where: RobotSelection, print_text: PrintLine = print_line) -> int:
     """Stop the addressed robots. Returns 0 when every known robot has confirmed that it is stopped, else 1."""
     local = local_stop_ports(where)
     elsewhere = stop_ports_elsewhere(where, local)
@@ -41,11 +41,11 @@ def estop(where: RobotSelection, say: PrintLine = print_line) -> int:
         shown = [result for future in network_futures for result in future.result()]
     results = combine_results(here, there, shown)
     for line in describe_results(results, here, shown):
-        say(line)
+        print_text(line)
     if not results:
-        say(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")
+        print_text(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")
     if where.namespace is not None and not any(robot.stopped for robot in results):
-        _print_other_robots(where, say)
+        _print_other_robots(where, print_text)
     return 0 if all_stopped(results) else 1
 
 
@@ -55,12 +55,12 @@ def _collect(futures: Sequence[Future[StopResult | None]]) -> list[StopResult]:
     return [result for result in results if result is not None]
 
 
-def _print_other_robots(where: RobotSelection, say: PrintLine) -> None:
-    """Print which robots there are, because the operator may have given a wrong name."""
+def _print_other_robots(where: RobotSelection, print_text: PrintLine) -> None:
+    """Print which robots there are, because the operator may have typed a wrong name."""
     from snakesim_operator.base.targets import find_robots
 
     for link in find_robots(replace(where, namespace=None)):
-        say(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
+        print_text(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
 
 
 def local_stop_ports(where: RobotSelection) -> dict[Address, Named]:
@@ -72,7 +72,7 @@ def local_stop_ports(where: RobotSelection) -> dict[Address, Named]:
 
 
 def stop_ports_elsewhere(where: RobotSelection, local: dict[Address, Named]) -> dict[Address, Named]:
-    """Return the stop port beside the given endpoint, if the endpoint is not that of a robot of this computer."""
+    """Return the stop port beside the endpoint, if the endpoint is not that of a robot of this computer."""
     if where.endpoint is None or local:
         return {}
     if where.session is not None:  # a router listens at a session's endpoint

@@ -16,7 +16,7 @@ from snakesim_hal.base.workers import start_worker
 
 STOP_LIMIT_S = 5.0  # a child that has not ended by then is killed
 LINES_SHOWN = 15  # of the output of a child that failed
-OUTPUT_TAIL_BYTES = 16384  # kept in memory, more than LINES_SHOWN usually take
+OUTPUT_TAIL_BYTES = 16384  # held in memory, more than LINES_SHOWN usually take
 PIPE_BYTES = 2**20  # holds a child's output while this process is frozen
 READ_BYTES = 65536
 

@@ -65,7 +65,7 @@ class ChildTracebackError(Exception):
 
 @dataclass(frozen=True)
 class ControlFailure:
-    """Why control could not go on."""
+    """Why control could not continue."""
 
     message: str
     cause: BaseException | None  # what the controller raised; None: its answer was not allowed

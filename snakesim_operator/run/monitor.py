@@ -20,7 +20,7 @@ from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import Progress
 from snakesim_operator.run.supervisor import HOST, Supervisor
 
-AFTER_FAULT_S = 1.5  # the host goes on for so long after a fault, so that the safe stop is in the record
+AFTER_FAULT_S = 1.5  # the host continues for so long after a fault, so that the safe stop is in the record
 POLL_S = 0.05
 ARM_LIMIT_S = 10.0  # for the host's answer to the request to arm
 RECORDER_LIMIT_S = 20.0  # once everything else is ready
@@ -41,7 +41,7 @@ class RunMonitor:
         session: Session,
         supervisor: Supervisor,
         ending: Ending,
-        say: Callable[[str], None],
+        print_text: Callable[[str], None],
         *,
         stay: bool,
         unchecked: bool = False,
@@ -53,7 +53,7 @@ class RunMonitor:
             session: connected to the run's network.
             supervisor: of the run's processes, already started.
             ending: collects the reasons for which the run ends.
-            say: prints a line for the operator.
+            print_text: prints a line for the operator.
             stay: whether a fault does not end the run; a person resets it and arms again.
             unchecked: whether to arm also without a check of the joints.
         """
@@ -61,10 +61,10 @@ class RunMonitor:
         self._session = session
         self._supervisor = supervisor
         self._ending = ending
-        self._say = say
+        self._print_text = print_text
         self._stay = stay
         self._unchecked = unchecked
-        self._faults = ProcessFaults(config, session, supervisor, say)
+        self._faults = ProcessFaults(config, session, supervisor, print_text)
         self._progress = Progress(config)
         self._startup_timeout = StartupTimeout(config.services, config.start_limit_s)
         self._processor_waits = ProcessorWaits(config.lease_ns * 1e-9)
@@ -170,7 +170,7 @@ class RunMonitor:
             self._status = host.status
             self._robot = host.description
         if self._robot is not None and robot_before is None:
-            self._say(describe_what_moves(self._robot))
+            self._print_text(describe_what_moves(self._robot))
         if self._status is not None and self._status is status_before:
             self._polls_without_status += 1
         else:
@@ -194,7 +194,7 @@ class RunMonitor:
         self._silence = self._describe_silence(status)
         if self._stay:
             if self._silence is not None and silence_before is None:
-                self._say(self._silence)
+                self._print_text(self._silence)
             self._print_recovery(status)
         elif self._silence is not None:
             self._ending.add_cause(self._silence)
@@ -243,8 +243,10 @@ class RunMonitor:
             return
         latched = f"{status.lifecycle}: {status.reason}"
         if latched != self._last_latched:
-            self._say(latched)
-            self._say(f"  go on with `snakesim robot reset`, then `snakesim robot arm {status.robot} {status.backend}`")
+            self._print_text(latched)
+            self._print_text(
+                f"  continue with `snakesim robot reset`, then `snakesim robot arm {status.robot} {status.backend}`"
+            )
         self._last_latched = latched
 
     def _arm_once(self) -> None:
@@ -281,7 +283,7 @@ class RunMonitor:
             self._recorder_due_s = now + RECORDER_LIMIT_S
         if now < self._recorder_due_s:
             return True
-        self._say(f"warning: no recorder within {RECORDER_LIMIT_S:.0f} s; the run goes on without")
+        self._print_text(f"warning: no recorder within {RECORDER_LIMIT_S:.0f} s; the run continues without")
         self._recorder_is_ready = True
         return False
 

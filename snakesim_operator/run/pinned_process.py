@@ -19,7 +19,7 @@ from snakesim_hal.base.arithmetic import common_environment
 from snakesim_hal.base.process import child_environment, die_with_parent, python_command
 
 ResultT = TypeVar("ResultT")
-CALL_FILE = "asked"  # holds the function and its arguments
+CALL_FILE = "call"  # holds the function and its arguments
 ANSWER_FILE = "answer"
 POLL_S = 1.0  # Python code runs again after so long, so that an exception can be raised in the caller's thread
 

@@ -52,10 +52,12 @@ class RobotTime:
 class ProcessFaults:
     """Carries out faults planned in the scenario, and those requested on `fault/run`."""
 
-    def __init__(self, config: RunConfig, session: Session, supervisor: Supervisor, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, config: RunConfig, session: Session, supervisor: Supervisor, print_text: Callable[[str], None]
+    ) -> None:
         self._allowed = config.allow_fault_injection
         self._supervisor = supervisor
-        self._say = say
+        self._print_text = print_text
         self._plan = InjectionPlan(injection for injection in parse_planned(config) if injection.part == RUN)
         self._time = RobotTime(session) if self._has_plan() else None  # each clock message wakes this process
         self._frozen: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
@@ -164,7 +166,7 @@ class ProcessFaults:
             )
 
     def _begin(self, injection: Injection) -> None:
-        self._say(f"injected fault: {injection.kind}:{injection.target}")
+        self._print_text(f"injected fault: {injection.kind}:{injection.target}")
         if injection.target_type != "process":
             step_s = injection.amount or 0.0
             step_wall_clock(step_s)
@@ -185,4 +187,4 @@ class ProcessFaults:
     def _thaw(self, name: str) -> None:
         del self._frozen[name]
         self._supervisor.signal(name, signal.SIGCONT)
-        self._say(f"injected fault ends: freeze:{name}")
+        self._print_text(f"injected fault ends: freeze:{name}")

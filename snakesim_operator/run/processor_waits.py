@@ -69,7 +69,7 @@ class ProcessorWaits:
         self._samples: deque[Sample] = deque()
 
     def sample(self, pids: Mapping[str, int]) -> None:
-        """Sample the counters of the processes, given by name; call it often."""
+        """Sample the counters of the processes, by name; call it often."""
         now_s = self._clock()
         usages = {name: self._read(pid) for name, pid in pids.items()}
         waited_s: dict[str, float] = {}

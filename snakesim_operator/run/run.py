@@ -141,7 +141,7 @@ def _conclude(request: RunRequest, supervisor: Supervisor, files: RunFiles, endi
 def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles, Path]]:
     """Lock the run's folder for as long as the context lives, and write the configuration.
 
-    A run whose folder is not writable goes on, but leaves no files.
+    A run whose folder is not writable continues, but leaves no files.
 
     Args:
         config: configuration of the run.
@@ -158,7 +158,7 @@ def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles
             write_atomically(folder / CONFIG, content)
         except OSError as error:
             held.close()
-            print_line(f"warning: --out {out}: {error.strerror}; the run goes on, but nothing of it is recorded")
+            print_line(f"warning: --out {out}: {error.strerror}; the run continues, but nothing of it is recorded")
             memory = os.memfd_create("snakesim-config")
             held.callback(os.close, memory)
             os.write(memory, content)
@@ -174,7 +174,7 @@ def check_recorder(*, record: bool) -> None:
 
 
 def _warn(failure: str) -> None:
-    print_line(f"warning: {failure}; the run goes on, its record may lack something")
+    print_line(f"warning: {failure}; the run continues, and its record may be incomplete")
 
 
 def _check_router(request: RunRequest) -> None:

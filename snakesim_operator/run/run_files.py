@@ -1,6 +1,6 @@
 """Writes the supervisor's files into the run's folder, in a separate thread: a robot never waits for a disk.
 
-Failed writes are kept in bounded memory and retried; lost data is reported.
+Failed writes stay in bounded memory and retried; lost data is reported.
 """
 
 import contextlib

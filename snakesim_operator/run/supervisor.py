@@ -74,7 +74,7 @@ class Supervisor:
         self,
         files: RunFiles,
         ending: Ending,
-        say: Callable[[str], None],
+        print_text: Callable[[str], None],
         stop_port: socket.socket,
         *,
         stay: bool = False,
@@ -84,7 +84,7 @@ class Supervisor:
         Args:
             files: receive the output of each process.
             ending: collects the reasons for which the run ends.
-            say: prints a line for the operator.
+            print_text: prints a line for the operator.
             stop_port: bound socket that each host of the run inherits in turn. Requests that arrive while no host runs
                 wait in it.
             stay: whether processes that end are restarted, once the run has started up.
@@ -97,7 +97,7 @@ class Supervisor:
         # Collaborators.
         self._files = files
         self._ending = ending
-        self._say = say
+        self._print_text = print_text
         self._stay = stay
 
         # What the processes share.
@@ -166,7 +166,7 @@ class Supervisor:
             self._note_restart(HOST, "host was reset", delay_s=0.0)
             robot = self.host.description
             command = f"snakesim robot arm {robot.robot} {robot.backend}" if robot is not None else "snakesim robot arm"
-            self._say(f"the simulator was reset: it is at the start, and disarmed; go on with `{command}`")
+            self._print_text(f"the simulator was reset: it is at the start, and disarmed; continue with `{command}`")
 
     def _note_restart(self, name: str, how: str, delay_s: float) -> None:
         elapsed_s = time.monotonic() - self._begun_s
@@ -248,7 +248,7 @@ class Supervisor:
             self.host.close()
             self.host = None
         self._note_restart(part.name, how, delay_s)
-        self._say(f"{how}; restart in {delay_s:g} s")
+        self._print_text(f"{how}; restart in {delay_s:g} s")
 
     def _host_is_done(self) -> bool:
         """Return whether the host has ended with a complete record."""
@@ -296,6 +296,6 @@ class Supervisor:
             lines = part.child.output.last_lines()
             if not lines:
                 continue
-            self._say(f"--- output of {part.name}:")
+            self._print_text(f"--- output of {part.name}:")
             for line in lines:
-                self._say(line)
+                self._print_text(line)

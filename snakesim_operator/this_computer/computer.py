@@ -26,6 +26,7 @@ from snakesim_hal.base.process import (
     lock_memory,
     python_command,
 )
+from snakesim_native.libraries import LAWS
 from snakesim_operator.base import extras
 
 MIN_PYTHON = (3, 11)
@@ -53,6 +54,14 @@ with mujoco.Renderer(model, 32, 32) as renderer:
     mujoco.mj_forward(model, data)
     renderer.update_scene(data)
     assert renderer.render().max() > 0
+"""
+
+
+FIND_LAWS_PROBLEM = """
+import mujoco
+from snakesim_native.libraries import LAWS
+from snakesim_native.load import load
+print(load(LAWS).problem)
 """
 
 
@@ -110,6 +119,35 @@ def _report_missing_packages(extra: str, names: list[str]) -> Finding:
 
 def _name_packages(extra: str) -> str:
     return f"packages [{extra}]" if extra else "packages"
+
+
+def check_laws() -> Iterator[Finding]:
+    """Check that the simulator's ground and friction laws run in C."""
+    if not extras.is_installed("sim"):
+        return
+    what = "Physics in C"
+    problem = _run_python(FIND_LAWS_PROBLEM)
+    if not problem:
+        yield Finding(what=what, state="ok", detail="ground and friction are computed in MuJoCo's engine")
+        return
+    detail = f"{LAWS.python_cost}, with the same results: {problem}"
+    fix = ["sudo apt install gcc libc6-dev", "python -m pip install ziglang"]
+    yield Finding(what=what, state="warn", detail=detail, fix=fix)
+
+
+def _run_python(program: str) -> str:
+    """Return what a Python program prints."""
+    parent = os.getpid()
+    completed = subprocess.run(
+        python_command("-c", program),
+        env=child_environment({}),
+        capture_output=True,
+        text=True,
+        timeout=PROBE_LIMIT_S,
+        check=False,
+        preexec_fn=lambda: die_with_parent(parent),
+    )
+    return completed.stdout.strip() or completed.stderr.strip()[-MAX_ERROR_LENGTH:]
 
 
 def check_opengl() -> Iterator[Finding]:

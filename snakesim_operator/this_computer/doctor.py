@@ -14,6 +14,7 @@ from snakesim_operator.this_computer.network_findings import check_ports, check_
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     computer.check_python,
     computer.check_packages,
+    computer.check_laws,
     computer.check_opengl,
     computer.check_can,
     computer.check_kvm,

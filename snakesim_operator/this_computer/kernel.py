@@ -51,7 +51,7 @@ def _governor(root: Path) -> Iterator[Finding]:
 def _isolated(root: Path) -> Iterator[Finding]:
     isolated = _read(root / "sys/devices/system/cpu/isolated")
     if isolated:
-        detail = f"{isolated} kept free of other programs; a host uses them when started with `taskset -c {isolated}`"
+        detail = f"{isolated} without other programs; a host uses them when started with `taskset -c {isolated}`"
     else:
         detail = f"none of {os.cpu_count()}; isolate one for the host from 500 Hz on (docs/how-to/real-time.md)"
     yield Finding(what="isolated processors", state="ok", detail=detail)

@@ -44,7 +44,7 @@ def _find_used_protocols(host: str, port: int) -> list[str]:
 
 
 def check_routers(where: RobotSelection) -> Iterator[Finding]:
-    """Check that a Zenoh router answers at every endpoint that was given, or that has a robot of this computer."""
+    """Check that a Zenoh router answers at every named endpoint, or that has a robot of this computer."""
     links = where.networks() if where.endpoint or local_robots() else []
     for link in links:
         begin_s = time.monotonic()

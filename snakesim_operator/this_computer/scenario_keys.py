@@ -148,15 +148,15 @@ def _holds_tables(option: inspect.Type) -> bool:
 
 
 def _keys_of_plugins(loaded: Loaded, section: str, group: str, named: str) -> Iterator[Key]:
-    """Yield the keys of a controller's or a backend's section: of the chosen one, of those given, and of one named."""
+    """Yield the keys of controllers or backends: of the chosen one, of those with values, and of the named one."""
     config = loaded.config
-    given: Mapping[str, dict[str, Any]] = config.controllers if section == "controllers" else config.backends
+    sections: Mapping[str, dict[str, Any]] = config.controllers if section == "controllers" else config.backends
     chosen = config.controller if section == "controllers" else config.backend
-    plugins = {name: name for name in [*given, *_name_in(named, section)] if name in list_installed(group)}
+    plugins = {name: name for name in [*sections, *_name_in(named, section)] if name in list_installed(group)}
     plugins[chosen.rpartition(":")[2]] = chosen
-    for name in sorted({*plugins, *given}):
+    for name in sorted({*plugins, *sections}):
         key = f"{section}.{name}"
-        values = given.get(name, {})
+        values = sections.get(name, {})
         plugin = find_installed(group, plugins[name]) if name in plugins else None
         if plugin is None:
             yield Key(key, replace(ANY_VALUE, name=name, type_words="table"), values)
@@ -173,10 +173,10 @@ def _name_in(named: str, section: str) -> list[str]:
     return [rest.partition(".")[0]] if first == section else []
 
 
-def _keys_of_settings(loaded: Loaded, plugin: Any, given: dict[str, Any], section: str) -> Iterator[Key]:
+def _keys_of_settings(loaded: Loaded, plugin: Any, sections: dict[str, Any], section: str) -> Iterator[Key]:
     required = [doc.name for doc in document_fields(section_type(plugin)) if doc.default is None]
-    if all(name in given for name in required):
-        checked = decode_section(plugin, given, loaded.table.source, section, loaded.table.origin)
+    if all(name in sections for name in required):
+        checked = decode_section(plugin, sections, loaded.table.source, section, loaded.table.origin)
         yield from _keys_of_struct(section_type(plugin), msgspec.to_builtins(checked), f"{section}.")
     else:  # of a plugin that the scenario does not use
-        yield from _keys_of_struct(section_type(plugin), given, f"{section}.")
+        yield from _keys_of_struct(section_type(plugin), sections, f"{section}.")

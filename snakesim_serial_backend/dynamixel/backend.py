@@ -17,7 +17,7 @@ from snakesim_serial_backend.dynamixel.emulator import CURRENT_A, MAX_CURRENT, E
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import Port
-from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
+from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.servos import Servos, ServosContext
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
 from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
@@ -126,16 +126,16 @@ def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequenc
                 f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}",
                 code="drive/unsupported-setting",
             )
-        if travel_rad + 2 * SLACK_RAD >= TURN:
+        if travel_rad + 2 * SLACK_RAD >= REVOLUTION_RAD:
             raise ConfigError(
                 f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and loses the count of whole "
                 f"turns when it is off: its angle would be ambiguous afterwards. Narrow its limits (or `gear`) to "
-                f"less than {TURN - 2 * SLACK_RAD:.2f} rad",
+                f"less than {REVOLUTION_RAD - 2 * SLACK_RAD:.2f} rad",
                 code="drive/unsupported-setting",
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is not given, and servos measure and limit "
+                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is missing, and servos measure and limit "
                 "amperes: take stall torque over stall current from the e-Manual, and measure it "
                 "(docs/hardware/dynamixel.md)",
                 code="drive/unsupported-setting",

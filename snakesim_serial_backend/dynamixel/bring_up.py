@@ -18,7 +18,7 @@ from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 # Registers that are written at every start.
 STARTUP_REGISTERS = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
 # Registers that are written only where they differ, as each write wears out their memory.
-KEPT_REGISTERS = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}
+EEPROM_VALUES = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}
 TORQUE_AT_START = 0x01  # bit of the startup configuration
 MEASURED_SIZE = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos differ: position, voltage, temperature
 READS = 3  # to distinguish a second servo from a single disturbance
@@ -75,15 +75,15 @@ def _check_servo(servo: Servo, ping: Packet | None, settings: DynamixelSettings)
     shared_id = _check_shared_id(servo)
     if shared_id:
         return shared_id
-    kept = _try_to_read(servo, 0, at.KEPT)
-    if kept is None:
+    eeprom = _try_to_read(servo, 0, at.EEPROM_SIZE)
+    if eeprom is None:
         return NO_ANSWER
     number, firmware = struct.unpack("<HB", ping.data[:3])
     return (
         _check_model(servo, number, settings)
         or _check_firmware(firmware)
-        or _check_kept_registers(kept)
-        or _check_current_limit(servo, kept)
+        or _check_eeprom(eeprom)
+        or _check_current_limit(servo, eeprom)
     )
 
 
@@ -162,22 +162,22 @@ def _check_firmware(firmware: int) -> str:
     return ""
 
 
-def _check_kept_registers(kept: Packet) -> str:
+def _check_eeprom(eeprom: Packet) -> str:
     """Return which of the registers that a servo keeps without power is unsafe; empty if none is."""
-    drive_mode = kept.data[at.DRIVE_MODE]
-    (offset,) = struct.unpack_from("<i", kept.data, at.HOMING_OFFSET)
+    drive_mode = eeprom.data[at.DRIVE_MODE]
+    (offset,) = struct.unpack_from("<i", eeprom.data, at.HOMING_OFFSET)
     if drive_mode or offset:
         return (
             f"has drive mode {drive_mode} and homing offset {offset}; both must be 0, as direction and zero are those "
             f"of the robot file (`sign`, `zero_rad`)"
         )
-    secondary_id = kept.data[at.SECONDARY_ID]
+    secondary_id = eeprom.data[at.SECONDARY_ID]
     if secondary_id <= LAST_ID:
         return (
             f"has the secondary id {secondary_id} (register {at.SECONDARY_ID}), and would take the setpoints of that "
             f"id, too: set it to 255, which is off"
         )
-    startup = kept.data[at.STARTUP]
+    startup = eeprom.data[at.STARTUP]
     if startup & TORQUE_AT_START:
         return (
             f"has startup configuration {startup} (register {at.STARTUP}): it switches its torque on "
@@ -186,14 +186,14 @@ def _check_kept_registers(kept: Packet) -> str:
     return ""
 
 
-def _check_current_limit(servo: Servo, kept: Packet) -> str:
+def _check_current_limit(servo: Servo, eeprom: Packet) -> str:
     """Return why a servo's own limit does not suit its joint; empty if it does."""
-    (servo.max_current,) = struct.unpack_from("<H", kept.data, at.CURRENT_LIMIT)
+    (servo.max_current,) = struct.unpack_from("<H", eeprom.data, at.CURRENT_LIMIT)
     limit_nm = servo.max_current * servo.unit_nm
     if servo.torque_nm > limit_nm:
         return (
             f"has a current limit of {limit_nm / servo.constant:.2f} A, which is "
-            f"{limit_nm:.2f} N·m, and its joint may ask for {servo.torque_nm:.2f} N·m: "
+            f"{limit_nm:.2f} N·m, and its joint may command {servo.torque_nm:.2f} N·m: "
             f"raise the one, or lower `torque_nm`"
         )
     return ""
@@ -213,8 +213,8 @@ def _write_registers(servo: Servo) -> None:
     state = _read_registers(servo, at.TORQUE_ENABLE, at.STATE_SIZE).data
     if state[at.WATCHDOG - at.TORQUE_ENABLE] == at.TRIPPED:
         _log.warning("%s: clearing an expired bus watchdog of an earlier run", servo.label)
-    kept = _read_registers(servo, 0, at.KEPT).data
-    differing = {address: value for address, value in KEPT_REGISTERS.items() if kept[address] != value}
+    eeprom = _read_registers(servo, 0, at.EEPROM_SIZE).data
+    differing = {address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value}
     for address, value in {**STARTUP_REGISTERS, **differing}.items():
         status = _try_to_write(servo, address, value)
         if status is None:

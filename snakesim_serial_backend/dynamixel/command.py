@@ -69,7 +69,7 @@ def named(links: Sequence[Path]) -> Iterator[list[Pty]]:
     """Make pseudo terminals with names, which are removed at the end.
 
     Raises:
-        ConfigError: a name cannot be given.
+        ConfigError: a name is not possible.
     """
     ptys = [Pty() for _ in links]
     made: list[Path] = []

@@ -325,7 +325,7 @@ class EmulatedDynamixel(DriveEmulator[Pty]):
         self._drive(i)
 
     def _drive(self, i: int) -> None:
-        """Drive the body as the registers say: in current-based position mode or in current mode, else not at all."""
+        """Drive the body in current-based position mode or in current mode, as the registers specify."""
         servo = self.servos[i]
         current = servo.read_register("h", at.GOALS)
         limit_nm = abs(current) * servo.unit_nm

@@ -1,6 +1,6 @@
 """The control table of the X series, its models, and the conversion of its units to SI units. Pure.
 
-The registers below address 64 are kept without power, and may be written only with torque off.
+The registers below address 64 last without power, and may be written only with torque off.
 
 Source: ROBOTIS' public e-Manual, "Control Table" of the X series.
 """
@@ -29,7 +29,7 @@ FIRST_FIRMWARE = 38  # the first one with a bus watchdog
 
 # Addresses.
 MODEL = 0  # 2 bytes; the model's information follows at 2, and the firmware at 6
-KEPT = 64  # size of what is kept without power, from 0 on
+EEPROM_SIZE = 64  # size of the registers that last without power, from 0 on
 DELAY = 9  # of an answer
 DRIVE_MODE = 10
 OPERATING_MODE = 11

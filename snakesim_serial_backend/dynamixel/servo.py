@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.port import Port
 
-TURN = 2 * math.pi  # rad
+REVOLUTION_RAD = 2 * math.pi  # rad
 SLACK_RAD = 0.3  # beyond its travel, where a servo may wake up
 OUT_OF_REACH = 1.2  # factor on the angle at which full torque would be reached
 

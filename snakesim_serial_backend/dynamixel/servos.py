@@ -25,7 +25,7 @@ from snakesim_serial_backend.dynamixel.bring_up import ANSWERS_TWICE, GARBLED, b
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
-from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
+from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.wire import is_emulated
 
@@ -139,7 +139,7 @@ class Servos(Drives):
             turns = at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD)
             if turns is not None:
                 servo.turns = turns
-        self._readings.set_motion(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
+        self._readings.set_motion(i, angle_rad + servo.turns * REVOLUTION_RAD, velocity * at.SPEED)
         self._readings.set_torque(i, current * servo.unit_nm)
         servo.current_a = abs(current) * servo.unit_nm / servo.constant
 
@@ -236,7 +236,7 @@ class Servos(Drives):
             case _:
                 limit_nm = 0.0
         current = min(round(limit_nm / servo.unit_nm), servo.max_current)
-        position = round((goal_rad - servo.turns * TURN) / at.RAD)
+        position = round((goal_rad - servo.turns * REVOLUTION_RAD) / at.RAD)
         return at.goals_form.pack(current, 0, 0, 0, position)
 
     def _write_same(self, address: int, indices: Sequence[int], data: bytes) -> None:

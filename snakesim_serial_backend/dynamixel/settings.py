@@ -1,4 +1,4 @@
-"""What the scenario may say about Dynamixel servos."""
+"""The settings of a scenario for Dynamixel servos."""
 
 from typing import Annotated, Literal
 

@@ -9,11 +9,11 @@ from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
-from snakesim_sim_backend.contacts import Touch, TouchReader
-from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.frames import rotate_into
 from snakesim_sim_backend.sensors.scope import Normal
+from snakesim_sim_backend.state.contacts import Touch, TouchReader
 
 MAX_FORCE_N = 1e7  # that a message may carry
 NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own point

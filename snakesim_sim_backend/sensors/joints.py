@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_hal.model.sensors import JointSensor
 from snakesim_hal.wire.messages import JointState
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model import of_joints
+from snakesim_sim_backend.model.build import of_joints
 from snakesim_sim_backend.sensors.scope import Normal
 from snakesim_sim_backend.sensors.timing import round_to_ticks
 

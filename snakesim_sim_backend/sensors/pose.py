@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_hal.model.sensors import PoseSensor
 from snakesim_hal.wire.messages import Pose
 from snakesim_hal.wire.quantities import Quaternion
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
 from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.scope import Normal
 

@@ -9,7 +9,7 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Power
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model import of_joints
+from snakesim_sim_backend.model.build import of_joints
 
 
 class PowerReader:

@@ -6,8 +6,8 @@ MuJoCo releases the interpreter lock meanwhile, so that a tick of the robot runs
 import mujoco
 import numpy as np
 
-from snakesim_sim_backend.ground import GROUND, PLANE_GROUP
-from snakesim_sim_backend.model import FOOT_GROUP
+from snakesim_sim_backend.model.build import FOOT_GROUP
+from snakesim_sim_backend.model.ground import GROUND, PLANE_GROUP
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.scope import Floats, Scope
 

@@ -11,7 +11,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import ColorImage, DepthImage
-from snakesim_sim_backend.ground import PLANE_GROUP
+from snakesim_sim_backend.model.ground import PLANE_GROUP
 from snakesim_sim_backend.sensors.depth import depth_image
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.rays import SEEN

@@ -12,7 +12,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
 
 Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers

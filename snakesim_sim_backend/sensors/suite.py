@@ -13,7 +13,7 @@ from snakesim_hal.model.sensors import AnyMounted, AnySensor, Mounted
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.joints import JointReader
 from snakesim_sim_backend.sensors.registry import make_body_reader, mounted_reader, own_noise

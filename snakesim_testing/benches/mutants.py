@@ -227,17 +227,17 @@ def let_go(points: SafeSetpoints) -> SafeSetpoints:
     return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
 
-@hears("position_mode_turns_the_joint_that_is_asked_and_no_other")
+@hears("position_mode_turns_only_the_requested_joint")
 def targets_in_degrees(points):
     return dataclasses.replace(points, target=np.radians(points.target).tolist())
 
 
-@hears("position_mode_turns_the_joint_that_is_asked_and_no_other")
+@hears("position_mode_turns_only_the_requested_joint")
 def head_to_tail(points):
     return SafeSetpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
 
 
-@hears("position_mode_turns_the_joint_that_is_asked_and_no_other", "torque_mode_pushes_with_the_torque_that_is_asked")
+@hears("position_mode_turns_only_the_requested_joint", "torque_mode_pushes_with_the_torque_that_is_asked")
 def wrong_way_round(points):
     return dataclasses.replace(points, target=[-target for target in points.target])
 
@@ -253,19 +253,19 @@ def one_mode_for_all(points):
     return dataclasses.replace(points, mode=[points.mode[1]] * len(points.mode))
 
 
-@hears("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+@hears("an_isolated_joint_is_passive_while_others_continue")
 def holds_what_is_lost(points):
     held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
     target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
     return SafeSetpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
 
 
-@hears("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+@hears("an_isolated_joint_is_passive_while_others_continue")
 def one_for_all(points):
     return let_go(points) if points.isolated else points
 
 
-@breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+@breaks("an_isolated_joint_is_passive_while_others_continue")
 class TakesNothingBack(Liar):
     lost: frozenset[int] = frozenset()
 
@@ -290,9 +290,7 @@ def no_torque_sensor(joints):
     return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
 
 
-@breaks(
-    "a_passive_joint_has_no_torque_and_moves_by_itself_nowhere", "nothing_moves_while_disarmed_whatever_is_commanded"
-)
+@breaks("a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded")
 class PassiveGoesToZero(Workbench):
     def step(self):
         passive = self.mode == Mode.PASSIVE
@@ -300,7 +298,7 @@ class PassiveGoesToZero(Workbench):
         super().step()
 
 
-@breaks("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_moves_by_itself_nowhere")
+@breaks("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_stays")
 class PassivePushes(Workbench):
     def step(self):
         passive = self.mode == Mode.PASSIVE
@@ -328,7 +326,7 @@ class ForgetsAfterAPeriod(Workbench):
         self.mode[:] = Mode.PASSIVE
 
 
-@breaks("a_mode_that_a_joint_lacks_is_refused_and_moves_nothing")
+@breaks("a_mode_that_a_joint_lacks_is_refused")
 class MovesAfterAll(Liar):
     """Has no torque mode, and moves without a setpoint."""
 
@@ -392,7 +390,7 @@ class RobotThatTrustsTheHost(Workbench):
 @breaks(
     "leaving_armed_brings_a_moving_joint_to_rest",
     "a_fault_of_the_backend_latches_and_stops_the_joints",
-    "a_controller_that_falls_silent_stops_the_joints_within_the_lease",
+    "a_controller_that_falls_silent_stops_joints_within_lease",
 )
 class GoesOnAfterArmed(Workbench):
     def enact(self, setpoints, lifecycle):
@@ -445,7 +443,7 @@ class RepeatsItsFaults(Workbench):
         return [Fault(tick=0, what="silent", cause=f"joint {i} is silent") for i in self.silent]
 
 
-FROZEN = "drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an_arming"
+FROZEN = "drives_that_stop_during_host_freeze_stay_off_until_reset"
 
 
 @breaks(FROZEN)
@@ -472,13 +470,13 @@ class HasNoWatchdog(DrivesWorkbench):
     WATCHDOG_S = 3600.0
 
 
-@breaks("drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watchdogs_time")
+@breaks("drives_brake_after_fault_and_are_off_after_watchdog")
 class BrakesForEver(DrivesWorkbench):
     def still_brakes(self):
         return self.enabled
 
 
-@breaks("drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watchdogs_time")
+@breaks("drives_brake_after_fault_and_are_off_after_watchdog")
 class LetsGoAtOnce(DrivesWorkbench):
     def still_brakes(self):
         return self.enabled & False
@@ -522,7 +520,7 @@ class KeepsItsBus(Workbench):
         super().__init__(config, settings)
 
 
-@reads("in_lockstep_the_same_seed_and_commands_give_the_same_samples")
+@reads("in_lockstep_same_seed_and_commands_give_same_samples")
 def own_dice(joints):
     return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
 

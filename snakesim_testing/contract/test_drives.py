@@ -16,7 +16,7 @@ def do_nothing(_rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("then", [do_nothing, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
-def test_drives_that_stop_while_the_host_is_frozen_stay_off_until_a_reset_and_an_arming(
+def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     rig: Rig, drives: EmulatedDrives, then: Callable[[Rig], None]
 ) -> None:
     """A host that does nothing for 1 s while a joint moves: every drive stops by its own watchdog.
@@ -52,9 +52,7 @@ def assert_drives_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> No
         assert not any(drives.enabled()), f"enabled again, in state {rig.authority.state}: {drives.enabled()}"
 
 
-def test_drives_brake_a_moving_joint_after_a_fault_and_are_off_after_their_watchdogs_time(
-    rig: Rig, drives: EmulatedDrives
-) -> None:
+def test_drives_brake_after_fault_and_are_off_after_watchdog(rig: Rig, drives: EmulatedDrives) -> None:
     """A fault that the driver gets: the drive of a moving joint brakes, for its watchdog's time at most."""
     rig.cruise()
     rig.fault()

@@ -21,7 +21,7 @@ def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
     assert healthy.samples and not healthy.faults, healthy.faults
 
 
-def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> None:
+def test_an_isolated_joint_is_passive_while_others_continue(rig: Rig) -> None:
     """While it is in `isolated`, a joint has no torque, whatever is commanded; a reset ends that."""
     with rig.with_isolation_allowed():
         began = rig.tick

@@ -113,7 +113,7 @@ def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: Hosted) -> 
     assert answer.ok and answer.lifecycle == "disarmed", answer
 
 
-def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench: Bench, hosted: Hosted) -> None:
+def test_a_controller_that_falls_silent_stops_joints_within_lease(bench: Bench, hosted: Hosted) -> None:
     """The lease is the dead-man switch: it runs out, that is a fault, and the joints come to rest."""
     try:
         let_lease_expire(hosted)

@@ -9,7 +9,7 @@ from snakesim_testing.contract.recordings import Pushing
 from snakesim_testing.contract.rig import Rig
 
 
-def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> None:
+def test_position_mode_turns_only_the_requested_joint(rig: Rig) -> None:
     """Each joint in turn moves STEP_RAD from the start pose, in rad, in the right direction, and stays there."""
     rig.arm()
     for joint in range(rig.count):
@@ -54,7 +54,7 @@ def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: Pus
     assert abs(measured_nm[1] + asked) < slack, f"asked for {-asked:.2f} N·m: {measured_nm[1]:.3f} N·m"
 
 
-def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> None:
+def test_a_passive_joint_has_no_torque_and_stays(rig: Rig) -> None:
     """Armed and passive: released away from the start pose, a joint stays where it is, without torque."""
     rig.arm()
     rig.drive({0: (Mode.POSITION, rig.home_rad[0] + t.STEP_RAD)}, rig.count_periods(t.SETTLE_S))
@@ -94,7 +94,7 @@ def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
     assert_cruising(rig)
 
 
-def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> None:
+def test_a_mode_that_a_joint_lacks_is_refused(rig: Rig) -> None:
     """Described without a mode, a joint is never given a setpoint in it: the command is refused as a whole."""
     missing = [mode for mode in Mode if not rig.supports_mode(0, mode)]
     if not missing:

@@ -20,7 +20,7 @@ from snakesim_operator.run.in_process import simulate
 PLOTLY = LIBRARY.read_text(encoding="utf-8")
 RATE_HZ, SECONDS = 100.0, 10.0
 LOST = "2 usable push-points, 3 are needed"  # how its locomotion ends
-SECTIONS = ["playback", "overview", "instants", "joints", "loads", "numbers", "again"]
+SECTIONS = ["playback", "overview", "snapshots", "joints", "loads", "numbers", "again"]
 SVG_NAMESPACE = "http://www.w3.org/2000/svg"
 ARMED_S = 0.37  # a robot is armed some time after its clock has begun
 

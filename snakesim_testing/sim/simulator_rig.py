@@ -10,7 +10,7 @@ from snakesim_hal.model.files import read_part
 from snakesim_hal.model.scenario import RunConfig, check
 from snakesim_hal.wire.messages import Message, Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.model import SimModel, build, of_joints
+from snakesim_sim_backend.model.build import SimModel, build, of_joints
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 

@@ -60,7 +60,7 @@ FAMILIES = {
         "motor_over_temp",
         "38550000000{}",
         "0.6.11",
-        "does not say its version: .*another id",
+        "does not report its version: .*another id",
         500,
     ),
     "moteus": Family(
@@ -72,7 +72,7 @@ FAMILIES = {
         "fault 38, over-temperature",
         "3033363665115510{:08X}",
         "",
-        "does not say its register map: .*another id",
+        "does not report its register map: .*another id",
         2000,
     ),
     "dynamixel": Family(
@@ -124,13 +124,13 @@ def robot(driver_type: Family) -> Iterator[Robot]:
     one.backend.close()
 
 
-def test_the_description_says_which_drives_these_are_where_they_say_it(robot: Robot) -> None:
+def test_driver_describes_the_drives_where_they_report_themselves(robot: Robot) -> None:
     joints = robot.backend.describe().joints
     assert [joint.serial for joint in joints] == [robot.driver_type.serial.format(i + 1) for i in range(JOINTS)]
     assert {joint.firmware for joint in joints} == {robot.driver_type.firmware}
 
 
-def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_again_if_it_is_still_there(
+def test_drive_error_persists_until_reset_and_is_reported_again(
     robot: Robot,
 ) -> None:
     assert robot.run(30, "disarmed") == [] and robot.run(30, "armed") == []
@@ -147,7 +147,7 @@ def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_aga
     assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
 
 
-def test_a_drive_that_restarts_in_motion_stays_off_until_the_clear_and_then_has_its_settings(robot: Robot) -> None:
+def test_drive_restarted_in_motion_stays_off_until_reset(robot: Robot) -> None:
     robot.run(20, "armed")
     robot.go_wrong("reboot:joint_3@0")
     faults = robot.run(80, "armed")
@@ -161,16 +161,14 @@ def test_a_drive_that_restarts_in_motion_stays_off_until_the_clear_and_then_has_
     assert settings[2] == settings[0] and law_of(robot.emulator, 2)[1] == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_drive_that_restarts_between_two_ticks_does_not_go_on_as_if_nothing_had_been(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_drive_restarted_between_ticks_does_not_continue(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("snakesim_drivers.emulation.emulated_body.BOOT_US", 10_000.0)
     robot.run(30, "armed")
     robot.go_wrong("reboot:joint_3@0")
     assert [(fault.what, fault.joint) for fault in robot.run(SHOWN, "armed")] == [("drive_not_armed", "joint_3")]
 
 
-def test_a_joint_that_was_lost_while_armed_is_left_alone_until_it_is_used_again(robot: Robot) -> None:
+def test_joint_lost_while_armed_is_ignored_until_used_again(robot: Robot) -> None:
     robot.run(20, "armed")
     robot.go_wrong("mute:joint_1@0")
     robot.isolated = frozenset({0})
@@ -181,7 +179,7 @@ def test_a_joint_that_was_lost_while_armed_is_left_alone_until_it_is_used_again(
     assert robot.run(30, "disarmed") == [] and robot.run(20, "armed") == [] and robot.following() == [True] * JOINTS
 
 
-def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_one_begins_anew(
+def test_drives_stop_by_watchdog_when_driver_is_gone(
     robot: Robot,
 ) -> None:
     """With the joint's own torque limit: a lower one that an ODrive has kept is in odrive/test_limits.py."""
@@ -197,7 +195,7 @@ def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_
     assert robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
 
 
-def test_drives_that_stopped_while_their_bus_was_cut_are_read_before_anything_clears_them(robot: Robot) -> None:
+def test_drives_stopped_behind_cut_bus_are_read_before_clearing(robot: Robot) -> None:
     """The driver ran all the time, and commanded them to damp and to be idle; nothing of it got through."""
     robot.run(30, "armed")
     robot.go_wrong("cut:bus_1@0-9")
@@ -211,7 +209,7 @@ def test_drives_that_stopped_while_their_bus_was_cut_are_read_before_anything_cl
     assert robot.run(10, "disarmed") == [] and robot.run(30, "armed") == [] and robot.following() == [True] * JOINTS
 
 
-def test_a_stop_that_cannot_be_read_yet_is_not_cleared_meanwhile(robot: Robot) -> None:
+def test_unreadable_stop_is_not_cleared_meanwhile(robot: Robot) -> None:
     """The host was frozen, and one drive does not answer after it: its watchdog's stop is reported once it does."""
     robot.run(20, "armed")
     robot.go_wrong("mute:joint_2@0-9")
@@ -227,7 +225,7 @@ def test_a_stop_that_cannot_be_read_yet_is_not_cleared_meanwhile(robot: Robot) -
     assert robot.following() == [False] * JOINTS
 
 
-def test_no_drive_is_enabled_by_the_damping_of_a_fault_that_comes_before_it_has_started(robot: Robot) -> None:
+def test_damping_before_start_enables_no_drive(robot: Robot) -> None:
     robot.run(5, "disarmed")
     robot.damps = True
     robot.run(10, "fault")
@@ -242,9 +240,7 @@ def test_no_drive_is_enabled_by_the_damping_of_a_fault_that_comes_before_it_has_
 
 
 @on_can
-def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_drive_with_other_id_is_missing_then_a_stranger(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     renamed = robot.driver_type.drives(robot.emulator)[0]
     setattr(renamed, "node" if hasattr(renamed, "node") else "id", 9)
     faults = robot.run(40, "disarmed")
@@ -263,7 +259,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 
 
 @on_can
-def test_two_drives_of_one_id_stop_the_robot_and_are_refused_at_the_start_with_both_serials(robot: Robot) -> None:
+def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: Robot) -> None:
     robot.run(20, "armed")
     serials = [joint.serial for joint in robot.backend.describe().joints]
     assert len(set(serials)) == JOINTS and all(serials)
@@ -293,7 +289,7 @@ def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> N
 
 
 @on_can
-def test_a_log_of_the_bus_is_read_by_python_can_as_it_was_sent(driver_type: Family, tmp_path: Path) -> None:
+def test_bus_log_is_read_by_python_can_as_sent(driver_type: Family, tmp_path: Path) -> None:
     one = Robot(driver_type, log=str(tmp_path / "bus.log"))
     one.run(5, "armed")
     one.backend.close()

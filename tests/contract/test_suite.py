@@ -79,7 +79,7 @@ def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("backend", "said"), [("BusWorkbench", ""), ("RealTimeWorkbench", "not exactly repeatable")])
-def test_a_backend_that_is_late_coarse_and_slow_to_wake_or_keeps_real_time_only_passes(backend: str, said: str) -> None:
+def test_contract_passes_late_coarse_slow_or_realtime_backend(backend: str, said: str) -> None:
     looks = ("--snakesim-mute", f"{BUS}:mute", "--snakesim-drives", f"{BUS}:WorkbenchDrives")
     ran = run_suite("--snakesim-backend", f"{BUS}:{backend}", *looks, "-q")
     assert ran.returncode == 0 and said in ran.stdout, ran.stdout
@@ -104,7 +104,7 @@ def test_a_wrong_call_is_said_once(given, said) -> None:
     assert " failed" not in ran.stdout
 
 
-def test_a_project_beside_ours_may_have_options_of_the_usual_names(tmp_path: Path) -> None:
+def test_contract_project_may_define_options_of_usual_names(tmp_path: Path) -> None:
     names = ["--backend", "--scenario", "--set", "--mute"]
     (tmp_path / "conftest.py").write_text(
         f"def pytest_addoption(parser):\n    for name in {names}:\n        parser.addoption(name)\n"

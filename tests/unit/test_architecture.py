@@ -23,7 +23,7 @@ def test_every_function_of_the_walks_is_where_they_say() -> None:
     assert not [f"{name} in {path}" for _, name, path, _ in ROWS if not sources(path, name)]
 
 
-def test_walk_from_readme_leads_to_the_line_that_limits_a_torque() -> None:
+def test_readme_walk_reaches_the_line_that_limits_torque() -> None:
     readme = (ROOT / "README.md").read_text()
     assert "](docs/concepts/architecture.md#walks-through-the-code)" in readme
     assert f"]({HOPS[0][1]})" in readme

@@ -10,13 +10,13 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ["snakesim", *sorted(path.name for path in ROOT.glob("snakesim_*"))]
 
 
-def test_benchmarks_may_use_what_tests_use_and_no_test_needs_a_benchmark() -> None:
+def test_tests_import_no_benchmark() -> None:
     imports = re.compile(r"^\s*(?:from|import) benchmarks\b", re.MULTILINE)  # most folders of tests are no packages
     assert not [path for path in (ROOT / "tests").rglob("*.py") if imports.search(path.read_text())]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_no_two_files_import_each_other_not_even_inside_a_function(package: str) -> None:
+def test_imports_have_no_cycles_even_inside_functions(package: str) -> None:
     graph = grimp.build_graph(package, cache_dir=None)
     circles = {
         tuple(sorted((one, other)))

@@ -21,7 +21,7 @@ def applied_of_strangers(operator: Stranger) -> list[int]:
 
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("kind", ["left_out", "none", "before", "after"])
-def test_a6_a_command_of_no_or_another_arming_is_never_applied(robot: Robot, kind: str, _time: int) -> None:
+def test_a6_command_of_no_or_another_arming_is_never_applied(robot: Robot, kind: str, _time: int) -> None:
     operator = robot.operator
     operator.receive("sensor/joints")
     operator.stand_by()
@@ -66,7 +66,7 @@ WRONG: tuple[dict[str, Any], ...] = (
 )
 
 
-def test_a6_a_wrong_command_with_a_high_sequence_keeps_no_right_one_out(robot: Robot) -> None:
+def test_a6_wrong_command_with_high_sequence_blocks_no_right_one(robot: Robot) -> None:
     operator = robot.operator
     operator.receive("sensor/joints")
     for changes in WRONG:
@@ -78,7 +78,7 @@ def test_a6_a_wrong_command_with_a_high_sequence_keeps_no_right_one_out(robot: R
         assert applied_of_strangers(operator) == [], changes
 
 
-def test_a6_what_a_stranger_knows_to_forge_stays_within_limits_and_ends_with_him(robot: Robot) -> None:
+def test_a6_perfect_forgery_stays_within_limits_and_ends_with_sender(robot: Robot) -> None:
     """What remains: epoch, arming and sequence are there to read, and who forges all three commands the robot."""
     operator = robot.operator
     operator.receive("sensor/joints")

@@ -55,7 +55,7 @@ def forging(stranger: Stranger, about: dict[str, Any]) -> AbstractContextManager
     return repeating(forge, EVERY_S)
 
 
-def test_a3_a_forged_description_lets_nothing_go_wrong_on_a_real_robot(real: tuple[Robot, Stranger]) -> None:
+def test_a3_forged_description_causes_no_fault_on_real_robot(real: tuple[Robot, Stranger]) -> None:
     robot, stranger = real
     before = robot.health()
     for key, request in ASKED:
@@ -67,7 +67,7 @@ def test_a3_a_forged_description_lets_nothing_go_wrong_on_a_real_robot(real: tup
     assert not robot.operator.status()["injected"]
 
 
-def test_a3_faults_are_for_runs_on_a_simulator_only_by_who_may_ask(robot: Robot) -> None:
+def test_a3_faults_are_only_for_simulators_and_permitted_users(robot: Robot) -> None:
     """What remains: on a simulator anybody may let anything go wrong, which ends in a stop, or a restart."""
     with Stranger(robot.endpoint) as stranger:
         assert stranger.ask("fault/run", {"kind": "kill", "target": "guidance"})[0]["ok"]

@@ -184,7 +184,7 @@ def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
     assert operator.next("hal/clock")["lifecycle"] == "estop", stopped.said
 
 
-def test_a8_forged_answers_of_services_stop_a_lockstep_run_at_most(tmp_path: Path) -> None:
+def test_a8_forged_service_answers_at_most_stop_lockstep_run(tmp_path: Path) -> None:
     arguments = ("triplet", "--controller", "hold", "--clock-mode", "lockstep", "--duration", "3600", "--stay")
     with standing(tmp_path, *arguments) as robot:
         before, operator = robot.health(), robot.operator

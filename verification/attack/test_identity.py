@@ -48,7 +48,7 @@ def frozen_host(robot: Robot) -> Iterator[None]:
     [
         ("disarm", "armed", lie("disarmed", "disarmed on request"), "disarmed"),
         ("reset", "estop", lie("disarmed", "reset; arm to move again"), "disarmed"),
-        ("estop", "armed", lie("estop", "emergency stop by root; reset it to go on"), "estop"),
+        ("estop", "armed", lie("estop", "emergency stop by root; reset it to continue"), "estop"),
         ("arm", "disarmed", lie("armed", "armed, commanded by control"), "armed"),
     ],
     ids=["disarm", "reset", "estop", "arm"],
@@ -75,7 +75,7 @@ def test_a2_a_second_answer_is_an_impostor(
         operator.until(lambda: operator.lifecycle() in (after, "fault"), f"{after}, as the robot was asked, too", 3.0)
 
 
-def test_a2_nobody_disarms_by_a_forged_answer_and_a_forged_status(robot: Robot) -> None:
+def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: Robot) -> None:
     operator = robot.operator
     answer = lie("disarmed", "disarmed on request")
     with impostor(robot, "hal/lifecycle", answer) as stranger:
@@ -89,12 +89,12 @@ def test_a2_nobody_disarms_by_a_forged_answer_and_a_forged_status(robot: Robot) 
 @pytest.mark.parametrize(
     ("tool", "key", "lies", "word"),
     [
-        ("estop", "hal/estop", lie("estop", "emergency stop by root; reset it to go on"), "planar13: stopped"),
+        ("estop", "hal/estop", lie("estop", "emergency stop by root; reset it to continue"), "planar13: stopped"),
         *[("disarm", "hal/lifecycle", lie("disarmed", "disarmed on request"), "planar13: disarmed")] * FULL,
     ],
     ids=["estop", "disarm"][: 1 + FULL],
 )
-def test_a2_a_frozen_host_is_not_stopped_by_whoever_answers_for_it(
+def test_a2_frozen_host_is_not_stopped_by_another_answer(
     routed: Robot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
 ) -> None:
     with impostor(routed, key, lies), frozen_host(routed):
@@ -103,10 +103,10 @@ def test_a2_a_frozen_host_is_not_stopped_by_whoever_answers_for_it(
 
 
 @pytest.mark.parametrize("how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL])
-def test_a2_a_stop_through_a_labs_router_is_confirmed_by_the_robot_alone(tmp_path: Path, how: str) -> None:
+def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, how: str) -> None:
     """The command is typed on another computer: all that it knows is the router's address, where anybody may answer."""
     endpoint = free_endpoint()
-    answer = lie("estop", "emergency stop by root; reset it to go on")
+    answer = lie("estop", "emergency stop by root; reset it to continue")
     with (
         zenoh.open(settings("", "router", listen=endpoint)),
         running(tmp_path / "robot", *STANDING, "--router", endpoint, endpoint=endpoint) as run,

@@ -43,7 +43,7 @@ def test_a12_a_request_without_a_name_is_not_anonymous(robot: Robot) -> None:
 
 
 @pytest.mark.slow  # tests/system/commands/test_operator.py has the quick one: a stop that outlives the host
-def test_a13_a_stop_outlives_its_run_and_its_folder_until_it_is_cleared(tmp_path: Path) -> None:
+def test_a13_stop_outlives_run_and_folder_until_reset(tmp_path: Path) -> None:
     with running(tmp_path, *STANDING, name="one") as run, joined(run) as operator:
         operator.recover()
         assert run.tell("estop").code == 0

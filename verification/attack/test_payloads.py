@@ -153,7 +153,7 @@ def test_many_tokens_of_services_change_nothing(robot: Robot) -> None:
     robot.unharmed(before)
 
 
-def test_a_token_of_a_service_that_comes_and_goes_stops_nothing(robot: Robot) -> None:
+def test_service_token_that_flaps_stops_nothing(robot: Robot) -> None:
     operator = robot.operator
     for name in ("control", "guidance", "hal") * effort(3, 100):
         with Stranger(robot.endpoint) as stranger:
@@ -164,9 +164,7 @@ def test_a_token_of_a_service_that_comes_and_goes_stops_nothing(robot: Robot) ->
     operator.recover()
 
 
-def test_many_robots_that_are_none_do_not_keep_a_stop_from_the_one_that_is(
-    robot: Robot, record_property: Record
-) -> None:
+def test_false_robots_do_not_keep_a_stop_from_real_one(robot: Robot, record_property: Record) -> None:
     operator = robot.operator
     with Stranger(robot.endpoint) as stranger:
         tokens = [stranger.session.liveliness().declare_token(f"robot_{i}/alive/hal") for i in range(effort(100, 1000))]
@@ -185,7 +183,7 @@ def test_many_robots_that_are_none_do_not_keep_a_stop_from_the_one_that_is(
 
 
 @pytest.mark.parametrize("mode", ["router", pytest.param("peer", marks=pytest.mark.slow)])
-def test_a_stranger_that_joins_as_a_router_or_peer_changes_nothing(robot: Robot, mode: str) -> None:
+def test_stranger_joining_as_router_or_peer_changes_nothing(robot: Robot, mode: str) -> None:
     before = robot.health()
     with Stranger(robot.endpoint, mode=mode, listen=free_endpoint()) as stranger:
         stranger.receive("hal/clock")
@@ -219,7 +217,7 @@ def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: Robot) -> Non
     assert not [key for key in answers if "config" in key], f"readable by anybody: {answers}"
 
 
-def test_hosts_that_are_none_neither_stop_the_robot_nor_hide_a_stop(robot: Robot) -> None:
+def test_false_hosts_neither_stop_robot_nor_hide_a_stop(robot: Robot) -> None:
     before, operator = robot.health(), robot.operator
     with Stranger(robot.endpoint) as stranger:
         for i in range(effort(100, 2000)):

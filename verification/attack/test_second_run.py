@@ -34,18 +34,18 @@ def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
 
 
 @pytest.mark.parametrize("_time", TIMES)
-def test_a1_a_second_run_on_a_router_does_not_arm_the_robot_there(routed: Robot, tmp_path: Path, _time: int) -> None:
+def test_a1_second_run_on_a_router_does_not_arm_robot(routed: Robot, tmp_path: Path, _time: int) -> None:
     routed.operator.stand_by()
     stays_disarmed(routed.operator, tmp_path, "--router", routed.endpoint)
 
 
-def test_a1_a_second_run_at_the_same_endpoint_does_not_arm_the_robot_there(robot: Robot, tmp_path: Path) -> None:
+def test_a1_second_run_at_same_endpoint_does_not_arm_robot(robot: Robot, tmp_path: Path) -> None:
     robot.operator.stand_by()
     stays_disarmed(robot.operator, tmp_path, "--endpoint", robot.endpoint)
 
 
 @pytest.mark.slow
-def test_a1_a_second_run_at_the_endpoint_of_a_router_does_not_arm_the_robot_there(tmp_path: Path) -> None:
+def test_a1_second_run_at_router_endpoint_does_not_arm_robot(tmp_path: Path) -> None:
     """Nobody holds the router's UDP port, so only that somebody listens there can tell the second run."""
     endpoint = free_endpoint()
     with (
@@ -59,9 +59,7 @@ def test_a1_a_second_run_at_the_endpoint_of_a_router_does_not_arm_the_robot_ther
         operator.recover()
 
 
-def test_a1_a_robot_that_only_seems_to_be_there_keeps_a_run_from_starting_and_no_more(
-    routed: Robot, tmp_path: Path
-) -> None:
+def test_a1_phantom_robot_only_keeps_a_run_from_starting(routed: Robot, tmp_path: Path) -> None:
     operator = routed.operator
     with Stranger(routed.endpoint, "mamba") as stranger:
         stranger.seem_alive("alive/hal")
@@ -76,7 +74,7 @@ def test_a1_a_robot_that_only_seems_to_be_there_keeps_a_run_from_starting_and_no
 
 
 @pytest.mark.parametrize("_time", TIMES)
-def test_a1_two_runs_that_start_at_once_have_a_network_each(tmp_path: Path, _time: int) -> None:
+def test_a1_two_runs_started_together_have_a_network_each(tmp_path: Path, _time: int) -> None:
     with (
         machine_of_its_own() as machine,
         running(tmp_path, *SHORT, name="one", endpoint=None, inside=machine) as one,
@@ -88,7 +86,7 @@ def test_a1_two_runs_that_start_at_once_have_a_network_each(tmp_path: Path, _tim
 
 
 @pytest.mark.slow
-def test_a14_a_stop_without_arguments_names_every_robot_of_the_machine_stopped_or_not_reached(tmp_path: Path) -> None:
+def test_a14_stop_without_arguments_names_every_robot_and_its_result(tmp_path: Path) -> None:
     with (
         machine_of_its_own() as machine,
         running(tmp_path, *STANDING, name="one", endpoint=None, inside=machine) as one,

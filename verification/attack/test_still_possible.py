@@ -52,7 +52,7 @@ def commanding(stranger: Stranger, epoch: int, target: float) -> AbstractContext
     return repeating(answer)
 
 
-def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_limits(robot: Robot) -> None:
+def test_anyone_may_take_lease_and_move_within_limits(robot: Robot) -> None:
     operator = robot.operator
     about, armings = operator.newest("hal/description"), operator.next("hal/clock")["arm_session"]
     operator.forget()
@@ -92,7 +92,7 @@ def test_a_forged_description_misleads_neither_host_nor_services(robot: Robot) -
     assert beyond_limits(about, rows) == []
 
 
-def test_an_impostor_keeps_tools_from_saying_yes_but_not_a_stop_from_the_robot(robot: Robot) -> None:
+def test_impostor_blocks_confirmation_but_not_the_stop(robot: Robot) -> None:
     answer: dict[str, Any] = {"ok": False, "reason": "no", "refusal": "wrong_state", "epoch": 0, "lifecycle": "armed"}
     with Stranger(robot.endpoint) as stranger:
         stranger.pretend("hal/estop", answer)

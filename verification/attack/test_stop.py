@@ -101,7 +101,7 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
 # --- by UDP, beside the endpoint ------------------------------------------------------------------------------------
 
 
-def test_a4_a_datagram_stops_the_robot_and_says_who_it_was(robot: Robot, record_property: Record) -> None:
+def test_a4_datagram_stops_the_robot_and_names_its_sender(robot: Robot, record_property: Record) -> None:
     asked_s = time.monotonic()
     answer = datagrams.ask(robot.endpoint, datagrams.stop("the bench's red button"), 2.0)
     assert answer is not None, "no answer at the endpoint's UDP port"
@@ -123,9 +123,7 @@ def test_a4_a_datagram_stops_the_robot_under(robot: Robot, name: str, record_pro
     assert answer is not None and took_s < QUERY_S
 
 
-def test_a4_a_flood_of_wrong_datagrams_does_nothing_and_keeps_no_right_one_out(
-    robot: Robot, record_property: Record
-) -> None:
+def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(robot: Robot, record_property: Record) -> None:
     before = robot.health()
     with datagrams.flood(robot.endpoint) as sent:
         time.sleep(float(effort(2, 10)))
@@ -139,7 +137,7 @@ def test_a4_a_flood_of_wrong_datagrams_does_nothing_and_keeps_no_right_one_out(
     robot.unharmed(before)
 
 
-def test_a4_whoever_a_datagram_says_it_is_from_the_host_lives_and_prints_it_safely(robot: Robot) -> None:
+def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: Robot) -> None:
     before = robot.health()
     for who in (b"", b"\xff\xfe\x80", b"\x1b[2J\r\nplanar13: armed", b"x" * 65, b"x" * 60_000, "é".encode() * 64):
         datagrams.ask(robot.endpoint, datagrams.stop(who), 0.2)
@@ -151,7 +149,7 @@ def test_a4_whoever_a_datagram_says_it_is_from_the_host_lives_and_prints_it_safe
 
 
 @pytest.mark.parametrize("knows_nonce", [False, True], ids=["wrong_nonce", "right_nonce"])
-def test_a4_a_false_answer_by_datagram_is_not_taken_for_a_stop(robot: Robot, knows_nonce: bool) -> None:
+def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: Robot, knows_nonce: bool) -> None:
     endpoint = free_endpoint()
     with datagrams.false_port(endpoint, knows_nonce=knows_nonce):
         ended = snakesim(robot.run.home, "estop", "--endpoint", endpoint)

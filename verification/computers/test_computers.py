@@ -113,7 +113,7 @@ def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
 
 
 @common
-def test_a_computer_with_another_c_library_says_that_its_digest_is_its_own(tmp_path: Path) -> None:
+def test_other_c_library_marks_digest_as_local(tmp_path: Path) -> None:
     """glibc has sines for processors with FMA, and others."""
     other = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
     typed = [*SNAKESIM, "run", "triplet", "--in-process", "--duration", "0.3", "--out", "run"]
@@ -156,7 +156,7 @@ def test_whole_runs_are_what_they_are_on_every_computer(tmp_path: Path, computer
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("computer", ["Haswell", "Nehalem", "plain NumPy"])
-def test_records_are_read_alike_by_a_program_that_imported_numpy_first(tmp_path: Path, computer: str) -> None:
+def test_records_are_equal_after_importing_numpy_first(tmp_path: Path, computer: str) -> None:
     suite(tmp_path, {**COMPUTERS[computer], "SNAKESIM_UNPINNED": "1"}, *OF_THIS_PROCESS)
 
 

@@ -30,7 +30,7 @@ def test_the_site_is_searched_from_a_folder_without_a_network() -> None:
     assert not [page for page in SITE.rglob("*.html") if loaded.search(page.read_text())]
     assert not [page for page in SITE.rglob("*.html") if "<code>``" in page.read_text()]  # a block taken for a text
     with chromium() as browser:
-        tab = browser.open(f"file://{SITE}/docs/safety.html")
+        tab = browser.open(f"file://{SITE}/docs/concepts/safety.html")
         tab.wait_for("Safety")
         tab.wait_until_loaded()
         tab.value("document.querySelector('input[name=query]').focus()")

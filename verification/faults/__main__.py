@@ -16,112 +16,168 @@ from pathlib import Path
 from typing import Any, get_args
 
 from verification.faults.results import ROOT, Store, machine
-from verification.faults.row import TRIALS, Backend, Request, Result, Row, Trial, judge
+from verification.faults.row import TRIALS, Backend, Environment, Request, Result, Row, Trial, judge
 from verification.faults.table import ROWS
 
-PLACE = "SNAKESIM_FAULTS_PLACE"  # where this process is, when it was started for a place
-ELSEWHERE = {
+# Set in a process that was started to measure rows in another environment: the name of this environment.
+ENVIRONMENT_VARIABLE = "SNAKESIM_FAULTS_ENVIRONMENT"
+
+# Commands that run a program in another environment.
+ENVIRONMENT_COMMANDS: dict[Environment, list[str]] = {
     "namespaces": ["unshare", "--net", "--mount"],
     "guest": [sys.executable, str(ROOT / "deploy/vm/with_vcan.py"), "--guest"],
 }
-Job = tuple[Row, Backend]
-ELSEWHERE_LIMIT_S = 2400.0
+ENVIRONMENT_LIMIT_S = 2400.0  # for all rows of one environment
+LOG_CHARACTERS = 800  # of each log, after an error
+
+Measurement = tuple[Row, Backend]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure the rows that are asked for, one after the other; those that need another place at the end, together."""
-    given = _parsed(argv)
-    store, inside = Store(given.json), os.environ.get(PLACE)
-    rows = [ROWS[name] for name in given.rows or ROWS]
-    wanted: list[Job] = [(row, backend) for row in rows for backend in _backends(row, given.backends)]
-    failed: list[str] = []
-    for row, backend in wanted:
-        if row.place in ("here", inside):
-            store.put(_measured(row, backend, given.trials))
-            failed += _reported(row, backend, store)
-    if inside is not None:
-        return 0
-    for place in ELSEWHERE:
-        there = [job for job in wanted if job[0].place == place]
-        if there:
-            _elsewhere(place, there, given, store)
-            failed += [name for row, backend in there for name in _reported(row, backend, store)]
-    if given.write:
+    """Measure rows one after the other: first those of this environment, then those of each other environment.
+
+    Returns:
+        0 if every measured row is met, 1 otherwise.
+    """
+    arguments = _parse_arguments(argv)
+    store = Store(arguments.json)
+    measurements = _select_measurements(arguments.rows or list(ROWS), arguments.backends)
+    started_in = os.environ.get(ENVIRONMENT_VARIABLE)
+
+    not_met: list[str] = []
+    for row, backend in measurements:
+        if row.environment in ("here", started_in):
+            store.save(_measure_row(row, backend, arguments.trials))
+            not_met += _print_result(row, backend, store)
+    if started_in is not None:
+        return 0  # the process that started this one reports
+
+    for environment in ENVIRONMENT_COMMANDS:
+        in_environment: list[Measurement] = [
+            (row, backend) for row, backend in measurements if row.environment == environment
+        ]
+        if in_environment:
+            _measure_in_environment(environment, in_environment, arguments.trials, store)
+            for row, backend in in_environment:
+                not_met += _print_result(row, backend, store)
+    if arguments.write:
         from verification.faults.page import write
 
         print(write(store))
-    print(f"not met: {', '.join(failed)}" if failed else "every row that was run is met")
-    return 1 if failed else 0
+    print(f"not met: {', '.join(not_met)}" if not_met else "every row that was run is met")
+    return 1 if not_met else 0
 
 
-def _backends(row: Row, only: Sequence[str] | None) -> list[Backend]:
-    return [name for name, how in row.on.items() if not isinstance(how, str) and (not only or name in only)]
+def _select_measurements(row_names: Sequence[str], only_backends: Sequence[str] | None) -> list[Measurement]:
+    """Return rows with each backend on which they are measured. only_backends: None or empty: all."""
+    measurements: list[Measurement] = []
+    for name in row_names:
+        for backend in ROWS[name].backends():
+            if not only_backends or backend in only_backends:
+                measurements.append((ROWS[name], backend))
+    return measurements
 
 
-def _measured(row: Row, backend: Backend, trials: int) -> Result:
-    """Run a row. What goes wrong is part of its result."""
-    measure = row.on[backend]
-    assert not isinstance(measure, str)
-    started, load, done, broken = time.monotonic(), round(os.getloadavg()[0], 2), list[Trial](), ""
-    wanted = max(trials, row.least) if trials >= TRIALS else trials
+def _measure_row(row: Row, backend: Backend, trials: int) -> Result:
+    """Measure a row on a backend. An exception ends the measurement, and is part of its result."""
+    measure = row.measurement(backend)
+    assert measure is not None, f"{row.name} does not apply to {backend}"
+    if trials >= TRIALS:
+        trials = max(trials, row.min_trials)
+    started_s = time.monotonic()
+    load = _machine_load()
+    done: list[Trial] = []
+    broken = ""
     print(f"{datetime.now():%H:%M:%S} {row.name} on {backend} ...", flush=True)
     with tempfile.TemporaryDirectory(prefix=f"snakesim-{row.name}-") as folder:
-        request = Request(backend, wanted, Path(folder), [])
+        request = Request(backend, trials, Path(folder), [])
         try:
             for trial in measure(request):
                 done.append(trial)
                 if trial.failure:
                     print(f"    {trial.failure}", flush=True)
-        except Exception as error:  # noqa: BLE001 - a row that breaks is a result, and the others go on
-            traceback.print_tb(error.__traceback__)
-            print(f"{type(error).__name__}: {str(error)[:1000]}", file=sys.stderr)
-            logs = [f"{log.name}: {log.read_text(errors='replace')[-800:]}" for log in Path(folder).glob("*.log")]
-            print("\n".join(logs), file=sys.stderr, flush=True)
+        except Exception as error:  # noqa: BLE001 - an exception is a result, and the other rows continue
+            _print_error(error, Path(folder))
             broken = f"{type(error).__name__}: {error}"[:500]
-    took_s = round(time.monotonic() - started, 1)
-    reported = {"trials": done, "retried": request.retried, "notes": request.notes, "broken": broken}
-    return _result(row, backend, took_s=took_s, load=load, **reported)
+    return _make_result(
+        row,
+        backend,
+        took_s=round(time.monotonic() - started_s, 1),
+        load=load,
+        trials=done,
+        retried=request.retried,
+        notes=request.notes,
+        broken=broken,
+    )
 
 
-def _elsewhere(place: str, wanted: Sequence[Job], given: argparse.Namespace, store: Store) -> None:
-    """Run rows by a process in the place that they need; it writes into the same file."""
+def _machine_load() -> float:
+    """Return the load of the machine over the last minute."""
+    return round(os.getloadavg()[0], 2)
+
+
+def _print_error(error: Exception, folder: Path) -> None:
+    """Print where an exception was raised, and the end of every log in a folder."""
+    traceback.print_tb(error.__traceback__)
+    print(f"{type(error).__name__}: {str(error)[:1000]}", file=sys.stderr)
+    for log in folder.glob("*.log"):
+        print(f"{log.name}: {log.read_text(errors='replace')[-LOG_CHARACTERS:]}", file=sys.stderr)
+    sys.stderr.flush()
+
+
+def _measure_in_environment(
+    environment: Environment, measurements: Sequence[Measurement], trials: int, store: Store
+) -> None:
+    """Measure rows by a process in another environment, which writes its results into the same file."""
     before = store.read()
-    names, backends = dict.fromkeys(row.name for row, _ in wanted), dict.fromkeys(backend for _, backend in wanted)
-    enter = list(ELSEWHERE[place])
-    if place == "guest":
-        folder = store.path.resolve().parent
-        enter += [*([] if folder.is_relative_to(ROOT) else ["--rwdir", str(folder)]), "--"]
-    command = [sys.executable, "-m", "verification.faults", "--rows", *names, "--backends", *backends]
-    command += ["--trials", str(given.trials), "--json", str(store.path)]
+    command = [*ENVIRONMENT_COMMANDS[environment]]
+    if environment == "guest":
+        command += [*_writable_folder_options(store), "--"]
+    command += ["env", f"{ENVIRONMENT_VARIABLE}={environment}", sys.executable, "-m", "verification.faults"]
+    command += ["--rows", *dict.fromkeys(row.name for row, _ in measurements)]
+    command += ["--backends", *dict.fromkeys(backend for _, backend in measurements)]
+    command += ["--trials", str(trials), "--json", str(store.path)]
     try:
-        subprocess.run([*enter, "env", f"{PLACE}={place}", *command], cwd=ROOT, check=False, timeout=ELSEWHERE_LIMIT_S)
+        subprocess.run(command, cwd=ROOT, check=False, timeout=ENVIRONMENT_LIMIT_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         print(f"    {error}", flush=True)
+
     after = store.read()
-    for row, backend in wanted:
+    for row, backend in measurements:
         if after.get((row.name, backend)) == before.get((row.name, backend)):
-            store.put(_result(row, backend, broken=f"nothing came back from the place that it needs ({place})"))
+            store.save(_make_result(row, backend, broken=f"no result from the environment {environment!r}"))
 
 
-def _result(row: Row, backend: str, **measured: Any) -> Result:
-    empty: dict[str, Any] = {"took_s": 0.0, "load": round(os.getloadavg()[0], 2), "trials": []}
-    when = f"{datetime.now():%Y-%m-%d %H:%M}"
-    return Result(row=row.name, backend=backend, when=when, machine=machine(), **(empty | measured))
+def _writable_folder_options(store: Store) -> list[str]:
+    """Return the options with which a guest may write into the folder of the results, if it is not in the checkout."""
+    folder = store.path.resolve().parent
+    if folder.is_relative_to(ROOT):
+        return []
+    return ["--rwdir", str(folder)]
 
 
-def _reported(row: Row, backend: str, store: Store) -> list[str]:
-    """Print how a row came out; its name when it is not met."""
+def _make_result(row: Row, backend: Backend, **measured: Any) -> Result:
+    """Return a result of now; `measured` replaces the values of a result without trials."""
+    values: dict[str, Any] = {"took_s": 0.0, "load": _machine_load(), "trials": []}
+    values |= measured
+    return Result(row=row.name, backend=backend, when=f"{datetime.now():%Y-%m-%d %H:%M}", machine=machine(), **values)
+
+
+def _print_result(row: Row, backend: Backend, store: Store) -> list[str]:
+    """Print the result of a row. Returns row and backend in words if the row is not met, otherwise nothing."""
     result = store.read()[row.name, backend]
     verdict = judge(row, result)
-    figures = "" if verdict.median is None else f"median {verdict.median:.1f}, worst {verdict.worst:.1f} {row.unit}, "
-    outcome = "met" if verdict.met else f"NOT MET: {verdict.why}"
+    figures = ""
+    if verdict.median is not None:
+        figures = f"median {verdict.median:.1f}, worst {verdict.worst:.1f} {row.unit}, "
     retried = f", {result.retried} retried" if result.retried else ""
+    outcome = "met" if verdict.met else f"NOT MET: {verdict.reason}"
     trials = f"{len(result.trials)} trials{retried} in {result.took_s:.0f} s"
     print(f"    {row.name} on {backend}: {figures}{trials}: {outcome}", flush=True)
     return [] if verdict.met else [f"{row.name} on {backend}"]
 
 
-def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
+def _parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m verification.faults", description=__doc__)
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), metavar="NAME", help=f"of {', '.join(ROWS)}")
     parser.add_argument("--backends", nargs="+", choices=get_args(Backend), metavar="NAME", help="only on these")

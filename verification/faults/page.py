@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from verification.faults.results import ROOT, Store
-from verification.faults.row import TRIALS, Result, Row, judge
-from verification.faults.table import HEADINGS, LEASE_MS, PERIOD_MS, Heading
+from verification.faults.row import TRIALS, Heading, Result, Row, judge
+from verification.faults.table import HEADINGS
+from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS
 
 PAGE = ROOT / "docs" / "benchmarks" / "faults.md"
 TABLE_NAME = "fault-table.csv"  # beside the page
@@ -45,7 +46,7 @@ This page summarizes [fault-table.csv]({table}){days}. The table has
 deadline, median, worst value, recovery, machine and notes of each measurement. [faults.json](faults.json) has every
 trial.
 
-**{met} of {wanted} measurements met**, {failed} not met, {left} not run. A measurement is met if the robot reacted as
+**{met} of {count} measurements met**, {failed} not met, {left} not run. A measurement is met if the robot reacted as
 expected within the deadline in its worst trial.
 
 Each row injects a fault at least {trials} times on each backend. The robot is the 13-joint snake of the scenario
@@ -76,16 +77,16 @@ def write(store: Store, page: Path = PAGE) -> Path:
 
 
 def _page_lines(results: Results) -> Iterator[str]:
-    wanted = [pair for heading in HEADINGS for pair in _measurable(heading)]
-    done = [pair for pair in wanted if _key(pair) in results]
+    measurable = [pair for heading in HEADINGS for pair in _measurable(heading)]
+    done = [pair for pair in measurable if _key(pair) in results]
     met = sum(_is_met(pair, results) for pair in done)
     yield INTRODUCTION.format(
         days=_format_days(list(results.values())),
         table=TABLE_NAME,
         met=met,
-        wanted=len(wanted),
+        count=len(measurable),
         failed=len(done) - met,
-        left=len(wanted) - len(done),
+        left=len(measurable) - len(done),
         trials=TRIALS,
         period=PERIOD_MS,
         lease=LEASE_MS,
@@ -115,12 +116,7 @@ def _format_days(results: Sequence[Result]) -> str:
 
 def _measurable(heading: Heading) -> list[tuple[Row, str]]:
     """Return row and backend of each measurement; a row that does not apply to a backend is left out."""
-    pairs: list[tuple[Row, str]] = []
-    for row in heading.rows:
-        for backend, measure in row.on.items():
-            if not isinstance(measure, str):
-                pairs.append((row, backend))
-    return pairs
+    return [(row, backend) for row in heading.rows for backend in row.backends()]
 
 
 def _key(pair: tuple[Row, str]) -> tuple[str, str]:
@@ -140,7 +136,7 @@ def _format_table(results: Results) -> str:
     writer.writeheader()
     for heading in HEADINGS:
         for row in heading.rows:
-            for backend, measure in row.on.items():
+            for backend, measure in row.measures.items():
                 cells: dict[str, Any] = {
                     "row": row.name,
                     "fault": row.fault,
@@ -168,9 +164,9 @@ def _measured_cells(row: Row, result: Result) -> dict[str, Any]:
         "median": _format_number(verdict.median),
         "worst": _format_number(verdict.worst),
         "trials": len(result.trials),
-        "trials_wanted": max(TRIALS, row.least),
+        "trials_wanted": max(TRIALS, row.min_trials),
         "retried": result.retried,
-        "result": "met" if verdict.met else f"not met: {verdict.why}",
+        "result": "met" if verdict.met else f"not met: {verdict.reason}",
         **_recovery_cells(result),
         "notes": "; ".join(result.notes),
         "when": result.when,

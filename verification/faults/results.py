@@ -19,14 +19,14 @@ class Store:
         self.path = path
 
     def read(self) -> dict[tuple[str, str], Result]:
-        """Everything that was measured so far."""
+        """Return every stored result by row and backend."""
         if not self.path.is_file():
             return {}
-        found = msgspec.json.decode(self.path.read_bytes(), type=list[Result])
-        return {(result.row, result.backend): result for result in found}
+        results = msgspec.json.decode(self.path.read_bytes(), type=list[Result])
+        return {(result.row, result.backend): result for result in results}
 
-    def put(self, result: Result) -> None:
-        """Take in a result, in place of an older one of the same row and backend."""
+    def save(self, result: Result) -> None:
+        """Store a result, in place of an older one of the same row and backend."""
         results = self.read() | {(result.row, result.backend): result}
         ordered = [results[key] for key in sorted(results)]
         partial = self.path.with_suffix(".partial")
@@ -36,7 +36,7 @@ class Store:
 
 
 def machine() -> str:
-    """Cores, kernel and interpreter, in words."""
+    """Return the cores, the kernel and the interpreter of this machine, in words."""
     emulated = ", emulated in a guest" if os.environ.get("SNAKESIM_VCAN") == "guest" else ""
     return (
         f"{os.cpu_count()} cores, {platform.machine()}, Linux {platform.release()}, "

@@ -1,4 +1,4 @@
-"""What a row of the fault table is, and what its trials leave."""
+"""A row of the fault table, the measurements of its trials, and the verdict on them."""
 
 import statistics
 from collections.abc import Callable, Iterator, Mapping
@@ -10,14 +10,17 @@ import msgspec
 
 Backend = Literal["sim", "can", "both", "odrive", "moteus", "dynamixel", "mixed"]
 DRIVE_TYPES: tuple[Backend, ...] = ("can", "odrive", "moteus", "dynamixel", "mixed")
-Place = Literal["here", "namespaces", "guest"]
+
+# Where a row is measured: in this process's environment, in network namespaces, or in a virtual machine with SocketCAN.
+Environment = Literal["here", "namespaces", "guest"]
+
 TRIALS = 20  # of each row and backend in a whole table
 
 
 class Trial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One injection."""
+    """The measurement of one injection."""
 
-    value: float | None  # in the row's unit; None: what should have happened did not
+    value: float | None  # in the row's unit; None: the expected reaction did not happen
     failure: str = ""  # what else was wrong
     recovered: bool | None = None  # by an operator's command; None: there was nothing to recover from
     step_rad: float | None = None  # largest change of an applied angle target in a tick, after the recovery
@@ -25,88 +28,112 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A row on a backend, as it was measured."""
+    """The measurements of a row on one backend."""
 
     row: str
     backend: str
     when: str
     took_s: float
-    load: float  # the machine's, when it began
+    load: float  # of the machine, at the beginning
     machine: str
     trials: list[Trial]
-    retried: int | None = None  # trials that were made again, see `Request.retry`; None: it was not counted then
+    retried: int | None = None  # trials that were repeated, see `Request.retry`; None: they were not counted then
     notes: list[str] = []
-    broken: str = ""  # why it ended early
+    broken: str = ""  # why the measurement ended early
 
 
 @dataclass
 class Request:
-    """What a measurement is asked for, and what it tells besides its trials."""
+    """A request to measure a row. The measurement adds its notes and its repeated trials."""
 
     backend: str
     trials: int
-    folder: Path  # its own, empty
-    notes: list[str]  # what should stand beside the row
+    folder: Path  # empty, for this measurement alone
+    notes: list[str]  # remarks that the table shows with the row
     retried: int = 0
 
     def retry(self, times: int = 1) -> None:
-        """A trial is made again: its arming did not last, or the robot had stopped before anything was injected."""
+        """Count repeated trials: an arming did not last, or the robot had stopped before the injection."""
         self.retried += times
 
     def note(self, text: str) -> None:
-        """Once, however often it is said."""
+        """Add a remark, unless it was added before."""
         if text not in self.notes:
             self.notes.append(text)
 
 
 Measure = Callable[[Request], Iterator[Trial]]
+"""Yields the trials of a row as they are done."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
-    """One line of the table."""
+    """One row of the table: a fault, the expected reaction, and how it is measured on each backend."""
 
     name: str
     fault: str
     expected: str
     deadline: str  # in words, with how it is counted
-    limit: float  # the worst value allowed
+    limit: float  # largest allowed value
     unit: str
-    on: Mapping[Backend, Measure | str]  # how it is measured, or why it does not apply
-    place: Place = "here"
-    least: int = 0  # trials in a whole table of 20; fewer where fewer are asked for
+    measures: Mapping[Backend, Measure | str]  # how it is measured, or why it does not apply
+    environment: Environment = "here"
+    min_trials: int = 0  # in a whole table of `TRIALS`
+
+    def measurement(self, backend: Backend) -> Measure | None:
+        """Return how the row is measured on a backend; None if it does not apply to the backend."""
+        measure = self.measures.get(backend)
+        return None if isinstance(measure, str) else measure
+
+    def backends(self) -> list[Backend]:
+        """Return the backends to which the row applies."""
+        return [backend for backend in self.measures if self.measurement(backend) is not None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Heading:
+    """A fault as the page summarizes it. It may need several rows."""
+
+    fault: str
+    expected: str
+    deadline: str
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Verdict:
     """Whether a row is met."""
 
     met: bool
-    why: str
+    reason: str  # why it is not met; empty if it is
     median: float | None = None
     worst: float | None = None
 
 
 def judge(row: Row, result: Result) -> Verdict:
-    """By the worst trial."""
+    """Return whether a row is met in all of its trials, and every objection if it is not."""
     values = [trial.value for trial in result.trials if trial.value is not None]
-    median = statistics.median(values) if values else None
-    worst = max(values) if values else None
-    against: list[str] = []
-    over = [value for value in values if value > row.limit]
-    if over:
-        against.append(f"{len(over)} of {len(values)} trials over {row.limit:g} {row.unit}")
-    if result.broken:
-        against.append(result.broken)
-    missing = sum(trial.value is None for trial in result.trials)
-    if missing:
-        against.append(f"nothing measured in {missing} of {len(result.trials)} trials")
     failures = [trial.failure for trial in result.trials if trial.failure]
+    too_late = sum(value > row.limit for value in values)
+    missing = sum(trial.value is None for trial in result.trials)
+    not_recovered = sum(trial.recovered is False for trial in result.trials)
+
+    objections: list[str] = []
+    if too_late:
+        objections.append(f"{too_late} of {len(values)} trials over {row.limit:g} {row.unit}")
+    if result.broken:
+        objections.append(result.broken)
+    if missing:
+        objections.append(f"nothing measured in {missing} of {len(result.trials)} trials")
     if failures:
-        against.append(f"{len(failures)} of {len(result.trials)} trials: {failures[0]}")
-    stuck = sum(trial.recovered is False for trial in result.trials)
-    if stuck:
-        against.append(f"no recovery in {stuck} trials")
+        objections.append(f"{len(failures)} of {len(result.trials)} trials: {failures[0]}")
+    if not_recovered:
+        objections.append(f"no recovery in {not_recovered} trials")
     if not result.trials and not result.broken:
-        against.append("no trial")
-    return Verdict(not against, "; ".join(against), median, worst)
+        objections.append("no trial")
+    return Verdict(
+        met=not objections,
+        reason="; ".join(objections),
+        median=statistics.median(values) if values else None,
+        worst=max(values, default=None),
+    )

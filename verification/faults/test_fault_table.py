@@ -11,14 +11,14 @@ from verification.faults.row import DRIVE_TYPES, Result, Row, Trial, judge
 from verification.faults.table import HEADINGS, ROWS
 
 
-def test_no_row_is_missing_and_every_row_stands_on_both_backends_or_says_why_not() -> None:
+def test_fault_table_has_every_row_on_both_backends() -> None:
     assert len(ROWS) == sum(len(heading.rows) for heading in HEADINGS)
     for row in ROWS.values():
-        assert set(row.on) in ({"sim", "can"}, {"both"}, set(DRIVE_TYPES)), row.name
-        assert any(not isinstance(measure, str) for measure in row.on.values()), row.name
+        assert set(row.measures) in ({"sim", "can"}, {"both"}, set(DRIVE_TYPES)), row.name
+        assert any(not isinstance(measure, str) for measure in row.measures.values()), row.name
 
 
-def test_the_page_is_short_and_is_made_of_the_raw_results(tmp_path: Path) -> None:
+def test_fault_table_page_is_short_and_matches_raw_results(tmp_path: Path) -> None:
     page = write(Store(), tmp_path / "faults.md").read_text()
     assert page == PAGE.read_text() and len(page.replace("|", "").split()) <= 600
     assert (tmp_path / TABLE_NAME).read_text() == PAGE.with_name(TABLE_NAME).read_text()
@@ -28,9 +28,9 @@ def test_the_page_is_short_and_is_made_of_the_raw_results(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
     raw = tmp_path / "faults.json"
-    asked = ["--trials", "2", "--json", str(raw)]
-    assert main(["--rows", "host_silent", *asked]) == 0
-    assert main(["--rows", "bus_duplicate_at_start", *asked]) == 0
+    options = ["--trials", "2", "--json", str(raw)]
+    assert main(["--rows", "host_silent", *options]) == 0
+    assert main(["--rows", "bus_duplicate_at_start", *options]) == 0
     results = Store(raw).read()
     assert sorted(results) == [("bus_duplicate_at_start", "can"), ("host_silent", "can")]
     silent = results["host_silent", "can"]
@@ -42,8 +42,11 @@ def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
         assert f"| {heading.fault} |" in page
 
 
-def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() -> None:
-    row = Row("r", "fault", "stop", "50 ms", 50.0, "ms", {"sim": lambda _request: iter(())})
+def test_fault_table_row_is_judged_by_its_worst_trial() -> None:
+    row = Row(
+        name="r", fault="fault", expected="stop", deadline="50 ms", limit=50.0, unit="ms",
+        measures={"sim": lambda _request: iter(())},
+    )  # fmt: skip
 
     def judged(*trials: Trial, broken: str = "") -> tuple[bool, str]:
         result = Result(
@@ -51,7 +54,7 @@ def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() 
             broken=broken,
         )  # fmt: skip
         verdict = judge(row, result)
-        return verdict.met, verdict.why
+        return verdict.met, verdict.reason
 
     good, late = Trial(value=40.0, recovered=True), Trial(value=50.1)
     assert judged(good, good) == (True, "")

@@ -12,7 +12,7 @@ PAYLOADS_EACH = 50  # into every file and the like
 FRAMES = 4_000
 
 
-def test_no_payload_brings_a_decoder_or_what_stands_behind_it_down() -> None:
+def test_fuzz_payloads_never_crash_decoders_or_their_users() -> None:
     report = run(PAYLOADS, seed=7)
     assert sum(outcomes.total() for outcomes in report.outcomes.values()) == PAYLOADS
     refused = {reason for outcomes in report.outcomes.values() for reason in outcomes}
@@ -33,7 +33,7 @@ def test_no_file_flag_or_datagram_does_more_than_be_refused(tmp_path: Path) -> N
 
 
 @pytest.mark.timeout(120)
-def test_no_frame_on_a_bus_raises_anything_in_driver_or_modules() -> None:
+def test_fuzz_bus_frames_never_raise_in_driver_or_modules() -> None:
     words = bus.run(FRAMES, seed=7)
     assert all(words[kind] > 0 for kind in bus.KINDS) and words["openings"] >= 2
     assert words["fault second_host"] > 0

@@ -271,7 +271,7 @@ NEEDS: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 
 @needs_uv
-def test_the_core_alone_drives_a_robot_and_every_command_says_which_extra_it_lacks(wheel: Path, tmp_path: Path) -> None:
+def test_core_installation_drives_robot_and_commands_name_missing_extras(wheel: Path, tmp_path: Path) -> None:
     snakesim, _ = lent("", wheel, tmp_path)
     listed = snakesim("--help")
     assert listed.code == 0 and not listed.err and " estop " in listed.out and " drive " in listed.out

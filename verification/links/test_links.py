@@ -33,7 +33,7 @@ def armed(made: Lab) -> None:
     time.sleep(0.3)
 
 
-def test_a_cut_link_stops_the_robot_and_a_mended_one_lets_it_be_armed(robot: Lab) -> None:
+def test_cut_link_stops_robot_and_restored_one_allows_arming(robot: Lab) -> None:
     armed(robot)
     robot.link.make(cut=True)
     assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
@@ -42,7 +42,7 @@ def test_a_cut_link_stops_the_robot_and_a_mended_one_lets_it_be_armed(robot: Lab
     robot.arm()
 
 
-def test_a_dead_router_stops_the_robot_and_a_new_one_lets_it_be_armed(robot: Lab) -> None:
+def test_dead_router_stops_robot_and_new_one_allows_arming(robot: Lab) -> None:
     """Again and again: a row of the fault table."""
     armed(robot)
     robot.kill_router()
@@ -61,7 +61,7 @@ def test_a_link_with_some_delay_keeps_the_robot_armed(robot: Lab) -> None:
         robot.link.make()
 
 
-def test_images_that_need_more_than_a_slow_link_has_stop_nothing(tmp_path: Path) -> None:
+def test_slow_link_overloaded_by_images_stops_nothing(tmp_path: Path) -> None:
     with lab(tmp_path, "robot=planar13_camera") as made:
         made.robot.run("sh", "-c", "tc qdisc add dev robot root tbf rate 4mbit burst 16kb latency 50ms")
         recording = made.record()

@@ -24,7 +24,7 @@ def test_what_a_killed_run_leaves(tmp_path: Path, trial: Trial) -> None:
     assert wrong == []
 
 
-def test_one_seed_draws_the_same_trials_of_all_moments_on_both_backends() -> None:
+def test_kills_of_one_seed_are_same_on_both_backends() -> None:
     assert list(islice(draw(11), 14)) == TRIALS
     assert {(trial.moment, trial.backend) for trial in TRIALS} == {(m, b) for m in MOMENTS for b in ("sim", "can")}
 

@@ -105,7 +105,7 @@ def _find_place_at_box(route: Route, box: Obstacle, near_s_m: float, window_m: f
 
 def find_push_points(
     planned: Sequence[PlannedContact],
-    kept: Collection[str],
+    retained: Collection[str],
     body_pose: BodyPose,
     measured_w: Floats,
     node_body_s_m: Sequence[float],
@@ -120,12 +120,12 @@ def find_push_points(
 
     Args:
         planned: planned contacts.
-        kept: names of the obstacles in contact, and of those that the body already pushes at.
+        retained: names of the obstacles in contact, and of those that the body already pushes at.
         body_pose: the body as it lies on the path.
         measured_w: (2, n_nodes) m, the measured body.
         node_body_s_m: (n_nodes,) arc lengths of the nodes from the tail end along the body.
         gap_m: maximum distance of the measured body from an obstacle.
-        give_up_gap_m: the same for the obstacles in `kept`.
+        give_up_gap_m: the same for the obstacles in `retained`.
         end_m: minimum distance along the body from either tip.
 
     Returns:
@@ -149,7 +149,7 @@ def find_push_points(
         offset_x_m = x_m[i] + fraction * (x_m[i + 1] - x_m[i]) - contact.point_w[0]
         offset_y_m = y_m[i] + fraction * (y_m[i + 1] - y_m[i]) - contact.point_w[1]
         measured_gap_m = contact.clearance_m + offset_x_m * contact.normal_w[0] + offset_y_m * contact.normal_w[1]
-        max_gap_m = give_up_gap_m if contact.obstacle in kept else gap_m
+        max_gap_m = give_up_gap_m if contact.obstacle in retained else gap_m
         # A large negative gap does not count either: the body is on the other side of the obstacle.
         if abs(measured_gap_m) <= max_gap_m:
             points.append(PushPoint(contact, body_s_m, measured_gap_m))

@@ -49,7 +49,7 @@ class PropulsionDemand:
     """The torque of the propulsion joint in one tick, and the forces that it comes from."""
 
     joint: int  # index among all joints
-    wanted_n: float  # propulsion force from the speed alone
+    desired_n: float  # propulsion force from the speed alone
     force_n: float  # after fading, and within the joint's torque limit
     torque_nm: float
     saturated: bool  # the torque limit has reduced the force
@@ -90,7 +90,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._choice: Choice | None = None
         self._refused: list[str] = []  # why triplets cannot be used
         # Propulsion of the tick before.
-        self._asked_n = 0.0  # before the joint's torque limit
+        self._unlimited_n = 0.0  # before the joint's torque limit
         self._force_n = 0.0
         # Supervision.
         self._stall_watch = StallWatch(
@@ -146,7 +146,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         setpoints = RequestedSetpoints(modes, targets, self._body.torque_limit_nm)
         choice = self._choice
         if choice is None:
-            self._asked_n = 0.0
+            self._unlimited_n = 0.0
             self._force_n = 0.0
             return ControllerCommand(setpoints, self._report_rest(located))
         demand = self._compute_propulsion(observation, located, choice)
@@ -214,26 +214,26 @@ class ObstacleTriplet(Controller[TripletParameters]):
         torque_per_n = choice.torque_per_n
 
         slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
-        wanted_n = parameters.propulsion_n * min(max(slow, 0.0), 1.0)
+        desired_n = parameters.propulsion_n * min(max(slow, 0.0), 1.0)
 
         swing_rad = observation.joints.angle_rad[joint] - float(self._reference[joint])
         if torque_per_n <= 0:
             swing_rad = -swing_rad  # positive: in the direction of the torque
         fade = 2.0 - swing_rad / parameters.angle_fade_rad
-        asked_n = wanted_n * min(max(fade, 0.0), 1.0)
+        unlimited_n = desired_n * min(max(fade, 0.0), 1.0)
         max_change_n = parameters.propulsion_rate_n_s * observation.period_s
-        asked_n = min(max(asked_n, self._asked_n - max_change_n), self._asked_n + max_change_n)
-        self._asked_n = asked_n
+        unlimited_n = min(max(unlimited_n, self._unlimited_n - max_change_n), self._unlimited_n + max_change_n)
+        self._unlimited_n = unlimited_n
 
-        force_n = min(asked_n, limit_nm / max(abs(torque_per_n), MIN_TORQUE_PER_N))
+        force_n = min(unlimited_n, limit_nm / max(abs(torque_per_n), MIN_TORQUE_PER_N))
         torque_nm = force_n * torque_per_n - parameters.damping_nm_s_per_rad * observation.joints.velocity_rad_s[joint]
         torque_nm = min(max(self._hand_over.torque_nm(torque_nm), -limit_nm), limit_nm)
         return PropulsionDemand(
             joint=joint,
-            wanted_n=wanted_n,
+            desired_n=desired_n,
             force_n=force_n,
             torque_nm=torque_nm,
-            saturated=force_n < asked_n,
+            saturated=force_n < unlimited_n,
             swung=fade < 1.0,
         )
 
@@ -244,12 +244,12 @@ class ObstacleTriplet(Controller[TripletParameters]):
         if located.restarted:
             self._planned.clear()
         self._update_planned(located)
-        kept = [contact.obstacle for contact in located.world.contacts if contact.obstacle is not None]
+        retained = [contact.obstacle for contact in located.world.contacts if contact.obstacle is not None]
         if self._choice is not None:
-            kept += self._choice.triplet.names
+            retained += self._choice.triplet.names
         self._points = find_push_points(
             [contact for _, contact in self._planned.values()],
-            kept,
+            retained,
             body_pose,
             located.nodes_w,
             self._body.node_s_m,
@@ -329,12 +329,12 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self, observation: Observation, located: Located, choice: Choice, demand: PropulsionDemand
     ) -> None:
         """Detect a standstill while pushing, and release a triplet that is strained but does not move the body."""
-        if not self._stall_watch.stands(observation.time_s, located.tail_s_m, demand.wanted_n):
+        if not self._stall_watch.stands(observation.time_s, located.tail_s_m, demand.desired_n):
             return
         self._stall_watch.forget()
         joint_name = self._body.names[demand.joint]
         stall = explain(
-            wanted_n=demand.wanted_n,
+            desired_n=demand.desired_n,
             force_n=demand.force_n,
             net_force=self._contacts.resolve_along(choice.triplet.contacts[0].tangent_w),
             push_points=choice.triplet.names,
@@ -352,7 +352,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def _wait(self, observation: Observation, why: str) -> ControllerCommand:
         """Move every joint to its reference without a push, because the pose of the body is unknown."""
         self._choice = None
-        self._asked_n = 0.0
+        self._unlimited_n = 0.0
         self._force_n = 0.0
         self._stall_watch.forget()
         if not len(self._reference):
@@ -380,13 +380,13 @@ class ObstacleTriplet(Controller[TripletParameters]):
             jammed=self._is_jammed(),
         )
 
-    def _explain_rest(self, wanted_m_s: float) -> str:
+    def _explain_rest(self, desired_m_s: float) -> str:
         if self._stall is not None:
             stall, _ = self._stall
             return stall.reason
-        if wanted_m_s > 0:
+        if desired_m_s > 0:
             return "; ".join(self._refused) or "no three push-points on alternating sides"
-        if wanted_m_s == 0:
+        if desired_m_s == 0:
             return ""
         return "cannot go backward"
 

@@ -50,7 +50,7 @@ class StallWatch:
 
 def explain(
     *,
-    wanted_n: float,
+    desired_n: float,
     force_n: float,
     net_force: NetContactForce | None,
     push_points: Sequence[str],
@@ -63,7 +63,7 @@ def explain(
     """Explain a stall, as far as the measurements show its cause.
 
     Args:
-        wanted_n: propulsion force from the speed alone.
+        desired_n: propulsion force from the speed alone.
         force_n: commanded propulsion force.
         net_force: measured contact forces along the path; None without a sensor.
         push_points: names of the triplet's obstacles.
@@ -74,13 +74,13 @@ def explain(
         drag_ratio: ratio of propulsion to weight above which the propulsion strains the joint.
     """
     touches_something = net_force is None or net_force.strongest_n != 0.0
-    joint_is_strained = saturated is not None or swung is not None or wanted_n > drag_ratio * weight_n
+    joint_is_strained = saturated is not None or swung is not None or desired_n > drag_ratio * weight_n
     contacts_are_strained = net_force is not None and net_force.strongest_n > jam_force_n
     jammed, why = explain_standstill(force_n, net_force, push_points)
     if swung is not None:
-        why += f"; {swung} has swung out and leaves no more of the {wanted_n:.1f} N wanted"
+        why += f"; {swung} has swung out and leaves no more of the {desired_n:.1f} N desired"
     elif saturated is not None:
-        why += f"; {saturated} at its limit of torque gives no more of the {wanted_n:.1f} N wanted"
+        why += f"; {saturated} at its limit of torque gives no more of the {desired_n:.1f} N desired"
     elif net_force is not None and not jammed and touches_something:
         why += "; raise propulsion_n"
     return Stall(

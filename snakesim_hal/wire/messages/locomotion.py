@@ -152,6 +152,7 @@ class ControlState(Message, frozen=True, kw_only=True):
     torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push; null: none pushes")] = None
     saturated: Annotated[bool, about("the push is at its torque limit")] = False
     jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
+    custom: Annotated[dict[q.Name, q.Scalar], Meta(max_length=32), about("numbers that the controller defines")] = {}
     failed: Annotated[bool, about("the last message of a controller that cannot continue; `reason` is why")] = False
     too_slow: Annotated[
         q.Reason, about("in real time: what shows that the controller misses its deadlines; empty: nothing does")

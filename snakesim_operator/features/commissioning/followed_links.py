@@ -16,9 +16,9 @@ from snakesim_operator.features.commissioning.measured import PITCH, YAW
 from snakesim_operator.features.commissioning.suspended_load import AXES, rotations_about
 
 MIN_SAMPLES = 20  # of a gyro
-MAX_DISAGREEMENT = 0.06  # of the link's rate, rms; sound joints show 0.02 of it, 10 mrad of backlash 0.12
+MAX_DISAGREEMENT = 0.06  # of the link's rate, rms; intact joints show 0.02 of it, 10 mrad of backlash 0.12
 MIN_DISAGREEMENT_RAD_S = 0.03  # less may be noise of gyros and of encoders
-MAX_RATIO_ERROR = 0.12  # of a sound joint, whose ratio is 1
+MAX_RATIO_ERROR = 0.12  # of an intact joint, whose ratio is 1
 
 
 @dataclass(frozen=True)

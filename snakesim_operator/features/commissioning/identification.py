@@ -26,7 +26,7 @@ BALANCE_LABELS = {  # fields of a robot file that come from the torque balance -
     "viscous_nm_s_per_rad": "viscous friction",
     "armature_kg_m2": "rotor inertia",
 }
-MISFIT = "the links do not move as the encoders say, or not under the torques that they need"
+MISFIT = "the links do not move as the encoders measure, or not under the torques that they need"
 
 
 @dataclass(frozen=True)

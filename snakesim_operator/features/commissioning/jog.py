@@ -172,7 +172,7 @@ class _JogSession:
                 self._send_request(disarm, "disarmed")
 
     def _follow_keys(self, keyboard: Keyboard) -> None:
-        """Move the joint as the keys say until the user quits. Raises RefusedError once the robot is not armed."""
+        """Move the joint by the keys until the user quits. Raises RefusedError once the robot is not armed."""
         joint = self._robot.joints[self._joint]
         target = JogTarget(self._request, joint, self._read_angle_rad())
         self._jog_target = target

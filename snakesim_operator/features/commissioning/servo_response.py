@@ -97,7 +97,7 @@ class _ServoModel:
     def lagged_inputs(self, latency_s: float, response_time_s: float) -> Floats:
         """Return target minus angle, and minus velocity, both behind a first-order lag: (ticks * STEPS_PER_TICK, 2).
 
-        A target is given at its tick, and holds until the next. Each row is at the end of its step.
+        A target begins at its tick, and holds until the next. Each row is at the end of its step.
         """
         record = self._record
         ticks = len(self._angle_rad)

@@ -31,7 +31,7 @@ SLOW_RAD_S = 0.2  # below this velocity, dry friction is not what it is in motio
 MAX_SLOW_FRACTION = 0.1  # of a smoothing window; windows with more are left out
 BLOCK_S = 1.0  # length of the jackknife's blocks
 MAX_TORQUE_FRACTION = 0.95  # of the torque limit; above, the motor does not do what its servo wants
-MODEL_MISFIT = 0.04  # rms fraction of the torque that the balance does not explain of sound joints
+MODEL_MISFIT = 0.04  # rms fraction of the torque that the balance does not explain of intact joints
 # What the balance leaves unexplained beyond that may also have been absorbed by the values: as much of it, times this.
 # On drives with 10 to 45 mrad of backlash somewhere in the body, 1.5 covers the truth of all values.
 ABSORBED_MISFIT = 2.0

@@ -126,8 +126,8 @@ def _front_server(port: int | None, link: Link | None, stop: threading.Event) ->
     """
     with open_console_ports(port) as ports:
         front = start_front(ports, link, lambda output: print_line(output.decode(errors="replace").rstrip()))
-        ports.browsers.close()  # the front server has its own copy
         print_line(f"console: {ports.address}")
+        ports.browsers.close()  # the front server has its own copy
         start_worker("console front watch", partial(_set_after_end, front, stop))
         try:
             yield ports

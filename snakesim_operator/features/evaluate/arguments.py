@@ -190,7 +190,7 @@ def _optimize(arguments: argparse.Namespace) -> int:
             return optimize(SearchRequest(**values))
         except KeyboardInterrupt:  # no trial that is done is lost
             if storage.is_file():
-                print_line(f"stopped: {storage} keeps the trials that are done; the same command goes on with")
+                print_line(f"stopped: {storage} keeps the trials that are done; the same command continues with")
                 print_line(f"  --storage {shlex.quote(str(storage))}")
             return INTERRUPTED
 
@@ -216,7 +216,7 @@ def _parse_numbers(text: str, option: str) -> list[int]:
 
 
 def _repeat_option(option: str, values: list[str]) -> list[str]:
-    """Return the words of an option that is given once for each value."""
+    """Return the words of an option that stands once for each value."""
     words: list[str] = []
     for value in values:
         words += [option, value]

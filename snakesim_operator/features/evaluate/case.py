@@ -80,7 +80,7 @@ def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Case
     """
     if code != code_digest():
         return CaseOutcome(
-            error="the worker has another version of SnakeSIM; install the same, and go on with --resume"
+            error="the worker has another version of SnakeSIM; install the same, and continue with --resume"
         )
     with _one_run_lock:
         try:

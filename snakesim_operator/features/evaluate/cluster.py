@@ -25,7 +25,7 @@ class Workers(Protocol):
     def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
         """Run all cases; yield each with its outcome as it is done.
 
-        They begin in the order given. No two may have one id.
+        They begin in this order. No two may have one id.
         """
         ...
 
@@ -109,7 +109,7 @@ def _outcome_of_call(case: Case, outcome: CallOutcome) -> CaseOutcome:
             return _outcome_of_deaths(MAX_DEATHS)
         case CallTookTooLongError():
             return took_too_long(case.limit_s)
-        case error:  # a controller may raise anything; the other cases go on
+        case error:  # a controller may raise anything; the other cases continue
             return _outcome_of_error(error)
 
 
@@ -120,7 +120,7 @@ def _outcome_of_future(future: "Future") -> CaseOutcome:
         return future.result()
     except KilledWorker as error:
         return _outcome_of_deaths(error.allowed_failures + 1)
-    except Exception as error:  # noqa: BLE001 - a controller may raise anything; the other cases go on
+    except Exception as error:  # noqa: BLE001 - a controller may raise anything; the other cases continue
         return _outcome_of_error(error)
 
 

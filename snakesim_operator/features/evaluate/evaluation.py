@@ -97,7 +97,7 @@ def _run_all_cases(request: EvaluationRequest) -> int:
             _report(request, cases, results.done, out, other_cards)
         except KeyboardInterrupt:
             done = sum(case.id in results.done for case in cases)
-            print_line(f"stopped: {done} of {len(cases)} cases are done; the same command goes on with")
+            print_line(f"stopped: {done} of {len(cases)} cases are done; the same command continues with")
             seed_option = f" --seed {seed}" if request.suite.fresh else ""
             print_line(f"  --resume --out {shlex.quote(str(out))}{seed_option}")
             return INTERRUPTED
@@ -162,7 +162,7 @@ def _run_on_workers(request: EvaluationRequest, todo: Sequence[Case], results: s
     with workers(request.cluster, request.workers) as pool, Progress(len(todo)) as progress:
         where = request.cluster or "on this computer"
         print_line(f"{len(todo)} cases on {pool.size()} workers, {where}")
-        print_line(f"results: {out}; if this ends early, --resume --out {out} goes on")
+        print_line(f"results: {out}; if this ends early, --resume --out {out} continues")
         for case, outcome in pool.solve(todo):
             results.append(case, outcome)
             progress.count(outcome)

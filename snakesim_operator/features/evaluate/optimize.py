@@ -47,7 +47,7 @@ Span = FloatDistribution | IntDistribution
 class SearchRequest:
     """The request of the command line."""
 
-    scenario: str  # a suite's name, where rows are given
+    scenario: str  # a suite's name, if rows are set
     vary: Sequence[str]  # key=low:high
     set: Sequence[str]  # key=value
     goal: str
@@ -84,7 +84,7 @@ def optimize(request: SearchRequest) -> int:
     study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
     completed = len(study.get_trials(states=(TrialState.COMPLETE,)))
     already = f"holds {completed} trials already" if completed else "keeps all trials"
-    print_line(f"{request.storage} {already}; --storage {shlex.quote(str(request.storage))} goes on with them")
+    print_line(f"{request.storage} {already}; --storage {shlex.quote(str(request.storage))} continues with them")
     if request.trials > completed:
         _search(request, study, space, request.trials - completed)
     return _report_best(request, study)
@@ -212,9 +212,9 @@ def _cases_of_trial(request: SearchRequest, parameters: dict[str, Any]) -> list[
 
 def _parse_span(text: str) -> tuple[str, Span]:
     """Return key and range of `key=low:high`: of whole numbers if both ends are. Raises ConfigError."""
-    key, _, given = (part.strip() for part in text.partition("="))
+    key, _, bounds = (part.strip() for part in text.partition("="))
     try:
-        low, high = given.split(":")
+        low, high = bounds.split(":")
         if low.strip("-").isdecimal() and high.strip("-").isdecimal():
             return key, IntDistribution(int(low), int(high))
         return key, FloatDistribution(float(low), float(high))

@@ -1,7 +1,7 @@
 """The file of a search: an Optuna study in SQLite, and the command that it belongs to.
 
-A search goes on only with a file that the same command began. Trials of another goal, direction, range, setting, seed,
-configuration or version of the code are not comparable, and the sampler and the printed result would mix them.
+A search continues only with a file that the same command began. Trials of another goal, direction, range, setting,
+seed, configuration or version of the code are not comparable, and the sampler and the printed result would mix them.
 """
 
 import hashlib
@@ -127,13 +127,13 @@ def _repeat_trials_without_result(study: Study) -> None:
         study.enqueue_trial(trial.params)
 
 
-def _check_same_search(path: Path, kept: Any, command: SearchCommand) -> None:
+def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
     """Raise a ConfigError that names each difference between the command in the file and this one."""
     try:
-        there = msgspec.convert(kept, SearchCommand)
+        there = msgspec.convert(stored, SearchCommand)
     except msgspec.ValidationError:
         raise ConfigError(
-            f"--storage {path}: the file holds trials and does not say with which command they were made: an older "
+            f"--storage {path}: the file holds trials and does not contain the command that made them: an older "
             f"version or another program wrote it. Trials of two searches are not comparable; choose another file",
             code="evaluation/other-search",
         ) from None
@@ -159,8 +159,8 @@ def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
     if there.goal != here.goal:
         yield f"--goal: {there.goal} there, {here.goal} here"
     if there.direction != here.direction:
-        given = {"minimize": "given", "maximize": "not given"}
-        yield f"--minimize: {given[there.direction]} there, {given[here.direction]} here"
+        set_or_not = {"minimize": "set", "maximize": "not set"}
+        yield f"--minimize: {set_or_not[there.direction]} there, {set_or_not[here.direction]} here"
     if there.seeds != here.seeds:
         yield f"--seeds: {there.seeds} there, {here.seeds} here"
     if there.seed != here.seed:
@@ -176,8 +176,8 @@ def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
 
 def _differing_keys(option: str, there: dict[str, Any], here: dict[str, Any]) -> Iterator[str]:
     for key in sorted(there.keys() | here.keys()):
-        before = there.get(key, "not given")
-        now = here.get(key, "not given")
+        before = there.get(key, "not set")
+        now = here.get(key, "not set")
         if before != now:
             yield f"{option} {key}: {before} there, {now} here"
 

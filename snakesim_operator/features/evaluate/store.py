@@ -72,7 +72,7 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(handle).st_size and not resume:
             raise ConfigError(
-                f"--out {folder} holds an evaluation; go on with it by --resume, or choose another folder",
+                f"--out {folder} holds an evaluation; continue it with --resume, or choose another folder",
                 code="file/already-exists",
             )
         yield ResultStore(handle, _read_results(path, handle))

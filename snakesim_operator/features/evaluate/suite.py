@@ -1,8 +1,8 @@
 """Reads the suite file: settings that a controller is tried in, each on many fields.
 
     scenario = "field"                              # what all cases begin with
-    fields = 20                                     # when --fields is not given
-    controllers = ["obstacle_triplet"]              # when --controllers is not given
+    fields = 20                                     # without --fields
+    controllers = ["obstacle_triplet"]              # without --controllers
     give_up_s = 12                                  # robot time without 3 cm of advance that ends a run
     limit_s = 1800                                  # wall time of one run, after which it counts as an error
 
@@ -134,7 +134,7 @@ def override_suite(suite: Suite, values: dict[str, Any]) -> Suite:
 
 
 def select_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
-    """Return the cases of some rows, by number; all cases if no row is given. Raises ConfigError for a missing row."""
+    """Return the cases of some rows, by number; all cases without a row. Raises ConfigError for a missing row."""
     known = {case.row for case in cases}
     for row in rows:
         if row not in known:
@@ -151,7 +151,7 @@ def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
     """
     common = list(_flatten_overrides(suite.set, f"{source}: [set]"))
     common += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
-    varied = {key: _list_values(key, given, source) for key, given in suite.vary.items()}
+    varied = {key: _list_values(key, values, source) for key, values in suite.vary.items()}
     labels = _short_names(list(varied))
     settings: list[SuiteSetting] = []
     for row in suite.row or [SuiteRow(name="")]:
@@ -235,19 +235,19 @@ def _compose_setting(suite: Suite, setting: SuiteSetting, controller: str | None
 
 def parse_vary(text: str) -> tuple[str, list[Any] | str]:
     """Return key and values of `--vary key=low:high:count` or `key=[a, b, c]`. Raises ConfigError."""
-    key, equals, given = (part.strip() for part in text.partition("="))
-    if not (key and equals and given):
+    key, equals, values = (part.strip() for part in text.partition("="))
+    if not (key and equals and values):
         raise ConfigError(
             f"--vary {shorten(text)}: give key=low:high:count, such as control.look_ahead_m=0.05:0.2:4",
             code="command/invalid-option",
         )
-    if not given.startswith("["):
-        return key, given
+    if not values.startswith("["):
+        return key, values
     try:
-        return key, parse_toml(f"value = {given}", "--vary")["value"]
+        return key, parse_toml(f"value = {values}", "--vary")["value"]
     except ConfigError:
         raise ConfigError(
-            f"--vary {shorten(text)}: {shorten(given)} is no list; write it as in TOML, [1, 2]",
+            f"--vary {shorten(text)}: {shorten(values)} is no list; write it as in TOML, [1, 2]",
             code="command/invalid-option",
         ) from None
 
@@ -293,9 +293,9 @@ def _find_randomizations(suite: Suite, without: Sequence[str], where: str) -> li
             )
     randomizations: list[Randomization] = []
     for randomization in suite.randomize:
-        kept = [key for key in randomization.set if key not in without]
-        if kept:
-            randomizations.append(msgspec.structs.replace(randomization, set=kept))
+        remaining_keys = [key for key in randomization.set if key not in without]
+        if remaining_keys:
+            randomizations.append(msgspec.structs.replace(randomization, set=remaining_keys))
     return randomizations
 
 
@@ -308,26 +308,26 @@ def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") ->
             yield Override(prefix + key, value, origin)
 
 
-def _list_values(key: str, given: list[Any] | str, source: str) -> list[Any]:
+def _list_values(key: str, values: list[Any] | str, source: str) -> list[Any]:
     """Return the values of a `[vary]` entry: those of the list, or evenly spaced ones. Raises ConfigError."""
-    if isinstance(given, str):
-        return space_evenly(given, f"{source}: `vary.{key}`")
-    if not given:
+    if isinstance(values, str):
+        return space_evenly(values, f"{source}: `vary.{key}`")
+    if not values:
         raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value", code="command/invalid-option")
-    return given
+    return values
 
 
-def space_evenly(given: str, where: str) -> list[float]:
+def space_evenly(values: str, where: str) -> list[float]:
     """Return the numbers of `low:high:count`, both ends included. Raises ConfigError. where: for the message."""
     try:
-        low, high, count = (float(part) for part in given.split(":"))
+        low, high, count = (float(part) for part in values.split(":"))
         is_finite = math.isfinite(low) and math.isfinite(high)
         is_a_count = count.is_integer() and 2 <= count <= 1000
         if not (is_finite and is_a_count):
             raise ValueError
     except ValueError:
         raise ConfigError(
-            f"{where} = {shorten(given)!r}: give low:high:count with a count of 2 to 1000, such as "
+            f"{where} = {shorten(values)!r}: give low:high:count with a count of 2 to 1000, such as "
             "0.05:0.2:4, or a list",
             code="command/invalid-option",
         ) from None

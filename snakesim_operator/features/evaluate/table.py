@@ -114,12 +114,12 @@ def group_results(cases: Sequence[Case], done: Results) -> list[ResultRow]:
 def known_columns(rows: Sequence[ResultRow]) -> list[list[str]]:
     """Return HEAD and the cells of each row, without the columns in which nothing is known."""
     table = [list(HEAD), *(row.cells for row in rows)]
-    kept: list[int] = []
+    varying: list[int] = []
     for column in range(len(HEAD)):
         has_a_value = any(cells[column].strip(UNKNOWN) for cells in table[1:])
         if column < TEXT_COLUMNS or has_a_value:
-            kept.append(column)
-    return [[cells[column] for column in kept] for cells in table]
+            varying.append(column)
+    return [[cells[column] for column in varying] for cells in table]
 
 
 def table_lines(rows: Sequence[ResultRow]) -> list[str]:
@@ -243,5 +243,5 @@ def _describe_end(outcome: CaseOutcome) -> str:
     if numbers.get("ended") != "complete":
         parts.append(str(numbers.get("ended")))
     if numbers.get(GAVE_UP):
-        parts.append("given up: no advance for too long")
+        parts.append("ended early: no advance for too long")
     return "; ".join(parts)

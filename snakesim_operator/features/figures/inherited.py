@@ -16,9 +16,9 @@ def import_matplotlib() -> None:
     """
     if "matplotlib" in sys.modules:
         return
-    asked = os.environ.pop(BACKEND, None)
+    backend_name = os.environ.pop(BACKEND, None)
     try:
         importlib.import_module("matplotlib")
     finally:
-        if asked is not None:
-            os.environ[BACKEND] = asked
+        if backend_name is not None:
+            os.environ[BACKEND] = backend_name

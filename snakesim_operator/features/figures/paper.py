@@ -19,7 +19,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.from_above import OBSTACLE, plot_body, plot_obstacles
 from snakesim_operator.features.figures.lines import Floats, plot_over_time
 from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
-from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
+from snakesim_operator.results.report.snapshots import Balance, Snapshot, balanced_snapshots
 from snakesim_operator.results.report.timeline import commanded_torque_nm, most_used_joints, reference_rad
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.run_log import RunRecord
@@ -55,16 +55,16 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
     Raises:
         ConfigError: The controller solved for no forces in this span.
     """
-    instants = balanced_instants(record, *span_s)
-    if not instants:
+    snapshots = balanced_snapshots(record, *span_s)
+    if not snapshots:
         raise ConfigError(
-            f"{record.folder}: at no time within it did a controller say which forces it solved for; such are "
+            f"{record.folder}: at no time within it did a controller report which forces it solved for; such are "
             "obstacle_triplet and obstacle_aided, with a pose and a recording; signals can be drawn of any run",
             code="recording/missing-data",
         )
-    first = instants[0]
-    moment_indices = np.unique(np.linspace(0, len(instants) - 1, MAX_MOMENTS).astype(int))
-    moments = [instants[i] for i in moment_indices]
+    first = snapshots[0]
+    moment_indices = np.unique(np.linspace(0, len(snapshots) - 1, MAX_MOMENTS).astype(int))
+    moments = [snapshots[i] for i in moment_indices]
     intervals = find_propulsion_intervals(record)
     joints = most_used_joints(intervals, MAX_JOINTS)
     drawn_span_s = (span_s[0], min(span_s[1], end_s(record)))
@@ -78,31 +78,31 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
     }
 
 
-def _draw_triplet(record: RunRecord, instant: Instant, width_in: float) -> Figure:
+def _draw_triplet(record: RunRecord, snapshot: Snapshot, width_in: float) -> Figure:
     """Draw body, obstacles and forces from above."""
     figure = Figure((width_in, width_in))
     axes = figure.subplots()
-    _plot_scene(axes, record, instant)
-    _plot_forces(axes, _require_balance(instant))
+    _plot_scene(axes, record, snapshot)
+    _plot_forces(axes, _require_balance(snapshot))
     width_m = float(np.diff(axes.get_xlim())[0])
     height_m = float(np.diff(axes.get_ylim())[0])
     figure.set_figheight(width_in * min(height_m / width_m, 1.0) + 0.4)
     return figure
 
 
-def _draw_propelling_joint(record: RunRecord, instant: Instant, width_in: float) -> Figure:
+def _draw_propelling_joint(record: RunRecord, snapshot: Snapshot, width_in: float) -> Figure:
     """Draw the surroundings of the joint that propels. Its torque presses on the last contact."""
     figure = Figure((width_in, 0.75 * width_in))
     axes = figure.subplots()
-    balance = _require_balance(instant)
-    _plot_scene(axes, record, instant)
+    balance = _require_balance(snapshot)
+    _plot_scene(axes, record, snapshot)
     _plot_forces(axes, balance)
     contact_w = np.array(balance.contacts[-1].position_w[:2])
     points = [contact_w]
-    joint = instant.propulsion_joint
+    joint = snapshot.propulsion_joint
     if joint is not None:
-        joint_w = nodes_xy_w(record, instant.row)[joint + 1]
-        torque_nm = record.torque_nm[instant.row, joint]
+        joint_w = nodes_xy_w(record, snapshot.row)[joint + 1]
+        torque_nm = record.torque_nm[snapshot.row, joint]
         axes.plot(*joint_w, "o", color=rcParams["text.color"], markersize=5)
         axes.annotate(f"$\\tau$ {torque_nm:.2f} N·m", joint_w, (6, -12), textcoords="offset points")
         lever = np.column_stack([joint_w, contact_w])
@@ -114,15 +114,15 @@ def _draw_propelling_joint(record: RunRecord, instant: Instant, width_in: float)
     return figure
 
 
-def _draw_moments(record: RunRecord, moments: Sequence[Instant], width_in: float) -> Figure:
+def _draw_moments(record: RunRecord, moments: Sequence[Snapshot], width_in: float) -> Figure:
     """Draw a row for each moment: the scene from above, and the force polygon beside it."""
     figure = Figure((2 * width_in, 0.62 * width_in * len(moments)))
     rows = figure.subplots(len(moments), 2, width_ratios=(2, 1), squeeze=False)
-    for (scene_axes, polygon_axes), instant, letter in zip(rows, moments, "abcd", strict=False):
-        balance = _require_balance(instant)
-        _plot_scene(scene_axes, record, instant)
+    for (scene_axes, polygon_axes), snapshot, letter in zip(rows, moments, "abcd", strict=False):
+        balance = _require_balance(snapshot)
+        _plot_scene(scene_axes, record, snapshot)
         _plot_forces(scene_axes, balance)
-        scene_axes.set_title(f"({letter}) {instant.time_s:.1f} s", loc="left", fontsize=TITLE_FONT_SIZE)
+        scene_axes.set_title(f"({letter}) {snapshot.time_s:.1f} s", loc="left", fontsize=TITLE_FONT_SIZE)
         _plot_force_polygon(polygon_axes, balance)
     return figure
 
@@ -186,9 +186,9 @@ def _plot_torque(axes: Axes, record: RunRecord, joint: int) -> None:
     axes.set_ylabel("torque [N·m]")
 
 
-def _plot_scene(axes: Axes, record: RunRecord, instant: Instant) -> None:
+def _plot_scene(axes: Axes, record: RunRecord, snapshot: Snapshot) -> None:
     """Plot obstacles and body to scale, and limit the axes to the surroundings of the body."""
-    nodes_w = nodes_xy_w(record, instant.row)
+    nodes_w = nodes_xy_w(record, snapshot.row)
     plot_obstacles(axes, record)
     plot_body(axes, record, nodes_w)
     axes.set_aspect("equal")
@@ -248,7 +248,7 @@ def _plot_arrow(axes: Axes, start: Floats | Sequence[float], end: Floats | Seque
     axes.annotate("", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=style)
 
 
-def _require_balance(instant: Instant) -> Balance:
-    """Return the forces of an instant for which the controller solved."""
-    assert instant.balance is not None, "balanced instants have one"
-    return instant.balance
+def _require_balance(snapshot: Snapshot) -> Balance:
+    """Return the forces of a snapshot for which the controller solved."""
+    assert snapshot.balance is not None, "balanced snapshots have one"
+    return snapshot.balance

@@ -82,7 +82,7 @@ def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
         within = ANY if identity.of == ALL else f"{robot}/{ANY}"
         for flow, message, key in list_permissions(identity.role, identity.services, faults=faults):
             yield Permission(flow, message, f"{robot}/{key}")
-            if key != ANY and message in SEARCHED:  # what is asked with a wildcard reaches who is asked
+            if key != ANY and message in SEARCHED:  # a query with a wildcard reaches every queryable
                 yield Permission(flow, message, f"{within if flow == 'ingress' else ANY}/{key}")
     if identity.role is Role.ADMINISTRATOR:
         yield Permission("ingress", "query", f"@/{ANY}")

@@ -51,29 +51,29 @@ WRITERS = {  # the process that publishes at a key all the time
 class Findings:
     """Prints the results of the checks, and keeps them."""
 
-    say: PrintLine
+    print_text: PrintLine
     wrong: int = 0
     results: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
     def passed(self, text: str) -> None:
         """Print a result that is as it should be."""
         self.results.append({"passed": True, "text": text})
-        self.say(f"  {text}")
+        self.print_text(f"  {text}")
 
     def failed(self, text: str) -> None:
         """Print a result that is wrong, and count it."""
         self.wrong += 1
         self.results.append({"passed": False, "text": text})
-        self.say(f"! {text}")
+        self.print_text(f"! {text}")
 
 
-def check(lab: Lab, folder: Path, say: PrintLine = print_line, *, as_json: bool = False) -> int:
+def check(lab: Lab, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False) -> int:
     """Check certificates, routers, robots and roles of a lab.
 
     Args:
         lab: The lab.
         folder: The output folder of `lab certs`.
-        say: Prints a line.
+        print_text: Prints a line.
         as_json: Whether to print one JSON object at the end instead of lines.
 
     Returns:
@@ -82,34 +82,34 @@ def check(lab: Lab, folder: Path, say: PrintLine = print_line, *, as_json: bool 
     if as_json:
         found = Findings(discard_line)
         exit_code = _check_all(lab, folder, found)
-        print_json({"ok": exit_code == 0, "results": found.results}, say)
+        print_json({"ok": exit_code == 0, "results": found.results}, print_text)
         return exit_code
-    return _check_all(lab, folder, Findings(say))
+    return _check_all(lab, folder, Findings(print_text))
 
 
 def _check_all(lab: Lab, folder: Path, found: Findings) -> int:
     """Check everything. Returns the exit code."""
-    say = found.say
-    say("certificates")
+    print_text = found.print_text
+    print_text("certificates")
     for identity in identities(lab):
         _check_certificate(identity, folder, found)
-    say("routers")
+    print_text("routers")
     reached = [name for name in lab.file.routers if _check_router(name, lab, folder, found)]
     if not reached:
         found.results.append({"passed": False, "text": "no router can be reached"})
-        say("no router can be reached, and so neither robots nor roles can be looked at")
+        print_text("no router can be reached, and so neither robots nor roles can be looked at")
         return 1
     for robot in lab.file.robots:
-        say(f"robot {robot}")
+        print_text(f"robot {robot}")
         _check_robot(robot, lab, folder, found)
-    say("roles: what each may ask")
+    print_text("roles: what each may request")
     for identity in identities(lab):
         if identity.role is not None:
             _check_role(identity, identity.role, lab, folder, found)
     if found.wrong:
-        say(f"{found.wrong} marked with ! need a look")
+        print_text(f"{found.wrong} marked with ! need a look")
         return 1
-    say("all is as it should be")
+    print_text("all is as it should be")
     return 0
 
 
@@ -162,8 +162,8 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
         return True
     tls = settings["transport"]["link"]["tls"]
     shown = _read_shown_certificate(endpoint, tls)
-    kept = read_certificate(_certificate_path(identity, folder))
-    if shown.serial_number != kept.serial_number:
+    stored = read_certificate(_certificate_path(identity, folder))
+    if shown.serial_number != stored.serial_number:
         _check_expiry(f"{name} shows an earlier certificate", shown, f"restart it on {identity.machine}", found)
     _check_refuses_strangers(name, settings, found)
     return True

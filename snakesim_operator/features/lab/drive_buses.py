@@ -191,7 +191,7 @@ def _check_one_type(robot: LabRobot, where: str) -> None:
     if not _buses_of_kind(robot, kind):
         raise ConfigError(
             f"{where}.{kind}` is empty, and backend {robot.backend!r} without a bus emulates its drives: nothing real "
-            f"would move. Name the bus, such as {example}; or say `emulated = true`, if that is meant",
+            f"would move. Name the bus, such as {example}; or set `emulated = true`, if that is meant",
             code="lab/invalid-file",
         )
 
@@ -217,7 +217,7 @@ def _check_mixed(robot: LabRobot, where: str) -> None:
     unassigned = [bus for bus in (*robot.can, *robot.serial) if bus not in assigned]
     if unassigned:
         raise ConfigError(
-            f"{where}.buses` does not say which drive type is on {', '.join(unassigned)}", code="lab/invalid-file"
+            f"{where}.buses` does not name the drive type that is on {', '.join(unassigned)}", code="lab/invalid-file"
         )
 
 
@@ -248,7 +248,7 @@ def _check_other_backend(robot: LabRobot, where: str) -> None:
     if not (has_section or names_scenario_file):
         raise ConfigError(
             f"{where}.backend` = {robot.backend!r} is none of {', '.join([SIMULATOR, *DRIVE_TYPES, MIXED])}, so this "
-            f"program does not know how it is given a bus. Configure the bus in `set`, such as "
+            f"program does not know how to set its bus. Configure the bus in `set`, such as "
             f"set = [\"backends.{robot.backend}.port='/dev/ttyUSB0'\"], or in a scenario file of your own",
             code="lab/invalid-file",
         )
@@ -264,7 +264,7 @@ def _check_settings(robot: LabRobot, where: str) -> None:
         drive_type = DRIVE_TYPES.get(section.removeprefix("backends."))
         if drive_type is not None and name in (drive_type.buses_key, "bit_rate", "data_bit_rate"):
             raise ConfigError(
-                f"{where}.set` has {setting!r}, which `{drive_type.kind}`, `buses`, `bitrate` and `data_bitrate` say: "
+                f"{where}.set` has {setting!r}, which `{drive_type.kind}`, `buses`, `bitrate` and `data_bitrate` set: "
                 f"the units are made from these, too. Say it there",
                 code="lab/invalid-file",
             )

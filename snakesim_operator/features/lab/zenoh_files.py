@@ -9,7 +9,7 @@ from snakesim_operator.features.lab.lab_file import ALL, Lab
 
 ALONE = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
 STAMPED = {"enabled": {"router": True, "peer": True, "client": True}}
-LEASE_MS = 2000  # after which a silent link is given up
+LEASE_MS = 2000  # after which a silent link is closed
 
 
 def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:

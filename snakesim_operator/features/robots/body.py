@@ -90,7 +90,7 @@ def _find_body_axes(row: Row, order: ImportOptions, urdf: Element) -> Floats:
     z = up - (up @ x) * x
     if np.linalg.norm(z) < 0.1:
         others = [name for name in UPS if abs(np.array(UPS[name]) @ x) < 0.9 and "-" not in name]
-        raise urdf.error(f"lies along its {order.up} axis: say which one points up: --up {' or --up '.join(others)}")
+        raise urdf.error(f"lies along its {order.up} axis: choose which one points up: --up {' or --up '.join(others)}")
     z /= np.linalg.norm(z)
     return np.vstack([x, np.cross(z, x), z])
 

@@ -16,7 +16,7 @@ from snakesim_operator.features.robots.unused_parts import LOOKS_HEADING
 HEADS = {
     "names": "names (ours: theirs)",
     "changed": "changed",
-    "assumed": "assumed, because the file does not say it",
+    "assumed": "assumed, because the file does not have it",
     "doubtful": "please check",
     "left_out": "left out",
 }
@@ -53,7 +53,7 @@ def import_robot(file: Path, order: ImportOptions, out: Path | None, *, as_json:
     for note in notes[1:shown]:
         print_line(note)
     if shown < len(notes):
-        print_line(f"  (what these say is at the top of {path})")
+        print_line(f"  (their text is at the top of {path})")
     robot = found.robot
     print_line("")
     print_line(

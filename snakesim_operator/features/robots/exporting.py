@@ -16,7 +16,7 @@ from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.urdf_sensors import gazebo_lines
 
-GEOMETRY = ("name", "chain", "module", "links")  # what links, joints and the robot's own name say
+GEOMETRY = ("name", "chain", "module", "links")  # which links, joints and the robot's own name contain
 AXES = {"yaw": "0 0 1", "pitch": "0 1 0"}
 COLOR = "0.87 0.45 0.12 1"
 LOOK = f'<material name="orange"><color rgba="{COLOR}"/></material>'

@@ -22,7 +22,7 @@ class ImportOptions:
 
 
 class Notes:
-    """Sentences of a report. The same sentence is kept once, with all the places in the file that it holds for."""
+    """Sentences of a report. The same sentence stands once, with all the places in the file that it holds for."""
 
     def __init__(self) -> None:
         self._places: dict[str, list[str]] = {}

@@ -29,7 +29,7 @@ from snakesim_operator.features.robots.urdf_tree import read_row
 from snakesim_operator.features.robots.xml_tree import Element, parse_xml
 
 SECTIONS = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
-OF_ANOTHER_ROBOT = ("links", "joints", "checked")  # of `--like`: they say nothing of this one
+OF_ANOTHER_ROBOT = ("links", "joints", "checked")  # of `--like`: they do not describe this one
 FROM_URDF = ("name", "about", "chain", "module")
 
 
@@ -118,7 +118,7 @@ def _exported_values(urdf: Element) -> Table:
     for element in urdf.all("snakesim"):
         key = element.get("key")
         if key.partition(".")[0] in GEOMETRY:
-            raise element.error(f"has `key` = {shorten(key)!r}, which links and joints say; remove this element")
+            raise element.error(f"has `key` = {shorten(key)!r}, which links and joints contain; remove this element")
         if key in seen:
             raise element.error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
         seen.add(key)
@@ -130,17 +130,17 @@ def _exported_values(urdf: Element) -> Table:
 
 
 def _report_values_of_other(found: Imported, order: ImportOptions) -> None:
-    """Report every value that was taken from the robot given by `--like`."""
+    """Report every value that was taken from the robot of `--like`."""
     for section, values in found.table.values.items():
         if section in FROM_URDF:
             continue
-        kept: list[str] = []
+        taken_values: list[str] = []
         for key, value in leaves(values, section):
             is_from_urdf = found.table.origin_of(key) == found.table.origin_of("name")
             if not is_from_urdf and value not in ({}, []):
-                kept.append(f"{key.removeprefix(f'{section}.')} = {value}")
-        if kept:
-            found.assumptions.add(f"[{section}] as of robot {order.like!r}: {', '.join(kept)}")
+                taken_values.append(f"{key.removeprefix(f'{section}.')} = {value}")
+        if taken_values:
+            found.assumptions.add(f"[{section}] as of robot {order.like!r}: {', '.join(taken_values)}")
     absent = [section for section in SECTIONS if section not in found.table.values and section not in OF_ANOTHER_ROBOT]
     if absent:
         found.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")

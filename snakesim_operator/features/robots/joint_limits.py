@@ -108,20 +108,20 @@ def _read_range(found: Imported, joint: UrdfJoint, negated: bool) -> AngleRange:
 
 def _read_limit_rad(found: Imported, joint: UrdfJoint, limit: Element, attribute: str) -> float:
     """Return one side of the range, cut to half a revolution. The cut is reported. Raises ConfigError."""
-    given = limit.number(attribute, "0")
-    if abs(given) > MAX_LIMIT_RAD:
-        radians = math.radians(given)
+    limit_rad = limit.number(attribute, "0")
+    if abs(limit_rad) > MAX_LIMIT_RAD:
+        radians = math.radians(limit_rad)
         raise limit.error(
-            f"of joint {joint.name!r} has `{attribute}` = {given:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at most. "
-            f"URDF has radians: if this is in degrees, write {radians:.5g}. A joint without end stops has "
+            f"of joint {joint.name!r} has `{attribute}` = {limit_rad:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at "
+            f"most. URDF has radians: if this is in degrees, write {radians:.5g}. A joint without end stops has "
             f'type="continuous"'
         )
-    if abs(given) <= MAX_TURN_RAD:
-        return given
-    cut = MAX_TURN_RAD if given > 0 else -MAX_TURN_RAD
+    if abs(limit_rad) <= MAX_TURN_RAD:
+        return limit_rad
+    cut = MAX_TURN_RAD if limit_rad > 0 else -MAX_TURN_RAD
     found.changes.add(
-        f"`{attribute}` = {given:g} rad became {cut:g} rad, half a turn, which is the most that a robot file has; if "
-        f"these are degrees, write radians",
+        f"`{attribute}` = {limit_rad:g} rad became {cut:g} rad, half a turn, which is the most that a robot file has; "
+        f"if these are degrees, write radians",
         joint.place("limit"),
     )
     return cut
@@ -142,10 +142,10 @@ def _complete_column(
     Raises:
         ConfigError: A joint has no motor, while others have one.
     """
-    given = [_read_number(found, number, joint) for joint in joints]
-    known = [value for value in given if value]
+    values = [_read_number(found, number, joint) for joint in joints]
+    known = [value for value in values if value]
     completed: list[float] = []
-    for joint, value, as_built in zip(joints, given, built, strict=True):
+    for joint, value, as_built in zip(joints, values, built, strict=True):
         if value is not None and (value > 0 or not number.is_limit):
             completed.append(value)
             continue
@@ -164,14 +164,14 @@ def _complete_column(
 def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, own: bool) -> tuple[float, str]:
     """Return the value for a joint for which the file gives none, and the origin of this value."""
     section = built.limits if number.is_limit else built.motor
-    kept = getattr(section, number.key)
+    default = getattr(section, number.key)
     if own:
-        return kept, f"from {number.section}.{number.key} of its <snakesim> element"
+        return default, f"from {number.section}.{number.key} of its <snakesim> element"
     if not number.is_limit:
         return 0.0, "the URDF default for a missing value"
     if known:
         return min(known), "the smallest of the other joints; is there a motor in this joint?"
-    return kept, "from the robot given by --like, because no joint has a value"
+    return default, "from the robot of --like, because no joint has a value"
 
 
 def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exception:

@@ -6,7 +6,7 @@ from snakesim_operator.features.robots.xml_tree import Element, Unused
 
 MAX_VALUE = 200  # characters that are shown of one value
 LOOKS_HEADING = "looks, which change nothing in a run: "
-LOOKS = ("<visual", "<material")  # how a path goes on that changes nothing in a run
+LOOKS = ("<visual", "<material")  # how a path continues that changes nothing in a run
 
 
 def report_unused(omissions: Notes, urdf: Element) -> None:

@@ -110,8 +110,8 @@ def _read_rate(found: Imported, sensor: Element, section: str) -> dict[str, Any]
     if rate_hz > 0:
         return {"rate_hz": rate_hz}
     existing = found.table.values.get("sensors", {}).get(section)
-    kept_hz = existing.get("rate_hz") if isinstance(existing, dict) else None
-    assumed_hz = DEFAULT_RATE_HZ[section] if kept_hz is None else kept_hz
+    existing_hz = existing.get("rate_hz") if isinstance(existing, dict) else None
+    assumed_hz = DEFAULT_RATE_HZ[section] if existing_hz is None else existing_hz
     if element is None:
         found.assumptions.add(f"<sensor><update_rate> has no value: {assumed_hz:g} Hz", f"line {sensor.line}")
     else:

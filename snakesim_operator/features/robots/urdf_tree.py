@@ -374,7 +374,7 @@ def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: 
     if first not in ends:
         choices = " or ".join(f"--tail {shorten(end)}" for end in ends)
         raise urdf.error(
-            f"has the link {shorten(tail or first)!r} amid the chain; say which end is the tail: {choices}"
+            f"has the link {shorten(tail or first)!r} amid the chain; choose which end is the tail: {choices}"
         )
     order = [first]
     joints: list[UrdfJoint] = []

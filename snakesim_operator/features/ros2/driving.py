@@ -28,13 +28,13 @@ END_TIMEOUT_S = 5.0  # for the thread
 class JointCommander:
     """Commands every joint in every tick from the messages of one topic; reconnects after a loss of the robot."""
 
-    def __init__(self, session: Session, messages: RawReader, say: PrintLine, *, wall_time: bool) -> None:
+    def __init__(self, session: Session, messages: RawReader, print_text: PrintLine, *, wall_time: bool) -> None:
         """Start the thread that commands the robot.
 
         Args:
             session: Session on the robot's network.
             messages: Messages of the ROS topic.
-            say: Reports changes to the user.
+            print_text: Reports changes to the user.
             wall_time: Whether timestamps in ROS are wall-clock time; else they are robot time.
 
         Raises:
@@ -48,7 +48,7 @@ class JointCommander:
             )
         self._session = session
         self._messages = messages
-        self._say = say
+        self._print_text = print_text
         self._wall_time = wall_time
         self._senders = SenderClocks()
         self._last_report = ""
@@ -110,4 +110,4 @@ class JointCommander:
         """Show a text to the user, unless it is the same as the last one."""
         if text != self._last_report:
             self._last_report = text
-            self._say(text)
+            self._print_text(text)

@@ -25,7 +25,7 @@ from snakesim_operator.features.ros2.server import ServiceServer
 
 NODE_NAME = "snakesim"
 MAX_ROS_MESSAGE_BYTES = 65536  # a Twist has 52
-JOINT_COMMANDS_KEPT = 64  # between two ticks: messages that name a single joint each
+MAX_JOINT_COMMANDS = 64  # between two ticks: messages that name a single joint each
 START_TIMEOUT_S = 60.0  # a robot may take so long to start
 RETRY_S = 0.5  # while the robot starts
 
@@ -65,7 +65,7 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
             for server in servers:
                 cleanup.callback(server.close)
             if arguments.joint_commands:
-                topic = Topic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=JOINT_COMMANDS_KEPT)
+                topic = Topic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=MAX_JOINT_COMMANDS)
                 messages = node.declare_subscription(topic)
                 commander = JointCommander(session, messages, print_line, wall_time=options.wall_time)
                 cleanup.callback(commander.close)

@@ -103,7 +103,7 @@ class RosJointTargets:
     def _hold(self, joint: int, joints: JointState) -> float:
         """Return the angle in rad that a joint had when it began to hold.
 
-        The angle is kept, because a joint that held its present angle in each cycle would sink under its load.
+        The angle stays, because a joint that held its present angle in each cycle would sink under its load.
         """
         held_rad = self._held_angles_rad[joint]
         if held_rad is None:

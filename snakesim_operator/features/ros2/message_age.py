@@ -1,7 +1,7 @@
 """Measures how old a message from ROS is, so that a message that the network held back moves nothing.
 
 A message that moves a robot counts for half a second from when its sender sent it, not from when it arrived: after a
-stall, a network delivers all that it has kept at once. If a message has a header, its timestamp gives the time of
+stall, a network delivers all that it has queued at once. If a message has a header, its timestamp gives the time of
 sending. Every message of rmw_zenoh also carries its sender's wall-clock time as an attachment. That clock need not
 agree with ours, so only differences count: the fastest message of a sender within two minutes is taken to have no
 delay, and every other message is as old as it is slower than that one. No session of rmw_zenoh survives a stall of
@@ -14,15 +14,15 @@ from snakesim_hal.network.foreign_network import RawSample
 from snakesim_operator.features.ros2.graph import ATTACHMENT, GID_BYTES
 
 MAX_AGE_NS = 500_000_000  # of a message that moves a robot
-MAX_AHEAD_NS = 100_000_000  # of a header's timestamp: two clocks are not read at the same instant
+MAX_AHEAD_NS = 100_000_000  # of a header's timestamp: two clocks are not read at the same time
 MAX_REQUEST_AGE_NS = 5_000_000_000  # of a service request that allows a robot to move
-SENDERS_KEPT = 64  # bounds the memory that a flood of senders can take
+MAX_SENDERS = 64  # bounds the memory that a flood of senders can take
 WINDOW_PART_NS = 10_000_000_000
 WINDOW_PARTS = 12  # times WINDOW_PART_NS: the two minutes in which the fastest message is searched
 
 
 class _FastestMessage:
-    """The smallest difference between our wall clock and a sender's, kept for each part of the last two minutes.
+    """The smallest difference between our wall clock and a sender's, for each part of the last two minutes.
 
     Each difference is clock offset plus latency, so the smallest one belongs to the fastest message.
     """
@@ -67,7 +67,7 @@ class SenderClocks:
         sender, sent_ns = origin
         fastest = self._fastest.setdefault(sender, _FastestMessage())
         self._fastest.move_to_end(sender)
-        while len(self._fastest) > SENDERS_KEPT:
+        while len(self._fastest) > MAX_SENDERS:
             self._fastest.popitem(last=False)
         delay_ns = fastest.add_offset(wall_ns - sent_ns, monotonic_ns)
         return max(delay_ns, waiting_ns)

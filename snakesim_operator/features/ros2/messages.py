@@ -76,13 +76,13 @@ class Marker:
 
 
 def make_message(type_name: str, *fields: Any) -> Any:
-    """Return a ROS message object, given its fields in the order of their definition."""
+    """Return a ROS message object with these fields, in the order of their definition."""
     message_types: Any = STORE.types
     return message_types[type_name](*fields)
 
 
 def encode_message(ros_type: RosType, *fields: Any) -> bytes:
-    """Return a message in CDR, given its fields in the order of their definition."""
+    """Return a message in CDR with these fields, in the order of their definition."""
     message = make_message(ros_type.name, *fields)
     return bytes(STORE.serialize_cdr(message, ros_type.name))
 

@@ -70,7 +70,7 @@ def _make_trigger_refusal(reason: str) -> bytes:
 def _explain_late_arm_request(attachment: bytes) -> str:
     """Return why a request to arm is refused; empty if it is allowed.
 
-    A network that stalls may deliver a request long after the client has given it up.
+    A network that stalls may deliver a request long after the client has stopped waiting.
     """
     return explain_request_age_refusal(attachment, time.time_ns())
 

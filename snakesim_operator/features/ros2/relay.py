@@ -10,8 +10,8 @@ from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Message
 
-CLOCK_OFFSETS_KEPT = 256  # a delayed clock message must not move the offset, so several seconds of clocks count
-SAMPLES_KEPT = 4  # some malformed samples must not displace the newest valid one
+MAX_CLOCK_OFFSETS = 256  # a delayed clock message must not move the offset, so several seconds of clocks count
+MAX_SAMPLES = 4  # some malformed samples must not displace the newest valid one
 
 
 def _always() -> bool:
@@ -21,7 +21,7 @@ def _always() -> bool:
 class Relay(Generic[MessageT]):
     """Forwards samples of one key in every n-th cycle of the bridge, while ROS nodes want them.
 
-    The relay subscribes to the key only while the samples are wanted: an image that no ROS node reads does not
+    The relay subscribes to the key only while a subscriber needs the samples: an image that no ROS node reads does not
     travel through the robot's network.
     """
 
@@ -32,7 +32,7 @@ class Relay(Generic[MessageT]):
         message_type: type[MessageT],
         every_cycles: int,
         forward: Callable[[MessageT], None],
-        is_wanted: Callable[[], bool] = _always,
+        has_subscriber: Callable[[], bool] = _always,
         *,
         forwards_all: bool = False,
     ) -> None:
@@ -53,9 +53,9 @@ class Relay(Generic[MessageT]):
         self._message_type = message_type
         self._every_cycles = every_cycles
         self._forward = forward
-        self._is_wanted = is_wanted
+        self._has_subscriber = has_subscriber
         self._forwards_all = forwards_all
-        self._reader: Reader[MessageT] | None = None  # None while the samples are not wanted
+        self._reader: Reader[MessageT] | None = None  # None while no subscriber needs the samples
 
     def poll(self, cycle: int, is_valid: Callable[[Message], bool]) -> None:
         """Forward what has arrived, if the relay is due in this cycle.
@@ -66,7 +66,7 @@ class Relay(Generic[MessageT]):
         """
         if cycle % self._every_cycles != 0:
             return
-        if not self._is_wanted():
+        if not self._has_subscriber():
             self._unsubscribe()
             return
         if self._reader is None:
@@ -81,7 +81,7 @@ class Relay(Generic[MessageT]):
                 self._forward(newest)
 
     def _subscribe(self) -> Reader[MessageT]:
-        depth: int | None = SAMPLES_KEPT
+        depth: int | None = MAX_SAMPLES
         if self._forwards_all:
             depth = None
         return self._session.reader(self._key, self._message_type, depth=depth)
@@ -102,7 +102,7 @@ class RosTime:
     def __init__(self, *, wall_time: bool) -> None:
         self.wall_time = wall_time
         self.newest_robot_ns = 0  # robot time of the newest clock
-        self._offsets_ns: deque[int] = deque(maxlen=CLOCK_OFFSETS_KEPT)
+        self._offsets_ns: deque[int] = deque(maxlen=MAX_CLOCK_OFFSETS)
 
     def add_clock(self, robot_ns: int) -> None:
         """Take in the robot time of a clock message that has just arrived."""

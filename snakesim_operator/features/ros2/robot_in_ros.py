@@ -199,7 +199,7 @@ def encode_camera_info(timestamp_ns: int, frame: str, image: DepthImage | ColorI
 
 
 def encode_laser_scan(timestamp_ns: int, frame: str, scan: Ranges) -> bytes:
-    """Return a sensor_msgs/LaserScan with all beams at one instant. Beams without a return are infinite (REP 117)."""
+    """Return a sensor_msgs/LaserScan with all beams at one time. Beams without a return are infinite (REP 117)."""
     ranges_m = [np.inf if range_m is None else range_m for range_m in scan.range_m]
     angle_max_rad = scan.angle_min_rad + scan.angle_step_rad * (len(ranges_m) - 1)
     return ros.encode_message(

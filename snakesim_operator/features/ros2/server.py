@@ -59,14 +59,14 @@ class ServiceServer:
         self._errors = ErrorReport(name)
         self.rejected = 0  # malformed requests
 
-    def poll(self, say: PrintLine) -> None:
+    def poll(self, print_text: PrintLine) -> None:
         """Start to answer the next request, if the previous one has been answered. It does not wait."""
         if self._running is not None:
             if not self._running.done():
                 return
             error = self._running.exception()
             if error is not None:
-                say(f"{self.name} was not answered: {error}")
+                print_text(f"{self.name} was not answered: {error}")
             self._running = None
         question = self._requests.take_next()
         if question is None:

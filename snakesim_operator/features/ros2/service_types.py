@@ -36,7 +36,7 @@ class RosService:
             return None
 
     def encode_response(self, *fields: Any) -> bytes:
-        """Return a response in CDR, given its fields in the order of their definition."""
+        """Return a response in CDR with these fields, in the order of their definition."""
         name = f"{self.type.name}_Response"
         response = make_message(name, *fields)
         return bytes(STORE.serialize_cdr(response, name))

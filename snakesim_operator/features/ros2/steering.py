@@ -27,17 +27,17 @@ REQUESTER = "ros2 /cmd_vel"
 class CmdVelInput:
     """Reads the newest Twist of a ROS topic in each cycle and publishes the intent that it stands for."""
 
-    def __init__(self, twists: RawReader, session: Session, say: PrintLine) -> None:
+    def __init__(self, twists: RawReader, session: Session, print_text: PrintLine) -> None:
         """Prepare to read the topic and to publish intents.
 
         Args:
             twists: Messages of the ROS topic.
             session: Session on the robot's network, where the intents are published.
-            say: Reports dropped messages to the user.
+            print_text: Reports dropped messages to the user.
         """
         self._twists = twists
         self._intents = session.publisher(keys.INTENT, Intent)
-        self._say = say
+        self._print_text = print_text
         self._steering = CmdVelSteering()
         self._senders = SenderClocks()
         self._reported_reason = ""  # the last reason for dropping that the user has seen
@@ -62,7 +62,7 @@ class CmdVelInput:
             self._intents.put(intent)
         elif self._steering.reason != self._reported_reason:
             self._reported_reason = self._steering.reason
-            self._say(f"a message on cmd_vel {self._reported_reason}; it is dropped, with all that are alike")
+            self._print_text(f"a message on cmd_vel {self._reported_reason}; it is dropped, with all that are alike")
 
 
 class CmdVelSteering:

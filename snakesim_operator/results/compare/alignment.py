@@ -25,7 +25,7 @@ class Joints:
 
 @dataclass(frozen=True)
 class Aligned:
-    """Both runs at the same instants."""
+    """Both runs at the same times."""
 
     time_s: Floats  # (n,) since the first arming
     a: Joints
@@ -63,7 +63,7 @@ def _describe_rates(a: RunRecord, b: RunRecord) -> str:
 
 
 def _sample_joints(record: RunRecord, time_s: Floats, grid: Floats) -> Joints:
-    """Return what the joints of a run did at the instants of a grid, (n,)."""
+    """Return what the joints of a run did at the times of a grid, (n,)."""
     held = np.searchsorted(time_s, grid + SAME_INSTANT_S, side="right") - 1
     on_grid = np.allclose(time_s[held], grid, rtol=0, atol=SAME_INSTANT_S)
 

@@ -53,7 +53,7 @@ class Gap:
     joint_worst: list[MaxDifference | None]
     rms: float | None  # over all joints
     worst: MaxDifference | None
-    correlation: float | None  # over all joints and instants; None when one of them never changes
+    correlation: float | None  # over all joints and times; None when one of them never changes
     unknown_fraction: float  # share of what is compared that is not a number in one of the runs, or in both
 
     @property
@@ -146,7 +146,7 @@ class Difference:
     other_mode: float  # share of ticks and joints whose modes differ
     tracking_rad: tuple[float | None, float | None]  # RMS of angle - target in position mode, in A and in B
     hand_overs: HandOvers
-    parted: FirstDivergence | None
+    divergence: FirstDivergence | None
 
     @property
     def identical(self) -> bool:
@@ -201,7 +201,7 @@ def differ(a: RunRecord, b: RunRecord) -> Difference:
         other_mode=float(1 - same_mode.mean()),
         tracking_rad=(_tracking_error_rad(joints_a), _tracking_error_rad(joints_b)),
         hand_overs=HandOvers(_hand_overs_until(a, until_s), _hand_overs_until(b, until_s), _describe_unreported(a, b)),
-        parted=_find_divergence(time_s, angle.difference),
+        divergence=_find_divergence(time_s, angle.difference),
     )
 
 
@@ -211,7 +211,7 @@ def _check_comparable(a: RunRecord, b: RunRecord) -> None:
         if not len(record.time_s):
             raise ConfigError(
                 f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed "
-                f"({record.host.reason}); {record.folder / 'host.log'} may say more. "
+                f"({record.host.reason}); {record.folder / 'host.log'} may explain it. "
                 "Run it again, until the summary has a time",
                 code="recording/never-armed",
             )
@@ -237,7 +237,7 @@ def _check_shapes(record: RunRecord) -> None:
         array: NDArray[np.generic] = getattr(record, name)
         if array.shape != shape or array.dtype.kind not in "fiu":
             raise ConfigError(
-                f"{record.folder / BLACK_BOX}: `{name}` holds {array.dtype} {array.shape}, wanted are numbers {shape}: "
+                f"{record.folder / BLACK_BOX}: `{name}` holds {array.dtype} {array.shape}, not numbers {shape}: "
                 f"{ticks} ticks, {joints} joints. It is damaged, or not of this run; repeat the run",
                 code="recording/not-readable",
             )
@@ -273,7 +273,7 @@ def _compare_quantity(
     Args:
         what: Name of the quantity.
         unit: Its unit.
-        time_s: (n,) the common instants.
+        time_s: (n,) the common times.
         a: (n, joints) values in A.
         b: (n, joints) values in B.
         compared: (n, joints) where a comparison makes sense; None: everywhere.

@@ -19,7 +19,7 @@ def advance(difference: Difference, moved: Advance) -> list[Figure]:
     ahead_mm = 1000 * (advance_b_m - advance_a_m)
     drawn = [Line("A", moved.a.time_s, moved.a.value, A, width=3.5), Line("B", moved.b.time_s, moved.b.value, B)]
     gap = Line("B − A", time_s, ahead_mm)
-    marks = parted(difference)
+    marks = mark_divergence(difference)
     return [
         lines("Advance of both runs over time", "advance, m", drawn, end_s, marks=marks),
         lines("Difference of the advance over time", "B − A, mm", [gap], end_s, marks=marks, height=170),
@@ -33,7 +33,9 @@ def gap_map(difference: Difference, gap: Gap) -> Figure:
         full = max(abs(gap.worst.difference), 1e-9)
     label = f"Difference of every joint's {gap.what} over time"
     until_s = float(difference.aligned.time_s[-1])
-    return joint_map(label, difference.joints, gap.difference, gap.unit, full, until_s, marks=parted(difference))
+    return joint_map(
+        label, difference.joints, gap.difference, gap.unit, full, until_s, marks=mark_divergence(difference)
+    )
 
 
 def overlay(difference: Difference, gap: Gap, a: Floats, b: Floats, joint: int) -> Figure:
@@ -61,11 +63,11 @@ def hand_overs(difference: Difference) -> Figure:
     for joint in sorted(propelled, reverse=True):
         rows += [f"{difference.joints[joint]} A", f"{difference.joints[joint]} B"]
     end_s = max([float(difference.aligned.time_s[-1]), *(bar.end_s for bar in drawn)])
-    return bars("Propulsion joints of both runs over time", rows, drawn, end_s, parted(difference))
+    return bars("Propulsion joints of both runs over time", rows, drawn, end_s, mark_divergence(difference))
 
 
-def parted(difference: Difference) -> list[Mark]:
+def mark_divergence(difference: Difference) -> list[Mark]:
     """Return a mark where the runs diverge."""
-    if difference.parted is None:
+    if difference.divergence is None:
         return []
-    return [Mark(difference.parted.time_s, "diverge")]
+    return [Mark(difference.divergence.time_s, "diverge")]

@@ -27,7 +27,7 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
     The lag is found by a grid search whose step is halved until it is below LAG_RESOLUTION_S.
 
     Args:
-        time_s: (n,) the common instants.
+        time_s: (n,) the common times.
         a: (n,) values in A.
         b: (n,) values in B.
 
@@ -41,15 +41,15 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
     if within.sum() < MIN_INSTANTS or np.std(a[within]) < MIN_DEVIATION:
         return None
     at_s = time_s[within]
-    wanted = b[within] - b[within].mean()
+    target = b[within] - b[within].mean()
 
     def fit(lag_s: float) -> tuple[float, float, float]:
         """Return the RMS that is left, the lag and the best gain for it."""
         moved = np.interp(at_s - lag_s, time_s, a)
         moved -= moved.mean()
         power = float(moved @ moved)
-        gain = float(moved @ wanted) / power if power > 0 else 0.0
-        left = wanted - gain * moved
+        gain = float(moved @ target) / power if power > 0 else 0.0
+        left = target - gain * moved
         return float(np.sqrt(left @ left / len(left))), lag_s, gain
 
     step_s = float(np.median(np.diff(time_s)))

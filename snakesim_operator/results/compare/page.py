@@ -14,13 +14,13 @@ UNKNOWN = "–"
 HAND_OVERS_SHOWN = 40
 
 
-def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
-    """Return the whole page as HTML. asked: the result of `--within`, if that was given."""
+def page(difference: Difference, tolerance_check: ToleranceCheck | None = None) -> str:
+    """Return the whole page as HTML. tolerance_check: the result of `--within`; None without this option."""
     words = sentences(difference)
     kind = ""
-    if asked is not None:
-        words = [*words, f"{asked.words[:1].upper()}{asked.words[1:]}."]
-        kind = "good" if asked.holds else "bad"
+    if tolerance_check is not None:
+        words = [*words, f"{tolerance_check.words[:1].upper()}{tolerance_check.words[1:]}."]
+        kind = "good" if tolerance_check.holds else "bad"
     turns = list(zip_longest(difference.hand_overs.a, difference.hand_overs.b))
     return render(
         Path(__file__).parent / "compare.html",
@@ -30,7 +30,7 @@ def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
         apart_rad=APART_RAD,
         records=(difference.a, difference.b),
         kind=kind,
-        said=" ".join(words),
+        verdict=" ".join(words),
         maps=[("Angles", difference.angle), ("Torques", difference.torque)],
         figures=figures,
         worst=_worst(difference),

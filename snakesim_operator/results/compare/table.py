@@ -42,14 +42,14 @@ def table(difference: Difference) -> list[str]:
 def for_scripts(difference: Difference) -> dict[str, Any]:
     """Return the same numbers as plain values. Unknown is None."""
     advance = difference.advance
-    parted = difference.parted
+    divergence = difference.divergence
     names = difference.joints
     moved = None
     if advance is not None:
         moved = {"a": advance.a_m, "b": advance.b_m, "percent": advance.percent}
     divergence = None
-    if parted is not None:
-        divergence = {"joint": names[parted.joint], "time_s": parted.time_s}
+    if divergence is not None:
+        divergence = {"joint": names[divergence.joint], "time_s": divergence.time_s}
     return {
         "identical": difference.identical,
         "missing": {"a": difference.a.missing, "b": difference.b.missing},
@@ -60,7 +60,7 @@ def for_scripts(difference: Difference) -> dict[str, Any]:
         "moved_m": moved,
         "gaps": [_gap_values(gap, names) for gap in difference.gaps],
         "by_joint": _joint_values(difference),
-        "parted": divergence,
+        "divergence": divergence,
         "hand_overs": {
             "a": _hand_over_values(difference.hand_overs.a, names),
             "b": _hand_over_values(difference.hand_overs.b, names),
@@ -170,7 +170,7 @@ def _gap(gap: Gap, joints: list[str]) -> str:
         return f"  {gap.what:<{NAME_WIDTH}}unknown"
     worst = gap.worst
     if gap.same:
-        return f"  {gap.what:<{NAME_WIDTH}}the same for every joint at every instant"
+        return f"  {gap.what:<{NAME_WIDTH}}the same for every joint at every time"
     if not worst.difference:
         return f"  {gap.what:<{NAME_WIDTH}}the same where it is known"
     where = f"{joints[worst.joint]} at {worst.time_s:.2f} s, A {worst.a:+.3f}, B {worst.b:+.3f}"

@@ -9,7 +9,7 @@ SAME = "the same"
 
 @dataclass(frozen=True)
 class ToleranceCheck:
-    """What `--within` asked for, and whether it holds."""
+    """The tolerance of `--within`, and whether it holds."""
 
     percent: float
     holds: bool
@@ -60,11 +60,11 @@ def _describe_replays(difference: Difference) -> list[str]:
 
 
 def _describe_divergence(difference: Difference) -> str:
-    parted = difference.parted
-    if parted is None:
+    divergence = difference.divergence
+    if divergence is None:
         return f"No joint's angles were ever more than {APART_RAD:g} rad apart."
-    joint = difference.joints[parted.joint]
-    return f"The runs diverge at {parted.time_s:.2f} s, when {joint} is first more than {APART_RAD:g} rad apart."
+    joint = difference.joints[divergence.joint]
+    return f"The runs diverge at {divergence.time_s:.2f} s, when {joint} is first more than {APART_RAD:g} rad apart."
 
 
 def _describe_partial(difference: Difference) -> list[str]:
@@ -115,7 +115,7 @@ def who_propelled(difference: Difference) -> str:
     for run, periods in (("A", hand_overs.a), ("B", hand_overs.b)):
         if agreed < len(periods):
             name = difference.joints[periods[agreed].joint]
-            next_joints.append(f"{run} goes on with {name} at {periods[agreed].start_s:.2f} s")
+            next_joints.append(f"{run} continues with {name} at {periods[agreed].start_s:.2f} s")
         else:
             next_joints.append(f"{run} with none")
     return f"the order of propulsion agrees for the first {agreed}; then {', '.join(next_joints)}"
@@ -123,7 +123,7 @@ def who_propelled(difference: Difference) -> str:
 
 def _common(difference: Difference) -> str:
     count = len(difference.aligned.time_s)
-    return f"{count} common ticks" if difference.aligned.how == "tick by tick" else f"{count} common instants"
+    return f"{count} common ticks" if difference.aligned.how == "tick by tick" else f"{count} common times"
 
 
 def _capitalize(words: str) -> str:

@@ -15,8 +15,8 @@ from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.results.run_log import RunRecord
 
 SAMPLE_S = 0.1
-LASTING_S = 0.5  # for which a run goes on at its goal, because noise may move the body back over the line
-GIVE_UP_M = 0.03  # a run that advances less within a given time is stuck
+LASTING_S = 0.5  # for which a run continues at its goal, because noise may move the body back over the line
+GIVE_UP_M = 0.03  # a run that advances less within its time limit is stuck
 MIN_DISTANCE_M = 0.1  # energy per meter means nothing over less
 
 
@@ -150,7 +150,7 @@ class Advance:
 
 
 class GoalWatch:
-    """Watches a run, and reports when it need not go on: its goal was reached a while ago, or it is stuck."""
+    """Watches a run, and reports when it may end: its goal was reached a while ago, or it is stuck."""
 
     def __init__(self, config: RunConfig, robot: Description, give_up_s: float | None = None) -> None:
         """Watch a run.

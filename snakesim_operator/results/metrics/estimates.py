@@ -17,8 +17,8 @@ class Estimates:
 
     pose_from: str | None = None
     contacts_from: str | None = None
-    reckoned_distance_m: float | None = None
-    reckoned_off_m: float | None = None
+    dead_reckoned_distance_m: float | None = None
+    dead_reckoning_error_m: float | None = None
 
     @staticmethod
     def of(record: RunRecord) -> "Estimates":
@@ -26,15 +26,17 @@ class Estimates:
         if not record.worlds or len(record.time_s) == 0:
             return Estimates()
         last = record.worlds[-1]
-        reckoned = [world for world in record.worlds if world.pose_from == "dead_reckoning"]
-        errors_m = [_position_error_m(record, world) for world in reckoned]
+        dead_reckoned = [world for world in record.worlds if world.pose_from == "dead_reckoning"]
+        errors_m = [_position_error_m(record, world) for world in dead_reckoned]
         known_errors_m = [error_m for error_m in errors_m if error_m is not None]
-        distance_m = _distance_between_m(record, reckoned[0], reckoned[-1]) if len(reckoned) > 1 else None
+        distance_m = (
+            _distance_between_m(record, dead_reckoned[0], dead_reckoned[-1]) if len(dead_reckoned) > 1 else None
+        )
         return Estimates(
             pose_from=last.pose_from,
             contacts_from=last.contacts_from,
-            reckoned_distance_m=distance_m,
-            reckoned_off_m=max(known_errors_m, default=None),
+            dead_reckoned_distance_m=distance_m,
+            dead_reckoning_error_m=max(known_errors_m, default=None),
         )
 
     def in_words(self) -> list[str]:
@@ -42,10 +44,10 @@ class Estimates:
         phrases: list[str] = []
         if self.pose_from == "dead_reckoning":
             phrase = "the pose is estimated by dead reckoning"
-            if self.reckoned_distance_m is not None:
-                phrase += f", {self.reckoned_distance_m:.3f} m far"
-            if self.reckoned_off_m is not None:
-                phrase += f", at most {100 * self.reckoned_off_m:.1f} cm off"
+            if self.dead_reckoned_distance_m is not None:
+                phrase += f", {self.dead_reckoned_distance_m:.3f} m far"
+            if self.dead_reckoning_error_m is not None:
+                phrase += f", at most {100 * self.dead_reckoning_error_m:.1f} cm off"
             phrases.append(phrase)
         if self.contacts_from == "joint_torques":
             phrases.append("contacts are estimated from joint torques")

@@ -61,7 +61,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Mark:
-    """A dashed line at an instant. Few are named."""
+    """A dashed line at one time. Few have a name."""
 
     time_s: float
     words: str = ""
@@ -187,12 +187,12 @@ def strongest(values: Floats, columns: int) -> Floats:
     """Return at most `columns` rows, each with the value of largest size in its bucket of time; NaN: none is known."""
     if len(values) <= columns:
         return values
-    kept: list[Floats] = []
+    largest: list[Floats] = []
     edges = np.round(np.linspace(0, len(values), columns + 1)).astype(int)
     for part in (values[first:last] for first, last in pairwise(edges.tolist())):
         sizes = np.where(np.isfinite(part), np.abs(part), -1.0)
-        kept.append(part[sizes.argmax(axis=0), np.arange(values.shape[1])])
-    return np.array(kept)
+        largest.append(part[sizes.argmax(axis=0), np.arange(values.shape[1])])
+    return np.array(largest)
 
 
 def rounded(values: Floats) -> list[float | None]:

@@ -1,7 +1,7 @@
 """Drawings of the snake and its forces as SVG: elements with escaped text and finite numbers, and arrows.
 
 All drawings on web pages are made here; charts over time are Plotly's (`charts`). On a report, figure.css and
-`palette` say how a class of elements looks. The console's page has no such style sheet, so it passes colors.
+`palette` define how a class of elements looks. The console's page has no such style sheet, so it passes colors.
 """
 
 import math

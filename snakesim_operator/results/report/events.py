@@ -1,4 +1,4 @@
-"""What happened in a run: start, hand-overs, largest force, jam, stop; and the instants at which that is drawn."""
+"""What happened in a run: start, hand-overs, largest force, jam, stop; and the snapshots that are drawn of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_operator.results.metrics.motion import measure_motion
 from snakesim_operator.results.metrics.propulsion import find_propulsion_periods
-from snakesim_operator.results.report.instants import Instant, balanced_instants, count_unmeasured, instant_at
+from snakesim_operator.results.report.snapshots import Snapshot, balanced_snapshots, count_unmeasured, find_snapshot
 from snakesim_operator.results.report.timeline import jam_bands
 from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
@@ -76,26 +76,26 @@ def select_listed(events: list[Event]) -> list[Event]:
     return [event for event in events if event not in left_out]
 
 
-def drawn_instants(record: RunRecord, events: list[Event]) -> list[tuple[Event, Instant]]:
+def drawn_snapshots(record: RunRecord, events: list[Event]) -> list[tuple[Event, Snapshot]]:
     """Return the events that are drawn, each with the snake at that time.
 
     Only a few hand-overs are drawn. Events that look the same are drawn once, with the words of both.
     """
     hand_over_times_s = _hand_over_times_to_draw(events)
-    chosen: list[tuple[Event, Instant]] = []
+    chosen: list[tuple[Event, Snapshot]] = []
     hand_overs_first = sorted(events, key=lambda event: event.joint is None)  # they show forces
     for event in hand_overs_first:
         if event.joint is not None and event.time_s not in hand_over_times_s:
             continue
-        instant = _instant_of(record, event)
-        if instant is None:
+        snapshot = _snapshot_of_event(record, event)
+        if snapshot is None:
             continue
-        later_s = instant.time_s - event.time_s
+        later_s = snapshot.time_s - event.time_s
         if later_s > SIMULTANEOUS_S:
             event = replace(event, words=f"{event.words}, {later_s:.2f} s later")
-        similar = _find_similar(record, instant, chosen)
+        similar = _find_similar(record, snapshot, chosen)
         if similar is None:
-            chosen.append((event, instant))
+            chosen.append((event, snapshot))
         else:
             other, drawn = chosen[similar]
             in_order = sorted((event, other), key=lambda one: one.time_s)
@@ -112,8 +112,8 @@ def _hand_over_times_to_draw(events: Sequence[Event]) -> set[float]:
     return {hand_overs[number].time_s for number in numbers}
 
 
-def _instant_of(record: RunRecord, event: Event) -> Instant | None:
-    """Return the instant at which an event is drawn.
+def _snapshot_of_event(record: RunRecord, event: Event) -> Snapshot | None:
+    """Return the snapshot that is drawn of an event.
 
     It is the nearest one whose solved forces balance. After a hand-over these forces come a little later, and those
     that were measured are preferred. Without any it is the body alone.
@@ -124,23 +124,23 @@ def _instant_of(record: RunRecord, event: Event) -> Instant | None:
     else:
         begin_s = event.time_s
         end_s = event.time_s + SETTLING_S
-    nearby = balanced_instants(record, begin_s, end_s)
-    candidates = [instant for instant in nearby if event.joint in (None, instant.propulsion_joint)]
+    nearby = balanced_snapshots(record, begin_s, end_s)
+    candidates = [snapshot for snapshot in nearby if event.joint in (None, snapshot.propulsion_joint)]
     return min(
         candidates,
-        key=lambda instant: (count_unmeasured(instant), abs(instant.time_s - event.time_s)),
-        default=instant_at(record, event.time_s),
+        key=lambda snapshot: (count_unmeasured(snapshot), abs(snapshot.time_s - event.time_s)),
+        default=find_snapshot(record, event.time_s),
     )
 
 
-def _find_similar(record: RunRecord, instant: Instant, chosen: Sequence[tuple[Event, Instant]]) -> int | None:
-    """Return the index of the first chosen instant that looks like this one."""
+def _find_similar(record: RunRecord, snapshot: Snapshot, chosen: Sequence[tuple[Event, Snapshot]]) -> int | None:
+    """Return the index of the first chosen snapshot that looks like this one."""
     for index, (_, other) in enumerate(chosen):
-        if _looks_alike(record, instant, other):
+        if _looks_alike(record, snapshot, other):
             return index
     return None
 
 
-def _looks_alike(record: RunRecord, a: Instant, b: Instant) -> bool:
+def _looks_alike(record: RunRecord, a: Snapshot, b: Snapshot) -> bool:
     moved_m = np.abs(nodes_xy_w(record, a.row) - nodes_xy_w(record, b.row)).max()
     return bool(moved_m < SAME_SHAPE_M or abs(a.time_s - b.time_s) < SAME_TIME_S)

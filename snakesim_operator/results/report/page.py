@@ -1,4 +1,4 @@
-"""The page: verdict, playback, advance, instants, joints, loads, numbers. An empty section gives the reason."""
+"""The page: verdict, playback, advance, snapshots, joints, loads, numbers. An empty section gives the reason."""
 
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -11,12 +11,12 @@ from snakesim_hal.wire.messages import TICK_TIMES
 from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
 from snakesim_operator.results.page.html import render
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import Event, drawn_instants, find_events, select_listed
-from snakesim_operator.results.report.instants import measured_along_n
+from snakesim_operator.results.report.events import Event, drawn_snapshots, find_events, select_listed
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import common_scale, force_polygon, with_subscript
 from snakesim_operator.results.report.pushing import pushing
 from snakesim_operator.results.report.reasons import why_at_limit, why_empty, why_late, why_refused
+from snakesim_operator.results.report.snapshots import measured_along_n
 from snakesim_operator.results.report.timeline import distance, in_words, joined, most_used_joints
 from snakesim_operator.results.report.top_view import top_view
 from snakesim_operator.results.report.verdict import verdict
@@ -56,7 +56,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         film=playback(record),
         names=[joint.name for joint in record.description.joints],
         events=select_listed(events),
-        instants=_instants(record, events),
+        snapshots=_describe_snapshots(record, events),
         pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
@@ -71,7 +71,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         propelled=len({interval.joint for interval in intervals}),
         figures=figures,
         begin_s=zero_s(record),
-        first_kept=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
+        first_faults=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
         numbers=_numbers(summary),
         config_file=_config_file(record),
         config=msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode(),
@@ -94,30 +94,30 @@ def playback_page(record: RunRecord, summary: RunSummary) -> str:
     )
 
 
-def _instants(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
+def _describe_snapshots(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
     """Return the drawings of each event, and the numbers beside them."""
-    chosen = drawn_instants(record, events)
-    instants = [instant for _, instant in chosen]
-    balances = [instant.balance for instant in instants if instant.balance is not None]
+    chosen = drawn_snapshots(record, events)
+    snapshots = [snapshot for _, snapshot in chosen]
+    balances = [snapshot.balance for snapshot in snapshots if snapshot.balance is not None]
     cards: list[dict[str, Any]] = []
-    for (event, instant), view in zip(chosen, views(record, instants, VIEW_WIDTH), strict=True):
+    for (event, snapshot), view in zip(chosen, views(record, snapshots, VIEW_WIDTH), strict=True):
         polygon = None
-        if instant.balance is None:
-            nodes = nodes_xy_w(record, instant.row)
+        if snapshot.balance is None:
+            nodes = nodes_xy_w(record, snapshot.row)
             forward = nodes[-1] - nodes[0]
         else:
-            forward = instant.balance.resultant_n
+            forward = snapshot.balance.resultant_n
             scale = common_scale(balances, *POLYGON_SIZE, upright=view.upright)
             polygon = Markup(
-                force_polygon(instant.balance, instant.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
+                force_polygon(snapshot.balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
             )
         cards.append(
             {
                 "event": event,
-                "instant": instant,
-                "view": Markup(top_view(record, instant, view)),
+                "snapshot": snapshot,
+                "view": Markup(top_view(record, snapshot, view)),
                 "polygon": polygon,
-                "pushed_n": measured_along_n(instant, forward),
+                "pushed_n": measured_along_n(snapshot, forward),
             }
         )
     return cards

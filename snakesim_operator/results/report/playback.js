@@ -23,7 +23,7 @@
   const show = () => {
     let i = frames.findIndex((frame) => frame[0] > time);
     i = i < 0 ? frames.length - 1 : Math.max(i - 1, 0);
-    const [t, nodes, propels, what, solved, felt, map, path, kinds] = frames[i];
+    const [t, nodes, propels, what, solved, measured, map, path, kinds] = frames[i];
     const [later, ahead] = frames[Math.min(i + 1, frames.length - 1)];
     const share = later > t ? Math.min(Math.max((time - t) / (later - t), 0), 1) : 0;
     const at = nodes.map((value, k) => value + share * (ahead[k] - value));
@@ -38,7 +38,7 @@
     });
     perceived.innerHTML = (maps[map] ?? []).map((outline) => `<polygon class="seen" points="${outline}"/>`).join("")
       + (paths[path] ? `<polyline class="planned" points="${paths[path]}"/>` : "");
-    forces.innerHTML = pieces(felt).map((one) => arrow(one, "felt")).join("")
+    forces.innerHTML = pieces(measured).map((one) => arrow(one, "measured")).join("")
       + pieces(solved).map((one, k) => arrow(one, kinds[k])).join("");
     words.innerHTML = `<b>${time.toFixed(2)} s</b> ${propels < 0 ? "" : `<b>${joints[propels]} propels.</b> `}${captions[what]}`;
     slider.value = time;

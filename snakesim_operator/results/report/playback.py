@@ -1,4 +1,4 @@
-"""The whole run as a film: a fixed map, and for each of some hundred instants the snake and its forces.
+"""The whole run as a film: a fixed map, and for each of some hundred times the snake and its forces.
 
 `playback.js` moves what `body` has drawn. All coordinates are those of the drawing.
 """
@@ -17,8 +17,8 @@ from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.metrics.motion import MOVING, STANDING, Motion, measure_motion
 from snakesim_operator.results.page.svg import Point, element, figure
-from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.snapshots import balance_of
 from snakesim_operator.results.report.timeline import in_words
 from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view, nodes_xy_w

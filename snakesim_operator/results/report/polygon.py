@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.page.svg import Point, arrow, element, figure, points_text, round_below, scale_bar
-from snakesim_operator.results.report.instants import Balance
 from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.snapshots import Balance
 
 EDGE = 46.0  # around the polygon, for labels
 FOOT = 16.0  # under it, for the scale

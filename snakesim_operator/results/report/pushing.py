@@ -45,7 +45,7 @@ class ForceSample:
 
 @dataclass(frozen=True)
 class ForceSpan:
-    """A span in which the controller wanted to push off one obstacle."""
+    """A span in which the controller planned to push off one obstacle."""
 
     start_s: float
     end_s: float
@@ -106,7 +106,7 @@ def _force_chart(record: RunRecord) -> Figure:
         time_s = world.timestamp_ns * 1e-9 - zero_s(record)
         measured.append(ForceSample(time_s, world.timestamp_ns, _sum_forces(world.contacts)))
     drawn = [
-        Line("wanted of all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
+        Line("desired at all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
         Line("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
     ]
     weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)

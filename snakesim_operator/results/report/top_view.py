@@ -1,4 +1,4 @@
-"""The snake seen from above at one instant: body to scale, route, obstacles, forces (Fig. 7-10)."""
+"""The snake seen from above at one time: body to scale, route, obstacles, forces (Fig. 7-10)."""
 
 import math
 
@@ -19,9 +19,9 @@ from snakesim_operator.results.page.svg import (
     text_width,
     title,
 )
-from snakesim_operator.results.report.instants import Balance, Instant
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.polygon import with_subscript
+from snakesim_operator.results.report.snapshots import Balance, Snapshot
 from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w, reach_m
 from snakesim_operator.results.run_log import RunRecord
 
@@ -32,15 +32,15 @@ SCALE_SPACING = 40.0  # between the scales of length and of force
 MEASURED_OFFSET = 7.0  # of a measured force from its contact, so that it does not cover the solved one
 
 
-def top_view(record: RunRecord, instant: Instant, view: View) -> str:
-    """Draw the snake, the obstacles and the forces of one instant."""
-    nodes = nodes_xy_w(record, instant.row)
+def top_view(record: RunRecord, snapshot: Snapshot, view: View) -> str:
+    """Draw the snake, the obstacles and the forces of one snapshot."""
+    nodes = nodes_xy_w(record, snapshot.row)
     labels = Labels(view.width, view.height - FOOT)
     parts = [ground(record, view, labels), body(record, view, nodes, labels)]
-    parts += [_draw_measured_force(contact, view, labels) for contact in instant.measured_contacts]
-    parts.append(_draw_solved_forces(instant, view, labels))
-    description = f"Top view at {instant.time_s:.2f} s"
-    joint = instant.propulsion_joint
+    parts += [_draw_measured_force(contact, view, labels) for contact in snapshot.measured_contacts]
+    parts.append(_draw_solved_forces(snapshot, view, labels))
+    description = f"Top view at {snapshot.time_s:.2f} s"
+    joint = snapshot.propulsion_joint
     if joint is not None:
         name = record.description.joints[joint].name
         description += f", {name} propels"
@@ -48,9 +48,9 @@ def top_view(record: RunRecord, instant: Instant, view: View) -> str:
         fill = f"fill:var(--joint-{joint})"
         parts.append(element("circle", cx=x, cy=y, r=6.5, class_="propelling", style=fill))
         parts.append(labels.place_label((x, y), name, "halo strong", gaps=(16, 22, 30, 40)))
-    if instant.balance is not None:
-        for i in range(len(instant.balance.contacts)):
-            parts.append(_label_push_point(i, instant.balance, view, labels))
+    if snapshot.balance is not None:
+        for i in range(len(snapshot.balance.contacts)):
+            parts.append(_label_push_point(i, snapshot.balance, view, labels))
     for end, word in ((nodes[0], "tail"), (nodes[-1], "head")):
         parts.append(labels.place_label(view.at(end), word, "halo soft", gaps=(16, 24, 34)))
     return figure(view.width, view.height, description, *parts, scales(view))
@@ -146,19 +146,19 @@ def _draw_measured_force(contact: WorldContact, view: View, labels: Labels) -> s
     start = view.along(view.at(contact.position_w), contact.tangent_w, MEASURED_OFFSET)
     tip = view.along(start, contact.force_w, cut * view.force_scale)
     labels.keep_off_line(start, tip, 3)
-    drawn = arrow(start, tip, "felt", head=8)
+    drawn = arrow(start, tip, "measured", head=8)
     if cut < 1.0:
-        drawn += labels.place_label(tip, f"{size_n:.0f} N", "halo felt-text", gaps=(6, 12))
+        drawn += labels.place_label(tip, f"{size_n:.0f} N", "halo measured-text", gaps=(6, 12))
     return drawn
 
 
-def _draw_solved_forces(instant: Instant, view: View, labels: Labels) -> str:
+def _draw_solved_forces(snapshot: Snapshot, view: View, labels: Labels) -> str:
     """Draw the solved forces and their resultant."""
-    balance = instant.balance
+    balance = snapshot.balance
     if balance is None:
         return ""
     parts: list[str] = []
-    contact_classes, resultant_class = balance.force_classes(instant.measured_contacts)
+    contact_classes, resultant_class = balance.force_classes(snapshot.measured_contacts)
     for contact, force_n, class_ in zip(balance.contacts, balance.contact_n, contact_classes, strict=True):
         foot = view.at(contact.position_w)
         tip = view.along(foot, force_n, view.force_scale)

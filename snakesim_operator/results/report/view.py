@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.page.svg import Point
-from snakesim_operator.results.report.instants import Instant
+from snakesim_operator.results.report.snapshots import Snapshot
 from snakesim_operator.results.run_log import RunRecord
 
 LONGEST_ARROW = 72.0  # of the strongest force, in units of the drawing
@@ -23,7 +23,7 @@ FOOT = 30.0  # under the drawing, for the scales
 
 @dataclass(frozen=True)
 class View:
-    """One scale for length and one for force, shared by all instants of a report."""
+    """One scale for length and one for force, shared by all snapshots of a report."""
 
     low_w: Floats  # (2,), m: the corner that is drawn at left and bottom, in the turned frame
     scale: float  # units per meter
@@ -64,29 +64,29 @@ def reach_m(obstacle: Obstacle) -> float:
     return max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2]))
 
 
-def views(record: RunRecord, instants: list[Instant], width: float) -> list[View]:
-    """Return a window for each instant, all of one size and one scale: around the body, with room for the arrows."""
-    if not instants:
+def views(record: RunRecord, snapshots: list[Snapshot], width: float) -> list[View]:
+    """Return a window for each snapshot, all of one size and one scale: around the body, with room for the arrows."""
+    if not snapshots:
         return []
-    bodies = [nodes_xy_w(record, instant.row) for instant in instants]
-    max_force_n = _max_force_n(instants)
+    bodies = [nodes_xy_w(record, snapshot.row) for snapshot in snapshots]
+    max_force_n = _max_force_n(snapshots)
     units_per_n = LONGEST_ARROW / max_force_n if max_force_n > 0 else 0.0
     return _windows(record, bodies, units_per_n, width)
 
 
-def _max_force_n(instants: list[Instant]) -> float:
+def _max_force_n(snapshots: list[Snapshot]) -> float:
     """Return the largest solved force; without any, the largest measured one."""
     solved_n: list[float] = []
     measured_n: list[float] = []
-    for instant in instants:
-        if instant.balance is not None:
-            solved_n += [*instant.balance.size_n, float(np.hypot(*instant.balance.resultant_n))]
-        measured_n += [math.hypot(*contact.force_w[:2]) for contact in instant.measured_contacts]
+    for snapshot in snapshots:
+        if snapshot.balance is not None:
+            solved_n += [*snapshot.balance.size_n, float(np.hypot(*snapshot.balance.resultant_n))]
+        measured_n += [math.hypot(*contact.force_w[:2]) for contact in snapshot.measured_contacts]
     return max(solved_n or measured_n, default=0.0)
 
 
 def map_view(record: RunRecord, nodes: list[Floats], units_per_n: float, width: float) -> View:
-    """Return one window for a whole run. nodes: the body at some of its instants, (k, 2) each."""
+    """Return one window for a whole run. nodes: the body at some of its times, (k, 2) each."""
     return _windows(record, [np.vstack(nodes)], units_per_n, width)[0]
 
 

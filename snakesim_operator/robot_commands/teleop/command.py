@@ -123,7 +123,7 @@ class Teleop:
             time.sleep(max(PERIOD_S - (time.monotonic() - began_s), 0.0))
         self._finish()
         with contextlib.suppress(OSError):  # the terminal may be gone
-            print_line(f"teleop ended: {self._end_reason}; nothing is asked of {self._link.namespace} any more")
+            print_line(f"teleop ended: {self._end_reason}; {self._link.namespace} gets no more requests")
         return 1 if self._input_is_lost() else 0
 
     def _finish(self) -> None:
@@ -283,24 +283,24 @@ class Teleop:
             return f"EMERGENCY STOP: {self._describe_stop()}. Then: snakesim robot reset, snakesim robot arm"
         silent_s = time.monotonic() - self._clock_s
         if silent_s > SILENT_S:
-            return f"{self._describe_silence(silent_s)}: nothing can be asked for"
+            return f"{self._describe_silence(silent_s)}: no request is possible"
         if self._steering.touched_s is None:
-            return "nothing asked for yet: the mission goes on"
+            return "nothing requested yet: the mission continues"
         if self._operator_may_be_gone():
             if self._stick is None:
-                return f"no key for {KEY_AGE_S:.0f} s: stopped; press one to go on"
-            return f"no event of the joystick for {STICK_AGE_S:.0f} s: stopped; move it to go on"
+                return f"no key for {KEY_AGE_S:.0f} s: stopped; press one to continue"
+            return f"no event of the joystick for {STICK_AGE_S:.0f} s: stopped; move it to continue"
         heading_w_rad = self._steering.heading_w_rad
         heading = "the mission's way" if heading_w_rad is None else _degrees(heading_w_rad)
         body = "unknown" if self._body_w_rad is None else _degrees(self._body_w_rad)
-        return f"asked: {self._steering.speed_m_s:+.2f} m/s, {heading}; body: {body}"
+        return f"requested: {self._steering.speed_m_s:+.2f} m/s, {heading}; body: {body}"
 
     def _describe_silence(self, silent_s: float) -> str:
         """Return why the robot publishes no clock: the reason in a recent status, or the time since the last clock."""
         status = self._status
         if status is not None and status.held_up and not _describe_age(self._status_s):
             return status.held_up
-        return f"the robot has given no clock for {silent_s:.0f} s"
+        return f"the robot has sent no clock for {silent_s:.0f} s"
 
 
 def _describe_age(arrival_s: float) -> str:

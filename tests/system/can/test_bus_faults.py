@@ -32,7 +32,7 @@ def set_points_out(run: SharedBus) -> int:
 # --- the interface -----------------------------------------------------------------------------------------
 
 
-def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_channel: str) -> None:
+def test_can_interface_down_stops_joints_and_recovers(spare_channel: str) -> None:
     with shared_bus(spare_channel) as run:
         must(ip("link", "set", spare_channel, "down"))
         start = run.tick
@@ -54,7 +54,7 @@ def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_chann
 
 
 @pytest.mark.slow
-def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_channel: str) -> None:
+def test_can_adapter_unplugged_and_plugged_in_again_is_used(spare_channel: str) -> None:
     with shared_bus(spare_channel) as run:
         must(ip("link", "delete", spare_channel))
         run.run(20, run.waving)
@@ -91,7 +91,7 @@ def unclog(channel: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_sent_late(slow_channel: str) -> None:
+def test_can_queue_full_for_three_periods_is_a_fault(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
         clog(slow_channel)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
@@ -108,7 +108,7 @@ def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_s
 
 
 @pytest.mark.slow
-def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_goes_on(slow_channel: str) -> None:
+def test_can_queue_full_for_a_moment_is_counted_and_skipped(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
         clog(slow_channel)
         run.run(IN_A_ROW - 1, run.waving)
@@ -121,7 +121,7 @@ def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_g
 
 
 @pytest.mark.slow
-def test_a_long_queue_that_fills_this_sockets_share_of_it_is_a_full_queue_too(slow_channel: str) -> None:
+def test_can_long_queue_with_socket_share_full_counts_as_full(slow_channel: str) -> None:
     must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
     with shared_bus(slow_channel) as run:
         run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the kernel makes it its minimum

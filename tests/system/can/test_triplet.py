@@ -19,9 +19,7 @@ ROBOT_TIME_S = "10"
 LIMIT_S = 400.0  # an emulated machine is slow
 
 
-def test_the_triplet_over_the_kernels_bus_is_the_triplet_over_the_virtual_one_to_the_bit(
-    tmp_path: Path, channel: str
-) -> None:
+def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, channel: str) -> None:
     over_the_bus = (f'backend.channels=["{channel}"]', 'backend.emulators="process"')
     records: dict[str, RunRecord] = {}
     took_s: dict[str, float] = {}

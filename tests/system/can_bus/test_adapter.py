@@ -50,7 +50,7 @@ def test_frames_go_both_ways_and_foreign_ones_are_left_out(channel: str, other: 
     wire.close()
 
 
-def test_only_what_is_asked_for_is_received_with_nothing_left_behind(channel: str, other: can.BusABC) -> None:
+def test_adapter_receives_only_requested_frames_and_leaves_nothing(channel: str, other: can.BusABC) -> None:
     wire = open_wire(channel, [Opcode.SYNC])
     sync = Frame(frame_id(Opcode.SYNC, 0), bytes(6))
     for frame in (STATE, sync, STATE, sync):
@@ -80,9 +80,7 @@ def test_an_adapter_that_is_not_there_is_named() -> None:
 # Left out: those that are there without an adapter, and one that would connect to a network.
 @pytest.mark.parametrize("interface", sorted(can.VALID_INTERFACES - {"virtual", "udp_multicast"}))
 @pytest.mark.parametrize("data_bit_rate", [None, 5_000_000])
-def test_an_interface_whose_library_or_adapter_is_missing_is_an_error_with_the_way_out(
-    interface: str, data_bit_rate: int | None
-) -> None:
+def test_adapter_with_missing_library_or_device_explains_what_to_do(interface: str, data_bit_rate: int | None) -> None:
     """Each of python-can's interfaces fails in its own way, one of them by a NameError."""
     with pytest.raises(SnakesimError) as raised:
         open_bus(f"{interface}:/dev/none", 1_000_000, data_bit_rate)

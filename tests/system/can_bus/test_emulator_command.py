@@ -17,7 +17,7 @@ from snakesim_can_backend.protocol.definitions import CommandAction, Opcode, par
 from snakesim_hal.programs.commands import Command
 
 
-def test_every_module_is_there_and_answers_and_in_the_end_the_traffic_is_told(monkeypatch, capsys):
+def test_emulator_command_answers_for_every_module_and_reports_traffic(monkeypatch, capsys):
     for of_a_process in ("on_stop_signal", "tune_garbage_collector"):
         monkeypatch.setattr(program, of_a_process, lambda *_: None)
     channel = f"modules-{uuid.uuid4().hex[:8]}"

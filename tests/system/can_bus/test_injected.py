@@ -55,7 +55,7 @@ def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSe
         CanBackend.check(config(faults=[text]), settings)
 
 
-def test_everything_that_own_twins_and_a_virtual_bus_can_do_is_allowed() -> None:
+def test_injection_allows_everything_emulators_and_virtual_bus_support() -> None:
     texts = [f"{kind}:joint_1@1" for kind in (*FAULT_DESCRIPTIONS, "wrong", "nan")]
     texts += [f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")]
     assert CanBackend.check(config(faults=texts), CanSettings()) == ("lockstep", "realtime")

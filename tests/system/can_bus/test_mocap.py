@@ -80,7 +80,7 @@ def test_stamps_go_on_although_a_tick_is_late() -> None:
         assert third is not None and third.timestamp_ns == mocap.now_ns
 
 
-def test_what_was_captured_before_the_robots_time_began_is_no_pose() -> None:
+def test_mocap_captured_before_robot_start_is_no_pose() -> None:
     with receiver(delay_s=0.02) as mocap:
         for timestamp_ns, known in ((0, False), (10 * MS, False), (20 * MS, True)):
             send(mocap, mocap.at())
@@ -96,7 +96,7 @@ def bare(mocap: Mocap, x: float, late_ms: float = 0.0) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("late_ms", [0.0, 4.0, 9.0])
-def test_a_velocity_is_the_change_over_the_time_of_the_stamps_not_of_the_arrivals(late_ms: float) -> None:
+def test_mocap_velocity_uses_capture_times_not_arrival_times(late_ms: float) -> None:
     """0.5 m/s, whatever the network does to the datagrams meanwhile."""
     with receiver() as mocap:
         assert read(mocap, bare(mocap, 0.0)) is None, "one pose has no velocity"
@@ -112,7 +112,7 @@ def test_a_turn_gives_the_angular_velocity() -> None:
         assert pose is not None and pose.angular_velocity_w == pytest.approx((0.0, 0.0, 1.0), abs=1e-4)
 
 
-def test_after_a_gap_or_a_jump_of_its_clock_a_velocity_is_known_again_with_the_second_pose() -> None:
+def test_mocap_velocity_after_gap_is_known_with_second_pose() -> None:
     with receiver() as mocap:
         read(mocap, bare(mocap, 0.0))
         mocap.now_ns += 300 * MS

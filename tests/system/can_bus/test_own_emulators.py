@@ -118,7 +118,7 @@ def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("ending", ["sys.exit(2)", SERVE])
-def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
+def test_emulator_process_that_never_becomes_ready_is_reported_and_removed(
     ending: str, child: Child, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(own_emulators, "SERVICE_START_LIMIT_S", 5.0)
@@ -137,7 +137,7 @@ def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixtu
     assert "vcan77" in capsys.readouterr().err
 
 
-def test_a_child_that_ends_by_itself_is_noticed_even_when_its_log_is_gone(child: Child) -> None:
+def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
     child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     assert emulators.describe_exit() is None
@@ -147,7 +147,7 @@ def test_a_child_that_ends_by_itself_is_noticed_even_when_its_log_is_gone(child:
     emulators.stop()
 
 
-def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(child: Child, tmp_path: Path) -> None:
+def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_path: Path) -> None:
     heard = tmp_path / "heard"
     child.does(READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
@@ -164,9 +164,7 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(child: Child, tmp_path
             emulators.inject(Injection("leak", "joint_1"), begins=True)
 
 
-def test_a_child_that_cannot_be_started_is_an_error_of_the_backend(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_emulator_process_that_cannot_start_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no python"))
     with raises_error(BackendError, code="emulator/not-started"):
         EmulatorProcess(RUN, ON_VCAN, None, stepped=True)

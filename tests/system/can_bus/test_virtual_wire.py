@@ -60,7 +60,7 @@ def took_s(began: float) -> float:
     return time.monotonic() - began
 
 
-def test_two_ends_of_a_virtual_bus_hear_each_other_and_not_themselves(pair: tuple[VirtualWire, VirtualWire]) -> None:
+def test_virtual_bus_ends_receive_each_other_and_not_themselves(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, far = pair
     frames = [Frame(0x105, b"\x01\x02"), Frame(0x7FF, b""), Frame(0, bytes(8))]
     assert all(near.send(frame) for frame in frames)
@@ -111,7 +111,7 @@ def test_wait_says_when_nothing_can_come(pair: tuple[VirtualWire, VirtualWire]) 
     assert not wait([near], 5.0) and took_s(began) < 1.0
 
 
-def test_wait_wakes_up_for_a_socket_and_tells_one_that_is_gone() -> None:
+def test_virtual_bus_wait_wakes_for_socket_and_reports_closed_one() -> None:
     near, far = socket.socketpair()
     with far:
         wire = OnSocket(near)
@@ -126,7 +126,7 @@ def test_wait_wakes_up_for_a_socket_and_tells_one_that_is_gone() -> None:
         wire.close()
 
 
-def test_a_virtual_bus_that_is_gone_is_an_error_of_the_backend() -> None:
+def test_virtual_bus_that_is_gone_is_a_backend_error() -> None:
     wire = VirtualWire(f"gone-{uuid.uuid4().hex}")
     wire._bus.shutdown()
     with raises_error(BackendError, code="bus/io-failed"):

@@ -172,7 +172,7 @@ def test_frames_and_errors_come_in(rig: Rig) -> None:
     assert rig.wire.receive() == []
 
 
-def test_a_full_queue_is_told_and_nothing_is_kept_for_later(rig: Rig) -> None:
+def test_wire_full_queue_is_reported_and_nothing_kept(rig: Rig) -> None:
     sent = 0
     while rig.wire.send(Frame(0x101, bytes(8))):
         sent += 1
@@ -193,7 +193,7 @@ def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
 
 
 @pytest.mark.parametrize(("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")])
-def test_an_interface_that_goes_is_told_once_and_again_when_it_is_back(rig: Rig, number: int, word: str) -> None:
+def test_wire_lost_interface_is_reported_once_per_loss(rig: Rig, number: int, word: str) -> None:
     rig.socket.fails, rig.up = OSError(number, ""), False
     for _ in range(3):
         assert not rig.wire.send(Frame(0x101, b"")) and rig.wire.receive() == []
@@ -205,7 +205,7 @@ def test_an_interface_that_goes_is_told_once_and_again_when_it_is_back(rig: Rig,
     assert rig.kinds() == [] and rig.wire.send(Frame(0x101, b""))
 
 
-def test_a_frame_that_gets_out_says_that_the_interface_is_back(rig: Rig) -> None:
+def test_wire_sent_frame_proves_interface_is_back(rig: Rig) -> None:
     rig.socket.fails, rig.up = OSError(errno.ENETDOWN, ""), False
     rig.wire.receive()
     rig.socket.fails = None
@@ -279,9 +279,7 @@ def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> N
     check_interface("lo")
 
 
-def test_an_interface_that_is_not_there_or_going_away_is_not_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wire_absent_or_removed_interface_is_not_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not is_up("nocan7")
     (tmp_path / "flags").write_text("")
     monkeypatch.setattr(wire_module, "Path", lambda *parts: tmp_path / parts[-1])

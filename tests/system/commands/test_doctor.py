@@ -27,7 +27,7 @@ def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.C
     assert os.sched_getscheduler(0) == before
 
 
-def test_an_endpoint_that_is_not_zenoh_is_a_failure_within_seconds() -> None:
+def test_doctor_endpoint_without_zenoh_fails_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         (finding,) = check_routers(RobotSelection(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
     assert finding.state == "fail" and finding.fix
@@ -60,7 +60,7 @@ def test_what_makes_ticks_late_is_named_with_its_remedy(
     assert all(finding.fix for finding in found if finding.state == "warn")
 
 
-def test_a_serial_port_in_use_is_named_and_is_free_again_later(tmp_path: Path) -> None:
+def test_doctor_serial_port_in_use_is_named_then_free(tmp_path: Path) -> None:
     port = tmp_path / "dev" / "ttyUSB0"
     port.parent.mkdir()
     port.write_text("")

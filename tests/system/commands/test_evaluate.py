@@ -135,9 +135,9 @@ def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tup
 STOPPED = {
     "evaluate": (
         "workers, on this computer",
-        "cases are done; the same command goes on with\n  --resume --out stopped",
+        "cases are done; the same command continues with\n  --resume --out stopped",
     ),
-    "optimize": ("keeps all trials", "the same command goes on with\n  --storage stopped.db"),
+    "optimize": ("keeps all trials", "the same command continues with\n  --storage stopped.db"),
     "train": ("generation 1:", "stopped/policy.onnx is the best policy until then, .* goes on with --resume"),
 }
 TYPED = {
@@ -172,7 +172,7 @@ TYPED = {
 @pytest.mark.parametrize(
     "command", ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))]
 )
-def test_ctrl_c_ends_it_at_once_and_leaves_nothing_but_its_results(command: str, tmp_path: Path) -> None:
+def test_evaluate_interrupted_stops_at_once_and_keeps_only_results(command: str, tmp_path: Path) -> None:
     (tmp_path / "quick.toml").write_text(SUITE)
     (tmp_path / "tmp").mkdir()
     begun, kept = STOPPED[command]
@@ -284,7 +284,7 @@ def test_a_sweep_runs_every_value(home: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Path) -> None:
+def test_evaluate_search_resumes_and_prints_a_runnable_command(home: Path) -> None:
     given = [
         "study",
         "optimize",
@@ -312,7 +312,7 @@ def test_a_search_goes_on_where_it_ended_and_what_it_prints_can_be_run(home: Pat
 
 
 @pytest.mark.slow
-def test_a_search_on_a_row_of_a_suite_prints_an_evaluation(home: Path) -> None:
+def test_evaluate_search_on_a_suite_row_prints_an_evaluation(home: Path) -> None:
     given = [
         "study",
         "optimize",

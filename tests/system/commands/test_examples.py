@@ -8,7 +8,7 @@ from pathlib import Path
 REPOSITORY = Path(__file__).parents[3]
 
 
-def test_a_policy_is_tried_on_a_scene_that_its_search_never_saw() -> None:
+def test_example_policy_is_evaluated_on_an_unseen_scene() -> None:
     command = [sys.executable, "examples/held_out.py", "clutter", "98100", "1"]
     ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=110)
     assert ended.returncode == 0, ended.stderr

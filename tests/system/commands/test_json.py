@@ -63,7 +63,7 @@ def test_status_and_top_say_whether_something_real_moves(
             assert capsys.readouterr().out.startswith(f"worm: {said.strip()}")
 
 
-def test_a_joint_that_is_let_go_is_told_with_the_way_back(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_isolated_joint_is_reported_with_how_to_recover(capsys: pytest.CaptureFixture[str]) -> None:
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as session:
         lost = status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)

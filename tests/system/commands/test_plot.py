@@ -1,6 +1,7 @@
 """`snakesim recording plot`: figures of a run as vector graphics, of any signals and of the paper."""
 
 import xml.etree.ElementTree as ElementTree
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,8 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
-pytest.importorskip("matplotlib", reason="needs the extra `report`")
+# Found and not imported, which would take a second in each worker.
+pytestmark = pytest.mark.skipif(find_spec("matplotlib") is None, reason="needs the extra `report`")
 SVG = "{http://www.w3.org/2000/svg}"
 
 

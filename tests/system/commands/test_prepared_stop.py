@@ -94,7 +94,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
         made.stop.close()
 
 
-def test_it_stops_with_a_full_file_table_and_whatever_the_network_does(
+def test_prepared_stop_works_with_full_file_table_and_broken_network(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.stop.connect(Network())  # pyright: ignore[reportArgumentType]
@@ -109,7 +109,7 @@ def test_it_stops_with_a_full_file_table_and_whatever_the_network_does(
     assert bench.searched == 0 and bench.log[0] == ("anna", "worm: stopped: emergency stop (tcp/127.0.0.1:9)")
 
 
-def test_who_asks_during_a_stop_gets_one_that_begins_after_it(bench: Bench) -> None:
+def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> None:
     bench.go_on.clear()
     first = bench.stop.request("anna")
     wait_until(lambda: bench.asked, "the first stop", 5.0)
@@ -121,9 +121,7 @@ def test_who_asks_during_a_stop_gets_one_that_begins_after_it(bench: Bench) -> N
     assert len(bench.log) == 2 and bench.log[1][0].startswith("viewer 0, viewer 1, ")
 
 
-def test_a_robot_that_no_way_reaches_is_not_stopped_and_the_answer_says_why(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_prepared_stop_of_unreachable_robot_explains_the_failure(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.stop.connect(Network())  # pyright: ignore[reportArgumentType]
     bench.network_error = ValueError("no session")
 
@@ -138,7 +136,7 @@ def test_a_robot_that_no_way_reaches_is_not_stopped_and_the_answer_says_why(
     assert bench.stop.stop("anna").startswith("worm: stopped"), "the next one is taken"
 
 
-def test_ready_is_the_result_of_a_test_that_was_made_just_now(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepared_stop_ready_reflects_a_test_made_now(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prepared_stop, "TEST_EVERY_S", 0.02)
     assert bench.stop.readiness() == prepared_stop.StopReadiness(ready=True, text=WAITING)
     network = Network()

@@ -42,7 +42,7 @@ def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
     assert imported.index("snakesim_hal.network.stop_port") < imported.index("msgspec") < imported.index("zenoh")
 
 
-def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
+def test_stop_answer_without_matching_status_is_not_trusted() -> None:
     with running(run_config()) as run, following(run.link, Follower()):
         run.arm()
         with open_session(Link(run.link.endpoint, "lab/other")) as impostor:

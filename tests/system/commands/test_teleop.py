@@ -53,7 +53,7 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost.type(LEFT)
                 wait_until(lambda: (intents.drain() or [NOTHING])[-1].heading_w_rad is not None, "a direction")
-                lost.shows("asked: +0.10 m/s")
+                lost.shows("requested: +0.10 m/s")
                 lost.process.send_signal(signal.SIGKILL)
                 wait_until(lambda: way.is_at(0.0, "expired"), "navigation to stop", 5.0)
             with at_the_keyboard(run, tmp_path) as left:
@@ -96,12 +96,12 @@ def frozen(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def test_an_operator_is_told_what_a_clock_that_stands_waits_for(in_lockstep: Running, tmp_path: Path) -> None:
+def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: Running, tmp_path: Path) -> None:
     """By the robot's own account; it has not gone."""
     why, run = " waits for navigation's answer to tick ", in_lockstep
     with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
         operator.type(UP)
-        operator.shows("asked: +0.05 m/s")
+        operator.shows("requested: +0.05 m/s")
         states, found = session.reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
 
         def told() -> bool:
@@ -114,7 +114,7 @@ def test_an_operator_is_told_what_a_clock_that_stands_waits_for(in_lockstep: Run
         assert "PowerOff" not in {one.state for one in found}
 
 
-def test_an_operator_is_told_that_the_robot_says_nothing_any_more(in_lockstep: Running, tmp_path: Path) -> None:
+def test_teleop_says_that_robot_stopped_sending(in_lockstep: Running, tmp_path: Path) -> None:
     with at_the_keyboard(in_lockstep, tmp_path) as operator:
         operator.shows("armed: ")
         with frozen(in_lockstep.part("host")):

@@ -13,7 +13,7 @@ from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.monitoring.top import TrafficSnapshot, top
-from snakesim_operator.monitoring.traffic import KEPT, MAX_KEYS, Traffic
+from snakesim_operator.monitoring.traffic import MAX_ARRIVALS, MAX_KEYS, Traffic
 from snakesim_testing.hal.small_robots import clock, command, description, state
 from snakesim_testing.harness.endpoint import free_endpoint
 
@@ -35,17 +35,17 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     joints = lines[keys.JOINTS]
     assert (joints.robot, joints.writer) == ("lab/worm", "HAL")
     assert joints.rate_hz == pytest.approx(100.0) and joints.jitter_ms == pytest.approx(0.0, abs=1e-9)
-    assert joints.heard_ago_s == pytest.approx(0.01) and joints.age_ms == pytest.approx(20.0)
+    assert joints.received_ago_s == pytest.approx(0.01) and joints.age_ms == pytest.approx(20.0)
     (latency,) = traffic.latencies()
-    assert (latency.heard_median_ms, latency.heard_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
+    assert (latency.arrival_median_ms, latency.arrival_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
 
 
-def test_a_strangers_keys_are_named_and_bounded_and_cannot_harm_the_terminal() -> None:
+def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
     traffic = Traffic("worm")
     traffic.add(Arrival("sensor/joints", b"noise", format_encoding(JointState), 0))
     for i in range(MAX_KEYS + 10):
         traffic.add(Arrival(f"evil/{i}", b"x", "", i))
-    for i in range(2 * KEPT):
+    for i in range(2 * MAX_ARRIVALS):
         traffic.add(Arrival("evil/0", b"x", "", i * MS))
     lines = traffic.lines(MS)
     assert len(lines) == MAX_KEYS and traffic.keys_left_out == 11

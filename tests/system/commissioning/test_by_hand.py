@@ -96,7 +96,7 @@ def swapped(home: Path, endpoint: str) -> str:
     return said
 
 
-def test_an_armed_robot_a_shipped_file_and_an_unknown_joint_are_refused(home: Path) -> None:
+def test_by_hand_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) -> None:
     hold(home, [0.0] * JOINTS)
     before = (home / "snake.toml").read_bytes()
     with running(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:

@@ -24,7 +24,7 @@ def moves(home: Path, out: str, *words: str) -> bool:
 
 
 @pytest.mark.slow
-def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) -> None:
+def test_checked_robot_can_be_armed_until_file_or_drive_changes(home: Path) -> None:
     refused = run(home, "never", "--duration", "0.1")
     assert refused.code == 1 and "its joints have not been checked against its file" in refused.out
     assert moves(home, "word", "--unchecked")

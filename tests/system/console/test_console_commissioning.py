@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -33,7 +34,7 @@ def bench(tmp_path: Path) -> Path:
     return make_jogged_folder(tmp_path)
 
 
-def test_a_robot_that_nobody_checked_is_armed_by_the_page_by_an_explicit_word(home: Path) -> None:
+def test_console_arms_unchecked_robot_only_by_explicit_confirmation(home: Path) -> None:
     with running(home / "run", *RUN) as run:
         asyncio.run(asyncio.wait_for(arm_unchecked(run.console()), 2 * LIMIT_S))
 
@@ -67,19 +68,24 @@ def console(home: Path, endpoint: str) -> Iterator[str]:
 
 
 @pytest.mark.quiet
-def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench: Path) -> None:
+def test_console_sets_zeros_and_jogs_while_button_is_held(bench: Path) -> None:
     with host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
         asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
 
 
 async def commission(address: str, home: Path, endpoint: str) -> None:
-    host_name, _, port = address.removeprefix("http://").rpartition(":")
-    async with StallingRelay(host_name, int(port)) as relay, viewing(f"http://127.0.0.1:{relay.port}") as socket:
+    parts = urlsplit(address)
+    assert parts.hostname is not None and parts.port is not None
+    async with (
+        StallingRelay(parts.hostname, parts.port) as relay,
+        viewing(f"http://127.0.0.1:{relay.port}{parts.path}") as socket,
+    ):
         viewer = Viewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
         await until(lambda: viewer.shows("not checked: its joints have not been checked"), "the table")
         await until(lambda: viewer.shows("id 2"), "the table")
+        await until(lambda: viewer.has("Start step"), "the controls of the viewer")
         await viewer.click("Start step")  # of somebody who has no control
         await viewer.click("Take control")
         await until(lambda: viewer.has("Release control"), "control")

@@ -38,11 +38,11 @@ def cells(tab: Tab) -> dict[str, list[str]]:
     rows = tab.value(
         "[...document.querySelectorAll('tr')].map(row => [...row.cells].map(cell => cell.innerText.trim()))"
     )
-    return {row[0].removeprefix("■ "): row[1:5] for row in rows}
+    return {row[0].removeprefix("■\xa0"): row[1:5] for row in rows}
 
 
 @pytest.mark.slow
-def test_signals_are_searched_put_beside_each_other_pointed_at_and_saved(tmp_path: Path) -> None:
+def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: Path) -> None:
     simulate(load("triplet", [parse_set("duration_s=2")]).config, tmp_path / "run")
     record = RunRecord.load(tmp_path / "run")
     angle = record.angle_rad[:, 4]

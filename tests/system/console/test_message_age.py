@@ -54,9 +54,7 @@ class Link:
 
 @pytest.mark.parametrize(("down_stalls", "up_stalls"), [(True, True), (False, True), (True, False)])
 @pytest.mark.parametrize("stall_s", [1.0, 14.0, 30.0])
-def test_what_was_held_before_or_in_a_stall_is_too_old_after_it(
-    *, down_stalls: bool, up_stalls: bool, stall_s: float
-) -> None:
+def test_console_message_delayed_by_a_stall_is_too_old(*, down_stalls: bool, up_stalls: bool, stall_s: float) -> None:
     link, now_s = Link(), 0.0
     fresh: list[float] = []
     for _ in range(20):
@@ -95,7 +93,7 @@ def test_answers_that_nobody_asked_for_make_nothing_younger() -> None:
     assert not age.may_ask(), "a page that hangs"
 
 
-def test_what_may_move_a_robot_is_not_done_late_and_what_stops_it_is() -> None:
+def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
     done: list[str] = []
     late: list[float] = []
     with served_console(ReadyStop()) as (server, _):
@@ -139,7 +137,7 @@ def _update(handle: Any, value: object) -> dict[str, Any]:
     return {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
 
 
-def test_a_page_without_a_scene_is_a_viewer_and_may_stop() -> None:
+def test_console_page_without_scene_may_view_and_stop() -> None:
     stopped: list[int] = []
     with served_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")

@@ -25,7 +25,7 @@ from snakesim_testing.operator.served_console import fronted, served_console
 from snakesim_testing.operator.viewer import watch
 
 
-def test_a_page_is_of_the_same_host_and_port_or_refused():
+def test_page_request_from_other_host_or_port_is_refused():
     for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):  # a tunnel has another port
         assert explain_refusal(host, f"http://{host}") is None and explain_refusal(host, None) is None
         assert (
@@ -38,7 +38,7 @@ def test_a_page_is_of_the_same_host_and_port_or_refused():
     assert explain_refusal("localhost:8080", "https://mine.example", also=["https://mine.example"]) is None
 
 
-def test_a_port_that_is_taken_is_an_error_and_no_other_port():
+def test_page_port_in_use_is_an_error_without_fallback():
     with open_port(None) as first, raises_error(NotConnectedError, code="network/port-in-use"):
         open_port(first.getsockname()[1])
 
@@ -85,13 +85,13 @@ def test_text_from_the_network_is_no_markup():
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
 
 
-def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
+def test_page_says_that_simulator_is_paused_and_by_whom():
     shown = page_html.format_header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
     assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
     assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=description(), status=status()))
 
 
-def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
+def test_page_draws_an_expected_robot_at_its_start():
     config = load("triplet").config
     snapshot = make_expected_snapshot(config)
     drawing = draw(snapshot, None)

@@ -11,7 +11,7 @@ from snakesim_testing.operator.drawn_samples import contact, joints, pushing, wo
 from snakesim_testing.operator.served_console import served_console
 
 
-def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
+def test_scene_force_without_contact_is_dashed_until_contact():
     point = contact((0.0, 10.0, 0.0))
     control = pushing([point], [10.0])
     with served_console() as (server, _):
@@ -29,7 +29,7 @@ def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
         assert len(ends) == 10 and ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
 
 
-def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
+def test_scene_perceived_shapes_are_drawn_until_forgotten():
     found = [
         Obstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True),
         Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),

@@ -39,7 +39,7 @@ def test_every_entry_of_an_archive_is_aligned() -> None:
         assert int(entry[54:62], 16) == length  # the size, seventh of the eight-digit fields after the magic
 
 
-def test_a_module_comes_after_what_it_depends_on_and_what_is_built_in_is_not_loaded() -> None:
+def test_vm_modules_are_ordered_by_dependency_without_builtin_ones() -> None:
     order = kernel.load_order(["can_raw", "virtio_net", "kvaser_pci", "vcan"], KERNEL)
     assert order == ["can", "can_raw", "sja1000", "can_dev", "kvaser_pci", "vcan"]
 
@@ -115,7 +115,7 @@ def test_the_host_is_read_only_but_for_the_given_folders(monkeypatch: pytest.Mon
     assert "accel kvm" in qemu(REQUEST, monkeypatch, kvm=True)
 
 
-def test_the_guest_has_no_network_unless_a_port_is_forwarded_on_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vm_guest_has_network_only_for_forwarded_loopback_ports(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "-netdev" not in qemu(REQUEST, monkeypatch)
     line = qemu(machine.Request([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
     assert "restrict=on,hostfwd=tcp:127.0.0.1:17447-:7447" in line
@@ -135,9 +135,7 @@ def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
         *((with_vcan.names, text) for text in ("", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen")),
     ],
 )
-def test_a_forward_that_is_not_two_ports_and_a_channel_that_is_no_name_are_refused(
-    parse: Callable[[str], object], text: str
-) -> None:
+def test_vm_invalid_port_forward_and_channel_name_are_refused(parse: Callable[[str], object], text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError):
         parse(text)
 

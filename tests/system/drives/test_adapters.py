@@ -59,7 +59,7 @@ def completes(machine: Machine, folder: Path, *arguments: str, backend: str = "c
 
 
 @pytest.mark.quiet
-def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: Machine, tmp_path: Path) -> None:
+def test_external_modules_are_detected_and_driven_in_real_time(machine: Machine, tmp_path: Path) -> None:
     with drives(machine, tmp_path, "modules", "can"):
         found = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
         assert found.count(CHANNEL) == 13, found
@@ -71,7 +71,7 @@ def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: M
     ("driver_type", "command", "of"),
     [pytest.param("odrive", "odrive", "axes", marks=pytest.mark.slow), ("moteus", "moteus", "controllers")],
 )
-def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_says_they_are_mounted(
+def test_external_drives_are_driven_as_mounted_in_robot_file(
     machine: Machine, tmp_path: Path, driver_type: str, command: str, of: str
 ) -> None:
     """ODrives on classic CAN; moteus on CAN FD, with ids of 29 bits."""
@@ -84,9 +84,7 @@ def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_say
 
 
 @pytest.mark.slow
-def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpreter(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_external_modules_stop_when_controller_holds_the_interpreter(machine: Machine, tmp_path: Path) -> None:
     """Beside the driver compiled code without end stops the host: what is left is the modules' own watchdog."""
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
     with drives(machine, tmp_path, "modules", "can"):

@@ -92,7 +92,7 @@ def opened() -> Iterator[Opens]:
         robot.backend.close()
 
 
-def test_joints_of_two_families_move_as_one_robot_and_say_who_they_are(opened: Opens) -> None:
+def test_mixed_drive_families_move_as_one_robot(opened: Opens) -> None:
     robot = opened()
     described = robot.backend.describe()
     assert [joint.serial[:4] for joint in described.joints] == ["3855", "3855", "", ""] and described.emulated
@@ -106,7 +106,7 @@ def test_joints_of_two_families_move_as_one_robot_and_say_who_they_are(opened: O
     assert robot.axes_follow() == robot.servos_follow() == {False}
 
 
-def test_a_failed_reading_leaves_the_last_value_with_its_age_and_does_not_touch_another_bus(opened: Opens) -> None:
+def test_bus_failed_reading_keeps_last_value_and_other_buses(opened: Opens) -> None:
     robot = opened()
     robot.run(20, "armed")
     before = robot.angles(SERVOS)
@@ -122,7 +122,7 @@ def test_a_failed_reading_leaves_the_last_value_with_its_age_and_does_not_touch_
     assert robot.joints.valid == [True, True, False, False] and robot.angles(SERVOS) == before
 
 
-def test_a_fault_of_a_drive_is_injected_and_reported_by_its_number_in_the_robot(opened: Opens) -> None:
+def test_bus_drive_fault_is_injected_and_reported_by_joint_number(opened: Opens) -> None:
     robot = opened()
     robot.run(20, "armed")
     robot.go_wrong("overheat:joint_4@0-9")
@@ -131,7 +131,7 @@ def test_a_fault_of_a_drive_is_injected_and_reported_by_its_number_in_the_robot(
         robot.go_wrong("cut:bus_3@0")
 
 
-def test_a_bus_of_half_the_rate_is_asked_and_told_every_second_tick_and_stops_at_once(opened: Opens) -> None:
+def test_bus_at_half_rate_is_polled_every_second_tick(opened: Opens) -> None:
     robot = opened(dynamixel={"decimation": 2})
     assert robot.backend.describe().sensors[0].delay_s == 0.01, "so old may a joint state be by itself"
     ages: list[list[float]] = []
@@ -160,7 +160,7 @@ class Held:
         robot.servos.read = wait_and_read
 
 
-def test_a_bus_that_blocks_grows_old_alone_and_a_stop_reaches_the_others(opened: Opens) -> None:
+def test_bus_that_blocks_ages_alone_while_others_stop(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     held = Held(robot)
     for _ in range(10):
@@ -186,7 +186,7 @@ def test_a_bus_that_blocks_grows_old_alone_and_a_stop_reaches_the_others(opened:
     wait_until(lambda: robot.run(1, "disarmed") == [] and max(robot.ages_ms(SERVOS)) < ages[-1], "news", 10.0)
 
 
-def test_a_bus_that_takes_20_ms_a_reading_is_not_waited_for_and_reads_at_its_own_rate(opened: Opens) -> None:
+def test_bus_with_slow_readings_does_not_delay_ticks(opened: Opens) -> None:
     robot = opened("realtime")
     read, readings = robot.servos.read, [0]
 
@@ -204,7 +204,7 @@ def test_a_bus_that_takes_20_ms_a_reading_is_not_waited_for_and_reads_at_its_own
     assert readings[0] > 5 and max(robot.ages_ms(SERVOS)) > 0
 
 
-def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(opened: Opens) -> None:
+def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     wait_until(
         lambda: (robot.run(1, "armed") and False) or robot.axes_follow() == robot.servos_follow() == {True}, "arms"
@@ -223,7 +223,7 @@ def test_a_bus_without_fresh_set_points_lets_its_drives_go_within_the_lease(open
 
 
 @pytest.mark.parametrize("body", ["odrive", "moteus"])
-def test_drives_that_stop_while_the_driver_is_frozen_are_read_first_and_stay_off(opened: Opens, body: str) -> None:
+def test_drives_that_stop_while_driver_is_frozen_stay_off(opened: Opens, body: str) -> None:
     """Without a look at them the bus would let its drives go, which clears what their watchdogs have latched."""
     robot = opened("realtime", body, **{body: {"watchdog_s": SHORT_S}, "dynamixel": {"watchdog_s": SHORT_S}})
     robot.arm()
@@ -242,7 +242,7 @@ def test_drives_that_stop_while_the_driver_is_frozen_are_read_first_and_stay_off
     robot.arm()
 
 
-def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened: Opens) -> None:
+def test_bus_thread_error_ends_run_and_disables_all_drives(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     wait_until(lambda: (robot.run(1, "armed") and False) or robot.servos_follow() == {True}, "arms")
     robot.axes.wire._bus.shutdown()
@@ -269,7 +269,7 @@ def test_what_goes_wrong_in_a_thread_ends_the_run_and_lets_all_drives_go(opened:
         {"robot__joints": {"joint_3": {"driver": "dynamixel", "id": 253}}},
     ],
 )
-def test_what_is_no_mixed_robot_is_refused_by_joint_family_and_section(changes: dict[str, Any]) -> None:
+def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any]) -> None:
     fixed: dict[str, Any] = {"robot__drive": HEAD[0], "robot__joints": HEAD[1]}
     config = run_config(**{"backend": "mixed", "robot__chain__modules": 4, "rate_hz": 100, **fixed, **changes})
     with raises_error(

@@ -26,7 +26,7 @@ def why(home: Path, endpoint: str) -> str:
     return snakesim("status", "--endpoint", endpoint, cwd=home).out
 
 
-def test_a_turn_that_a_drive_has_forgotten_is_not_wound_again(tmp_path: Path) -> None:
+def test_cable_turn_forgotten_by_its_drive_is_not_repeated(tmp_path: Path) -> None:
     held = text_of_the_example().replace("emulated=True", "emulated=False") + HELD
     with (lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": held}) / "snake.toml").open("a") as file:
         file.write(ENDLESS)

@@ -16,7 +16,7 @@ def over_can(*sets: str) -> Result:
 
 
 @pytest.mark.slow
-def test_it_goes_on_without_a_joint_that_was_lost_on_the_way() -> None:
+def test_clutter_run_over_can_continues_without_lost_joint() -> None:
     reported = over_can("duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
     assert reported.summary.ended == "complete" and list(reported.record.host.isolated) == ["joint_7"]
     advance = Advance.of(reported.record)

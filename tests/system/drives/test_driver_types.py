@@ -14,7 +14,7 @@ LINE = re.compile(
 
 
 @pytest.mark.slow  # each driver type alone is in tests/contract, several at once in test_mounted_drives.py
-def test_a_controller_gets_as_far_on_every_family_by_the_same_joints() -> None:
+def test_controller_advances_equally_on_every_drive_family() -> None:
     ended = subprocess.run([sys.executable, str(SCRIPT), "2"], capture_output=True, text=True, check=False, timeout=110)
     assert ended.returncode == 0, ended.stderr
     rows = [match.groups() for line in ended.stdout.splitlines() if (match := LINE.match(line))]

@@ -12,7 +12,7 @@ EVERY_SECOND = [f"joint_{i}" for i in range(2, 14, 2)]
 MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5.zero_rad=-0.2"]
 
 
-def ran(*sets: str, backend: str = "can", duration_s: float = 2.0) -> RunSummary:
+def ran(*sets: str, backend: str = "can", duration_s: float = 1.2) -> RunSummary:
     fixed = (f"backend={backend}", f"duration_s={duration_s}")
     return simulate(load("peg_row", [parse_set(text) for text in (*fixed, *sets)]).config).summary
 
@@ -31,9 +31,7 @@ def plain() -> RunSummary:
         ("dynamixel", []),
     ],  # a servo that forgets its turns has no room for the gear
 )
-def test_drives_of_a_family_reversed_and_off_zero_move_as_others_where_the_file_says_so_and_only_there(
-    backend: str, others: list[str]
-) -> None:
+def test_drives_mounted_reversed_move_the_robot_equally(backend: str, others: list[str]) -> None:
     run = partial(ran, backend=backend, duration_s=1.0)
     nominal = run()
     built = (*(f"{joint}.sign=-1" for joint in EVERY_SECOND), "joint_5.zero_rad=0.4", *others)
@@ -60,7 +58,7 @@ def test_every_second_module_reversed_and_declared_is_the_same_run(plain: RunSum
     assert believed.command_digest == undeclared.command_digest, "the wrong word is as bad as none"
 
 
-def test_zero_and_gear_change_a_run_by_no_more_than_quantisation(plain: RunSummary) -> None:
+def test_drives_with_zero_and_gear_change_only_quantization(plain: RunSummary) -> None:
     mixed = ran(*(f"robot.joints.{text}" for text in MIXED))
     assert mixed.path_distance_m == pytest.approx(plain.path_distance_m, rel=0.05)
     assert mixed.command_digest != plain.command_digest, "angles behind a gear are rounded otherwise"

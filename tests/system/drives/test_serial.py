@@ -56,7 +56,7 @@ def run(folder: Path, pose: str, *arguments: str) -> Ended:
     return snakesim(*hold, "--endpoint", free_endpoint(), *arguments, cwd=folder)
 
 
-def test_servos_of_another_program_are_found_and_driven_in_real_time(pose: str, folder: Path) -> None:
+def test_external_servos_are_detected_and_driven_in_real_time(pose: str, folder: Path) -> None:
     found = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
     assert found.code == 0 and found.out.count("XM540-W270 (1120)") == 13, found.said
     ended = run(folder, pose, "--duration", "2")
@@ -65,7 +65,7 @@ def test_servos_of_another_program_are_found_and_driven_in_real_time(pose: str, 
     assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, "current-based position is kept"
 
 
-def test_servos_that_stop_while_the_host_is_frozen_are_reported_and_stay_off(pose: str, folder: Path) -> None:
+def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path) -> None:
     """The host's process gets SIGSTOP for 1 s; the clause for every drive type is in the contract suite."""
     frozen = ("--fault", "freeze:host@0.5-1.5", "--duration", "5", "--set", "backend.log=bytes.log")
     ended = run(folder, pose, *frozen, "--out", str(folder / "frozen"))

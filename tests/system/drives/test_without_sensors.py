@@ -18,15 +18,15 @@ BARE = [*SHORT, "--unset", "robot.sensors.imu"]  # and these servos have no cont
 
 
 @pytest.mark.slow
-def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is_estimated(tmp_path: Path) -> None:
+def test_drives_without_force_sensors_and_mocap_run_on_estimates(tmp_path: Path) -> None:
     watched = [*BARE, "--set", "mission.localization=dead_reckoning", "--out", "watched"]
     blind = [*BARE, "--unset", "robot.sensors.pose", "--out", "blind"]
     ended = {name: snakesim("run", *words, cwd=tmp_path) for name, words in (("watched", watched), ("blind", blind))}
     said = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ended}
     assert all(one.code == 0 for one in ended.values()), ended["blind"].out + ended["blind"].err
     assert said["watched"]["command_digest"] == said["blind"]["command_digest"], "guidance has looked at the pose"
-    assert said["watched"]["path_distance_m"] > 0.1 and said["watched"]["reckoned_off_m"] < 0.1
-    assert said["blind"]["path_distance_m"] is None and said["blind"]["reckoned_distance_m"] > 0.1
+    assert said["watched"]["path_distance_m"] > 0.1 and said["watched"]["dead_reckoning_error_m"] < 0.1
+    assert said["blind"]["path_distance_m"] is None and said["blind"]["dead_reckoned_distance_m"] > 0.1
     assert (said["blind"]["pose_from"], said["blind"]["contacts_from"]) == ("dead_reckoning", "joint_torques")
     assert said["blind"]["peak_contact_force_n"] is None, "nobody has measured a force"
     for text in (ended["blind"].out, (tmp_path / "blind" / REPORT).read_text()):

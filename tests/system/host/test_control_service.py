@@ -77,7 +77,7 @@ def test_a_command_names_the_joint_state_that_it_answers() -> None:
         assert len(named - felt) <= 2  # at the ends of what was heard
 
 
-def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_leaves_grows_old() -> None:
+def test_control_without_streams_withholds_them_until_they_return() -> None:
     limits = {"pose_s": 0.3, "trajectory_s": 0.5}
     with stage(max_age=limits) as made:
         made.run.arm()
@@ -103,7 +103,7 @@ def test_streams_that_stop_are_withheld_named_and_given_again_and_what_guidance_
         assert made.run.status.lifecycle == "armed"
 
 
-def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why() -> None:
+def test_control_after_intent_expired_rests_and_says_why() -> None:
     with stage() as made:
         clocks, operator = made.run.session.reader(keys.CLOCK, Clock), made.run.session
         intents = operator.publisher(keys.INTENT, Intent)
@@ -126,7 +126,7 @@ def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why() -> 
         wait_until(lambda: speed(made) == 0.2, "a new intent")
 
 
-def test_an_update_that_outlasts_the_lease_is_reported_after_the_stop() -> None:
+def test_control_update_longer_than_lease_is_reported_after_stop() -> None:
     def slow(self: Showing, observation: Observation) -> ControllerCommand:
         time.sleep(0.3)
         return ControllerCommand(positions(self.robot, observation.joints.angle_rad))

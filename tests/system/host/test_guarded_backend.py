@@ -25,9 +25,7 @@ from snakesim_testing.harness.wait import wait_until
         (OSError(19, "No such device"), "LagBackend.{} failed: OSError: [Errno 19] No such device"),
     ],
 )
-def test_an_error_anywhere_is_a_latched_fault_and_the_joints_are_told_to_be_safe(
-    where: str, error: Exception, cause: str
-) -> None:
+def test_backend_error_is_latched_and_joints_are_made_safe(where: str, error: Exception, cause: str) -> None:
     with commanded(run_config()) as (run, _):
         run.backend.fails_in, run.backend.fails_with = where, error
         wait_until(run.ended, "the end of the host")
@@ -66,7 +64,7 @@ class Wrong(LagBackend):
         (keys.JOINTS, {"angle_rad": np.zeros(3)}, "JointState.angle_rad is array([0., 0., 0.]), must be plain Python"),
     ],
 )
-def test_a_sample_that_no_reader_would_accept_is_a_latched_fault_that_names_it(
+def test_backend_sample_out_of_bounds_is_a_named_latched_fault(
     clock_mode: ClockMode, key: str, sample: Any, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("snakesim_testing.hal.local_network.LagBackend", Wrong)

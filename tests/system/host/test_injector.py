@@ -27,7 +27,7 @@ def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
 
 
 @pytest.mark.quiet  # a lease of 50 ms
-def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_what_cannot_be_is_refused_with_the_reason() -> None:
+def test_injected_fault_lasts_until_ended_and_impossible_one_is_refused() -> None:
     with commanded(run_config(**ALLOWED)) as (run, _):
         for asked, refusal, words in (
             (FaultRequest(kind="mote", target="joint_1"), "cannot", "knows no 'mote'"),
@@ -67,7 +67,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 
 
 @pytest.mark.quiet  # a lease of 50 ms
-def test_what_was_planned_and_cannot_be_done_is_told_as_a_fault_of_the_run() -> None:
+def test_injected_plan_that_fails_is_a_fault_of_the_run() -> None:
     with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.faults_since_start
         wait_until(lambda: any(fault.what == "injection_refused" for fault in told.kept), "a word about it")
@@ -108,7 +108,7 @@ def turn(injector: Injector, tick: int, arm_session: int) -> None:
     injector.update(tick * 10_000_000, arm_session, "armed" if arm_session else "disarmed")
 
 
-def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> None:
+def test_injected_plan_is_not_repeated_for_restarted_service() -> None:
     config = run_config(faults=["drop:actuator/joints@0.1"], allow_fault_injection=True)
     with meeting("worm") as (session,):
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
@@ -120,7 +120,7 @@ def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> No
             injector.close()
 
 
-def test_a_newer_fault_of_a_kind_takes_the_place_of_the_one_before() -> None:
+def test_injected_newer_fault_replaces_one_of_its_kind() -> None:
     config = run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
     notes: list[str] = []
     with meeting("worm") as (session,):
@@ -138,7 +138,7 @@ def test_a_newer_fault_of_a_kind_takes_the_place_of_the_one_before() -> None:
 # --- on the wire ---------------------------------------------------------------------------------------------
 
 
-def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_needed() -> None:
+def test_injected_delay_ends_with_its_sending_thread() -> None:
     with meeting(None, None) as (here, there):
         arrived: list[float] = []
         there.on_arrival(keys.CLOCK, lambda arrival: arrived.append(arrival.monotonic_ns * 1e-9))
@@ -161,7 +161,7 @@ def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_ne
         faults.close()
 
 
-def test_a_publisher_that_is_declared_later_is_disturbed_too_and_a_flood_ends_with_the_faults() -> None:
+def test_injected_disturbance_covers_later_publishers_and_flood_ends() -> None:
     with meeting(None, None) as (here, there):
         arrived: list[bytes] = []
         there.on_arrival(keys.JOINTS, lambda arrival: arrived.append(arrival.payload))

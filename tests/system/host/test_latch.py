@@ -95,7 +95,7 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
     assert answers.empty()  # once each
 
 
-def test_a_host_on_a_disk_that_hangs_stops_at_once_answers_and_ends(tmp_path: Path, hanging: Event) -> None:
+def test_latch_on_hanging_disk_stops_at_once_and_ends(tmp_path: Path, hanging: Event) -> None:
     with running(run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
         began = time.monotonic()
         answer = run.ask(keys.ESTOP, EstopRequest(requester="anna"))

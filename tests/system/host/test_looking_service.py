@@ -45,7 +45,7 @@ def images_of(config: RunConfig) -> list[DepthImage]:
 
 
 @pytest.mark.slow
-def test_a_robot_on_can_sees_what_the_simulated_robot_sees_from_the_same_place() -> None:
+def test_looking_service_on_can_sees_what_simulator_sees() -> None:
     can = images_of(config_of("backend=can"))
     assert [image.tick for image in can] == list(range(0, 40, 5))[: len(can)] and len(can) >= 7
     simulated = Run(config_of())
@@ -75,7 +75,7 @@ def recording(path, images) -> str:
     return str(path)
 
 
-def test_a_recording_is_played_again_with_the_times_of_this_run(tmp_path) -> None:
+def test_looking_service_replays_recording_with_times_of_this_run(tmp_path) -> None:
     recorded = images_of(config_of("backend=can"))
     file = recording(tmp_path / "head.jsonl", recorded[2:5])
     played = images_of(

@@ -68,7 +68,7 @@ def remembered(memory: int) -> Numbers:
     return msgspec.json.decode(os.pread(memory, 2**20, 0), type=Numbers)
 
 
-def test_rows_and_numbers_are_on_disk_within_a_second_and_all_of_them_at_the_end(tmp_path: Path, memory: int) -> None:
+def test_recorder_writes_rows_within_a_second_and_all_at_end(tmp_path: Path, memory: int) -> None:
     box = BlackBox(ROBOT)
     with recorder(box, tmp_path, memory):
         fill(box, *range(40))
@@ -84,7 +84,7 @@ def test_rows_and_numbers_are_on_disk_within_a_second_and_all_of_them_at_the_end
     assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
 
 
-def test_a_host_that_is_started_again_leaves_the_record_of_the_one_before(tmp_path: Path) -> None:
+def test_recorder_of_restarted_host_keeps_the_earlier_record(tmp_path: Path) -> None:
     for first in (0, 100, 200):
         box = BlackBox(ROBOT)
         with recorder(box, tmp_path):
@@ -120,7 +120,7 @@ def disk(monkeypatch: pytest.MonkeyPatch, memory: int) -> Disk:
     return Disk(monkeypatch, memory)
 
 
-def test_what_a_full_disk_did_not_take_is_written_when_there_is_room_again(
+def test_recorder_writes_what_full_disk_refused_when_space_returns(
     tmp_path: Path, memory: int, disk: Disk, capfd: pytest.CaptureFixture[str]
 ) -> None:
     box = BlackBox(ROBOT)
@@ -136,7 +136,7 @@ def test_what_a_full_disk_did_not_take_is_written_when_there_is_room_again(
     assert capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"  # once
 
 
-def test_what_is_never_written_is_counted_and_seen_in_the_ticks(tmp_path: Path, memory: int, disk: Disk) -> None:
+def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(tmp_path: Path, memory: int, disk: Disk) -> None:
     box = BlackBox(ROBOT, memory_bytes=10 * ROW)
     begins = len(box.layout.header())
     disk.space = begins + 3 * ROW
@@ -151,7 +151,7 @@ def test_what_is_never_written_is_counted_and_seen_in_the_ticks(tmp_path: Path, 
     assert last.lost_ticks == 18 + 4 and last.failure == f"{tmp_path}: No space left on device"
 
 
-def test_a_folder_that_cannot_be_written_to_leaves_no_empty_file(tmp_path: Path, memory: int) -> None:
+def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memory: int) -> None:
     box = BlackBox(ROBOT)
     with recorder(box, tmp_path / "gone", memory):
         fill(box, 1, 2)
@@ -160,7 +160,7 @@ def test_a_folder_that_cannot_be_written_to_leaves_no_empty_file(tmp_path: Path,
     assert last.lost_ticks == 2 and "No such file" in last.failure
 
 
-def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
+def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(under_test, "CLOSE_LIMIT_S", 0.3)

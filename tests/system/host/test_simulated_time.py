@@ -49,7 +49,7 @@ def test_nothing_expires_in_a_pause_and_steps_are_exact(clock_mode: ClockMode) -
         assert "step by 'ada', done" in run.host.requests[-2]
 
 
-def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
+def test_pause_controller_death_stops_the_robot_afterwards() -> None:
     """The lease counts robot time: it is as long after a pause as it was before."""
     with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, control):
         ask(run, "pause")
@@ -60,7 +60,7 @@ def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
         assert {fault.what for fault in run.host.authority.faults} == {"lease_expired"}
 
 
-def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None:
+def test_pause_emergency_stop_is_immediate_and_outlasts_it() -> None:
     with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, _):
         ask(run, "pause")
         tick = stands_at(run)
@@ -72,7 +72,7 @@ def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None
         assert run.status.lifecycle == "estop" and not run.lifecycle("arm").ok
 
 
-def test_speed_scales_real_time_and_a_reset_ends_the_host_disarmed() -> None:
+def test_simulated_speed_scales_real_time_and_reset_ends_disarmed() -> None:
     with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, _):
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")

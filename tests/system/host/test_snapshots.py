@@ -58,7 +58,7 @@ def arrivals(run, ticks):
 
 
 @pytest.mark.parametrize(("delay_s", "ticks"), [(0.0, 1), (0.01, 1), (0.03, 3), (0.12, 12)])
-def test_an_image_shows_what_was_there_and_arrives_after_the_delay_but_never_at_once(delay_s, ticks):
+def test_snapshot_shows_past_scene_and_arrives_after_delay(delay_s, ticks):
     run = run_with({"delay_s": delay_s})
     run.sim.data.qvel[0] = 1.0  # slides towards the wall on ice, by 1 cm a tick
     before_m = 3.75 - (float(run.sim.data.qpos[0]) + 13 * 0.11 + 0.04)
@@ -88,7 +88,7 @@ def bytes_of_a_run(robot, seed=3):
     return reported
 
 
-def test_the_same_seed_gives_the_same_images_and_a_camera_changes_nothing_else():
+def test_snapshot_depends_only_on_seed_and_changes_nothing_else():
     first, again, other = (bytes_of_a_run("planar13_camera", seed) for seed in (3, 3, 4))
     assert first == again
     image = first.pop(HEAD)
@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_images_and_a_camera_changes_nothing_else()
     assert first == bytes_of_a_run("planar13")
 
 
-def test_a_robot_that_does_not_look_around_has_no_thread_for_it():
+def test_snapshot_thread_is_absent_without_cameras():
     def looking():
         return [thread.name for thread in threading.enumerate() if thread.name.startswith("sensors")]
 
@@ -116,7 +116,7 @@ def slow(tmp_path, sleep_s, name="Slow"):
     return {"model": f"{path}:{name}"}
 
 
-def test_in_real_time_late_images_are_dropped_which_is_told_ever_more_rarely_and_stops_nothing(tmp_path):
+def test_snapshot_late_in_real_time_is_dropped_and_reported_rarely(tmp_path):
     run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, clock_mode="realtime")
     reported = []
     for _ in range(40):
@@ -149,7 +149,7 @@ def test_a_model_that_breaks_is_an_error_of_the_backend(tmp_path):
         {"settings": {"gain": 2}},
     ],
 )
-def test_a_model_that_cannot_be_is_refused_before_anything_is_opened(camera):
+def test_snapshot_impossible_model_is_refused_before_opening_anything(camera):
     config = make_config({"sensors": {"depth": [{**CAMERA, **camera}]}})
     with raises_error(ConfigError, code=("config/unknown-key", "plugin/not-found", "plugin/not-loadable")):
         SimBackend.check(config, SimSettings())

@@ -74,7 +74,7 @@ def test_containers_run_what_the_units_run(rendered: Path) -> None:
         assert ours == sorted(shlex.split(command[1]) for command in commands if command is not None)
 
 
-def test_what_is_no_longer_in_the_lab_is_removed_and_what_is_not_ours_stays(tmp_path: Path) -> None:
+def test_lab_files_of_removed_roles_are_deleted_others_kept(tmp_path: Path) -> None:
     lab = tmp_path / "lab.toml"
     lab.write_text(EXAMPLE.read_text())
     assert main(["lab", "render", str(lab), "--out", str(tmp_path)]) == 0

@@ -73,7 +73,7 @@ def until(lab: Lab, words: str, *arguments: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
-def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_path: Path, backend: str) -> None:
+def test_lockstep_across_four_machines_has_digest_of_one(tmp_path: Path, backend: str) -> None:
     """With `can` the joints are emulated modules, on a bus in the host's memory.
 
     Even while somebody with a viewer's certificate repeats, commands and answers whatever they can.

@@ -87,7 +87,7 @@ def test_who_was_taken_out_of_the_lab_file_is_nobody(lab: SmallLab, tmp_path: Pa
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
-def test_a_peer_or_a_router_has_the_rights_of_its_certificate(lab: SmallLab, mode: str) -> None:
+def test_intruder_peer_or_router_has_rights_of_its_certificate(lab: SmallLab, mode: str) -> None:
     assert passed(lab, lab.settings(lab.who(Role.VIEWER, OWN), mode=mode), "command") == []
     assert passed(lab, lab.settings(lab.who(Role.GNC, OWN), mode=mode), "command") == ["command"]
 
@@ -139,7 +139,7 @@ def test_a_role_cannot_pose_as_the_router(lab: SmallLab) -> None:
         lab.session(gnc, connect={"endpoints": [endpoint], "timeout_ms": 400}).close()
 
 
-def test_the_routers_log_tells_who_came_and_what_was_refused_and_nothing_else(lab: SmallLab) -> None:
+def test_router_log_states_only_who_joined_and_what_was_refused(lab: SmallLab) -> None:
     """Once a line, however often it happens; what nobody asked for is not in it."""
     who = lab.who(Role.ADMINISTRATOR, OTHER)
     with lab.session(who) as session:
@@ -196,7 +196,7 @@ def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
             onward.sendall(piece)
 
 
-def test_a_renewed_certificate_goes_on_and_one_that_ends_is_out(lab: SmallLab, tmp_path: Path) -> None:
+def test_renewed_certificate_continues_and_expired_one_is_excluded(lab: SmallLab, tmp_path: Path) -> None:
     """A session with a short certificate connects again by itself when it is renewed on the disk; otherwise it ends."""
     own, life = make_authority(lab.folder / "authority", lab.lab), timedelta(seconds=2)
     heard: dict[str, list[float]] = {"renewed": [], "ended": []}

@@ -132,7 +132,7 @@ def test_who_has_all_robots_addresses_them_at_once(lab: SmallLab) -> None:
         assert found == {f"{OWN}/alive/hal", f"{OTHER}/alive/hal"}
 
 
-def test_only_an_administrator_reads_the_routers_own_state_and_nobody_changes_it(lab: SmallLab) -> None:
+def test_router_state_is_read_by_administrator_and_changed_by_nobody(lab: SmallLab) -> None:
     """The admin space of Zenoh names every session and address."""
     for role in Role:
         with lab.session(lab.who(role, OWN)) as session:

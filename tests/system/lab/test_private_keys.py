@@ -47,9 +47,7 @@ def test_an_authority_that_everybody_may_read_signs_nothing(tmp_path: Path, caps
     assert certs(tmp_path, "--rotate") == 0
 
 
-def test_a_session_names_a_key_that_everybody_may_read_and_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_private_key_readable_by_all_is_named_in_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key = tmp_path / "viewer.key"
     key.touch(0o600)
     path = tmp_path / "session.json5"

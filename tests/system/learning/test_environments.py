@@ -114,7 +114,7 @@ def test_a_residual_of_nothing_is_the_shipped_controller(tmp_path) -> None:
     assert something["digest"] != nothing["digest"]
 
 
-def test_one_seed_and_the_same_actions_give_one_digest_and_another_seed_another_field() -> None:
+def test_environment_digest_depends_only_on_seed_and_actions() -> None:
     first, second = made("surveyed_clutter", duration=0.3), made("surveyed_clutter", duration=0.3)
     digest = episode(first, seed=5)["digest"]
     assert digest == episode(second, seed=5)["digest"]
@@ -126,7 +126,7 @@ def test_one_seed_and_the_same_actions_give_one_digest_and_another_seed_another_
     assert [env.config.scene.random_field[0].seed for env in fields] == [5, 1]
 
 
-def test_what_a_lab_does_not_choose_is_drawn_for_each_seed_as_in_an_evaluation() -> None:
+def test_environment_unspecified_choices_are_drawn_per_seed() -> None:
     env = made("surveyed_clutter", randomize={"scene.ground.friction": (0.1, 0.4)}, duration=0.1)
     found = [env.reset(seed=seed) and env.config.scene.ground.friction for seed in (7, 8, 7)]
     assert found[0] == found[2] != found[1] and all(0.1 <= one <= 0.4 for one in found)
@@ -159,7 +159,7 @@ def test_the_gate_is_inside_and_says_so() -> None:
 
 @pytest.mark.parametrize("action", ["position", "residual:hold"])
 @pytest.mark.parametrize(("fault", "why"), [("nan:joint_3@0.2", "joint_3"), ("diverge:simulator@0.2", "diverged")])
-def test_a_robot_that_is_stopped_ends_the_episode_with_the_reason(action: str, fault: str, why: str) -> None:
+def test_environment_episode_of_stopped_robot_ends_with_reason(action: str, fault: str, why: str) -> None:
     env = made(set={"faults": [fault]}, action=action)
     info = episode(env, action=lambda time_s: 0.1 * wave(time_s))
     assert (

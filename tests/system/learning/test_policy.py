@@ -105,7 +105,7 @@ EPISODES = {
 
 
 @pytest.mark.parametrize("case", ["simulator", *(pytest.param(n, marks=pytest.mark.slow) for n in list(EPISODES)[1:])])
-def test_a_policy_sees_as_a_controller_what_it_saw_in_its_environment(tmp_path: Path, case: str) -> None:
+def test_policy_controller_gets_observations_of_its_environment(tmp_path: Path, case: str) -> None:
     """To the bit: targets that depend on every number of the observation have one digest."""
     env: Any = SnakeEnv(
         "surveyed_clutter", observe=EVERYTHING.split(","), duration=2, new_field=False, set=EPISODES[case]
@@ -144,7 +144,7 @@ def linear(file: Path, width: int) -> Path:
     return file
 
 
-def test_a_sensor_that_falls_silent_holds_the_robot_and_says_why(tmp_path: Path) -> None:
+def test_policy_with_silent_sensor_holds_robot_and_says_why(tmp_path: Path) -> None:
     width = len(SnakeEnv("surveyed_clutter", observe=EVERYTHING.split(",")).observation_names)
     slow = {"robot.sensors.pose.rate_hz": 2, "max_age.pose_s": 0.1}  # half a second between samples
     given = {"control.model": str(linear(tmp_path / "model.onnx", width)), **slow}
@@ -183,7 +183,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_model_that_does_not_fit_is_refused_with_file_field_and_what_is_expected(tmp_path: Path, case: str) -> None:
+def test_policy_model_mismatch_names_file_field_and_expectation(tmp_path: Path, case: str) -> None:
     with raises_error(snakesim.ConfigError, code="policy/invalid", field=f"{case}.onnx"):
         driven(saved(tmp_path / f"{case}.onnx", **WRONG[case]))
 

@@ -184,7 +184,7 @@ def test_a_controller_that_fails_is_an_error_that_names_it(controller, cause: ty
     assert type(caught.value.__cause__) is (type(None) if cause is None else cause)
 
 
-def test_a_controller_that_fails_in_a_child_process_is_a_cause_too(tmp_path: Path) -> None:
+def test_python_controller_failure_in_child_process_is_a_cause(tmp_path: Path) -> None:
     """As when NumPy was imported first."""
     (tmp_path / "failing.py").write_text(FAILING)
     code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
@@ -193,7 +193,7 @@ def test_a_controller_that_fails_in_a_child_process_is_a_cause_too(tmp_path: Pat
     assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in done.err
 
 
-def test_a_controller_that_is_too_slow_for_real_time_is_reported() -> None:
+def test_python_controller_too_slow_for_real_time_is_reported() -> None:
     def slow(time_s, joints):
         time.sleep(0.1)
         return joints.angle_rad
@@ -255,7 +255,7 @@ def test_importing_it_changes_no_environment_variable() -> None:
     assert done.stdout == "True\n"
 
 
-def test_a_process_computes_as_snakesim_run_does_after_one_call_before_numpy() -> None:
+def test_python_process_computes_like_snakesim_run_after_one_call() -> None:
     code = (
         "import snakesim; snakesim.use_common_arithmetic()\n"
         "from snakesim_hal.base.arithmetic import common_environment, is_pinned\n"

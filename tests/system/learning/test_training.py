@@ -44,7 +44,7 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
 
-def test_a_search_that_was_stopped_goes_on_to_the_same_policy(trained: Path, tmp_path: Path) -> None:
+def test_training_search_resumed_reaches_the_same_policy(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "two"
     out.mkdir()
     first, second, *_ = (trained / "search.jsonl").read_bytes().splitlines(keepends=True)
@@ -108,7 +108,7 @@ def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, b
 
 
 @pytest.mark.parametrize(("name", "out"), [("clutter", "trained"), ("free", "free"), ("lab", "lab")])
-def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(name: str, out: str) -> None:
+def test_training_shipped_policy_names_its_documented_command(name: str, out: str) -> None:
     told = {one.key: one.value for one in onnx.load(POLICIES / f"{name}.onnx").metadata_props}
     page = (REPOSITORY / "docs" / "development" / "shipped-policies.md").read_text().replace("\\\n", " ")
     (given,) = [
@@ -122,13 +122,13 @@ def test_a_shipped_policy_names_the_command_that_the_documentation_gives_for_it(
 
 
 @pytest.mark.slow
-def test_the_shipped_policy_crosses_a_field_that_it_was_not_trained_on() -> None:
+def test_training_shipped_policy_crosses_an_unseen_field() -> None:
     given = {"scene.random_field.0.seed": 5400}
     run = snakesim.run("surveyed_clutter", controller="policy:clutter", duration=4, seed=5400, set=given)
     assert run.complete and (run.metrics["advance_m"] or 0.0) > 2.95
 
 
-def test_a_policy_of_another_robot_and_one_that_there_is_not_are_refused(trained: Path) -> None:
+def test_training_policy_of_other_robot_or_missing_is_refused(trained: Path) -> None:
     with raises_error(snakesim.ConfigError, code="policy/invalid", field="policy.onnx"):
         snakesim.run("mamba_flat", controller=f"policy:{trained / 'policy.onnx'}")
     with raises_error(snakesim.ConfigError, code="config/unknown-name", field="cluter"):

@@ -25,7 +25,7 @@ def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Cl
     return client.ticks(0.05)
 
 
-def test_in_lockstep_a_tick_that_was_shown_many_times_is_answered_once_as_it_is_now(
+def test_client_in_lockstep_answers_repeated_tick_once(
     sessions: tuple[Session, Session],
 ) -> None:
     ticks = shown(
@@ -37,7 +37,7 @@ def test_in_lockstep_a_tick_that_was_shown_many_times_is_answered_once_as_it_is_
     ]
 
 
-def test_in_lockstep_a_sample_of_a_later_tick_is_not_read_although_it_is_here(
+def test_client_in_lockstep_ignores_sample_of_a_later_tick(
     sessions: tuple[Session, Session],
 ) -> None:
     """A delayed sensor has nothing at the first ticks, and a host that is ahead has already sent what comes then."""
@@ -62,7 +62,7 @@ def test_in_real_time_only_the_newest_counts(sessions: tuple[Session, Session]) 
     assert newest is not None and newest.tick == 4 and nothing is None
 
 
-def test_a_tick_that_was_commanded_before_is_reported_done_when_it_is_shown_again(
+def test_client_reports_done_for_a_tick_shown_again(
     sessions: tuple[Session, Session],
 ) -> None:
     host, service = sessions

@@ -96,7 +96,7 @@ def test_a_slow_participant_is_waited_for() -> None:
         assert all(counted == max(tick - 5, 0) // 5 * 5 for tick, counted in newest.items())
 
 
-def test_a_client_that_falls_silent_is_a_stall_then_an_expired_lease_and_the_joints_are_damped() -> None:
+def test_client_that_stalls_loses_lease_and_joints_are_damped() -> None:
     config = run_config(stall_limit_s=0.2)
     with commanded(config, 20, end_after_fault_s=0.1) as (run, control):
         control.silent.set()
@@ -110,7 +110,7 @@ def test_a_client_that_falls_silent_is_a_stall_then_an_expired_lease_and_the_joi
         assert all(p.mode == [Mode.VELOCITY] * 3 and p.target == [0.0] * 3 for p in after)
 
 
-def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_clear() -> None:
+def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
     with running(run_config()) as run:
         with following(run.link, Follower()) as control:
             run.arm()
@@ -129,7 +129,7 @@ def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_cl
 # --- stops and refusals ----------------------------------------------------------------------------------------
 
 
-def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
+def test_client_estop_by_anyone_lasts_until_reset_and_arming() -> None:
     with commanded(run_config(clock_mode="realtime")) as (run, _):
         answer = run.ask(keys.ESTOP, EstopRequest(requester="passer-by"))
         assert answer.ok and answer.lifecycle == "estop"
@@ -145,7 +145,7 @@ def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
         assert passive(run.backend.enacted[-1])
 
 
-def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is_not() -> None:
+def test_client_second_holder_needs_higher_priority() -> None:
     with running(run_config(clock_mode="realtime")) as run, following(run.link, Follower()) as control:
         run.arm()
         request = LeaseRequest(action="acquire", holder="teleop")
@@ -167,7 +167,7 @@ def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
 
 
-def test_arming_waits_for_everybody_and_says_for_whom_and_time_stands_still_until_then() -> None:
+def test_arming_waits_for_all_services_with_time_paused() -> None:
     with running(run_config()) as run:
         assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.reason
         answer = run.lifecycle("arm")
@@ -183,7 +183,7 @@ def test_arming_waits_for_everybody_and_says_for_whom_and_time_stands_still_unti
 # --- strangers -------------------------------------------------------------------------------------------------
 
 
-def test_nothing_that_is_put_on_the_network_ends_the_host_and_all_of_it_is_counted() -> None:
+def test_host_counts_and_survives_everything_sent_to_it() -> None:
     garbage = [b"", b"\xff" * 50, b"\x91" * 100_000, encode(description())]
     foreign = [
         "zenoh/bytes",
@@ -228,7 +228,7 @@ def test_nothing_that_is_put_on_the_network_ends_the_host_and_all_of_it_is_count
         wait_until(lambda: run.status.commands_rejected == dict(counted), "the counts in the status")
 
 
-def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_answer() -> None:
+def test_host_ignores_commands_and_answers_of_a_stranger() -> None:
     """In lockstep a tick ends when the holder has answered; a refused command of somebody else is no answer."""
     with meeting("worm") as (session,):
         host = Host(run_config(), GuardedBackend(LagBackend(run_config())), session)
@@ -285,7 +285,7 @@ def test_realtime_keeps_its_deadlines_on_average() -> None:
         assert median_us is not None and 0 < median_us < 20_000
 
 
-def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold() -> None:
+def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
     """Also where nothing is armed: arming may be what its old samples prevent."""
     with running(run_config(clock_mode="realtime", rate_hz=50.0)) as run:
         run.backend.read_s = 0.03
@@ -305,7 +305,7 @@ def test_free_waits_for_nobody() -> None:
 # --- what readers see ------------------------------------------------------------------------------------------
 
 
-def test_somebody_who_comes_late_gets_description_status_and_what_is_applied() -> None:
+def test_client_that_joins_late_receives_description_status_and_setpoints() -> None:
     with commanded(run_config()) as (run, _), open_session(run.link) as late:
         descriptions = late.latched_reader(keys.DESCRIPTION, Description)
         assert received(descriptions, "the description") == [run.host.description]

@@ -16,7 +16,7 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 
-def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
+def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
     robot, network = description(), LocalNetwork()
     feed = Feed(network.session().reader(keys.JOINTS, JointState), keys.JOINTS)
     joints = network.session().publisher(keys.JOINTS, JointState)
@@ -39,7 +39,7 @@ def naming(tick: int, joints_tick: int, arm_session: int = 1) -> Clock:
     return clock(tick, arm_session=arm_session, newest={keys.JOINTS: joints_tick})
 
 
-def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
+def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     robot = description()
@@ -75,7 +75,7 @@ def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never
         wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
 
 
-def test_a_commander_asks_for_a_free_lease_and_gives_up_one_that_passed_on() -> None:
+def test_commander_requests_free_lease_and_releases_passed_one() -> None:
     with running(run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
         client = Client(session, "pilot")
         commander = Commander(client, client.description())

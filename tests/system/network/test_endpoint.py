@@ -58,9 +58,7 @@ def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
         ("udp/robot.lab:7447", True),
     ],
 )
-def test_what_other_machines_may_reach_is_listened_on_only_with_access_control_or_on_request(
-    endpoint: str, exposed: bool
-) -> None:
+def test_endpoint_for_other_machines_needs_access_control_or_a_request(endpoint: str, exposed: bool) -> None:
     check_guarded(endpoint, "--endpoint", insecure=True)
     check_guarded(endpoint, "--endpoint", access_control=True)
     if exposed:
@@ -81,7 +79,7 @@ APART = ["unshare", "--net", "--map-root-user"]  # a network namespace of its ow
 LOOKS = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
 
 
-def test_a_loopback_interface_that_is_down_is_named_instead_of_waited_for(tmp_path: Path) -> None:
+def test_endpoint_on_loopback_that_is_down_is_named(tmp_path: Path) -> None:
     if shutil.which("unshare") is None or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode:
         pytest.skip("no network namespace can be made here")
     command = [*APART, *python_command("-c", LOOKS), "run", "triplet", "--out", "run"]

@@ -33,7 +33,7 @@ def test_a_description_is_proven_by_the_runs_key_alone() -> None:
     assert not is_proven(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
 
 
-def test_a_service_of_a_run_does_not_take_a_forged_description(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identity_service_of_a_run_ignores_forged_description(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(RUN_KEY, new_run_key())
     with running(run_config()) as run, open_session(run.link) as stranger, open_session(run.link) as own:
         forged = msgspec.structs.replace(run.host.description, emulated=True, lease_ns=10**9)
@@ -83,7 +83,7 @@ def a_robot() -> LocalRobot:
     return LocalRobot(namespace="worm", robot="worm", backend="sim", **where, pid=os.getpid())
 
 
-def test_robots_of_this_computer_are_found_as_long_as_they_live(
+def test_identity_robots_of_this_computer_are_listed_while_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -126,7 +126,7 @@ def test_one_robot_is_one_folder_whatever_its_name(tmp_path: Path, monkeypatch: 
     assert robot_folder("../../etc", "sim", "").parent == robots
 
 
-def test_of_two_runs_that_start_at_once_each_has_an_endpoint_of_its_own() -> None:
+def test_identity_runs_started_together_have_separate_endpoints() -> None:
     from snakesim_operator.run.meeting import meeting_point
 
     first, its_port = meeting_point(None, None, "worm")

@@ -17,7 +17,7 @@ def settings(endpoints: list[str] = ENDPOINTS, **link: object) -> zenoh.Config:
     return zenoh.Config.from_json5(json.dumps(file))
 
 
-def test_little_of_it_is_under_way_and_it_is_marked_as_what_may_wait() -> None:
+def test_image_connection_queue_is_short_and_low_priority() -> None:
     config = settings()
     configure_for_images(config)
     assert int(config.get_json(SNDBUF)) < 5000

@@ -10,7 +10,7 @@ from snakesim_testing.messages import raises_error
 REQUEST = LeaseRequest(action="acquire", holder="control")
 
 
-def test_samples_reach_those_whose_key_matches_and_what_is_latched_also_who_comes_later() -> None:
+def test_local_network_delivers_matching_keys_and_latched_values_later() -> None:
     network = LocalNetwork()
     one, other = network.session(), network.session()
     every, reader = other.reader(keys.DONE_ALL, Done), other.reader(keys.done_key("control"), Done)

@@ -66,7 +66,7 @@ def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]
     wait_until(lambda: entries.find_problems(own, ["control", "recorder"]) == [], "no difference", 5.0)
 
 
-def test_another_version_of_a_message_is_reported_and_the_entry_counts_as_long_as_its_process_lives(
+def test_process_entry_with_other_version_is_reported_while_alive(
     sessions: tuple[Session, Session],
 ) -> None:
     here, there = sessions

@@ -42,7 +42,7 @@ def comes(name: str = VIEWER, zid: str = ZID) -> list[str]:
     ]
 
 
-def test_who_comes_and_what_they_are_refused_is_told_with_the_name_in_the_certificate() -> None:
+def test_router_log_names_certificates_of_joins_and_refusals() -> None:
     put = line(f"{SUBJECT} is unauthorized to Put (ingress) on planar13/actuator/joints")
     cached = line(f"Using cached result: {ZID} is unauthorized to Declare Queryable (ingress) on planar13/hal/lease")
     assert reported(*comes(), put, cached) == [

@@ -25,7 +25,7 @@ from snakesim_testing.messages import raises_error
 ROBOT = description()
 
 
-def test_a_latched_value_reaches_readers_that_come_later_and_only_the_newest() -> None:
+def test_session_latched_value_reaches_later_readers_once() -> None:
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
         publisher = hal.latched_publisher(keys.JOINTS, JointState)
@@ -41,7 +41,7 @@ def test_a_latched_value_reaches_readers_that_come_later_and_only_the_newest() -
             assert [joints.tick for joints in received(reader, "the next value")] == [3]
 
 
-def test_a_reader_that_comes_first_gets_the_value_when_the_publisher_comes() -> None:
+def test_session_early_reader_gets_value_when_publisher_joins() -> None:
     with meeting("worm", "worm", "worm") as (_, early, hal):
         reader = early.latched_reader(keys.JOINTS, JointState)
         hal.latched_publisher(keys.JOINTS, JointState).put(state(ROBOT, tick=7))
@@ -58,7 +58,7 @@ def test_a_stream_is_not_given_to_those_who_come_late() -> None:
         assert [joints.tick for joints in received(reader, "the sample")] == [2]
 
 
-def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
+def test_session_reader_keeps_newest_and_counts_dropped_samples() -> None:
     with meeting("worm", "worm") as (hal, session):
         reader = session.reader(keys.JOINTS, JointState, depth=4)
         publisher = hal.publisher(keys.JOINTS, JointState, lossless=True)
@@ -104,7 +104,7 @@ def test_a_session_closes_while_urgent_samples_arrive() -> None:
         talker.join()
 
 
-def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both() -> None:
+def test_session_namespaces_are_separate_except_for_a_tool() -> None:
     with meeting("lab/a", "lab/b", None) as (a, b, tool):
         heard: dict[str, list[Arrival]] = {"a": [], "b": [], "tool": []}
         a.on_arrival(keys.DONE_ALL, heard["a"].append)
@@ -124,7 +124,7 @@ def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both()
         assert split == {("lab/a", "hal/done/a"), ("lab/b", "hal/done/b")}
 
 
-def test_a_question_by_pattern_is_about_the_key_that_was_declared() -> None:
+def test_session_query_by_pattern_concerns_the_declared_key() -> None:
     questions: list[Query] = []
     with meeting("worm", None) as (hal, tool):
         hal.on_query(keys.ESTOP, questions.append)
@@ -217,7 +217,7 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
         wait_until(lambda: arrived, "the sample through the router")
 
 
-def test_threads_may_open_sessions_at_once_and_the_environment_of_children_stays_as_it_was() -> None:
+def test_session_may_be_opened_by_threads_without_changing_environment() -> None:
     endpoint, before, failed = free_endpoint(), dict(os.environ), list[BaseException]()
 
     def open_often(start: threading.Barrier) -> None:

@@ -23,7 +23,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_sessions_of_one_file_meet_at_its_router_and_stock_zenoh_reads_the_same_file(tmp_path: Path) -> None:
+def test_session_file_connects_sessions_and_stock_zenoh_at_router(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     router = tmp_path / "router.json5"
     router.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
@@ -59,7 +59,7 @@ def tokens(session: zenoh.Session) -> list[str]:
         "{mode: ",
     ],
 )
-def test_a_file_that_contradicts_what_every_session_needs_is_refused_by_name(text: str, tmp_path: Path) -> None:
+def test_session_file_that_contradicts_requirements_is_refused_by_name(text: str, tmp_path: Path) -> None:
     with raises_error(ConfigError, code=("network/invalid-address", "network/session-file"), field="lab.json5"):
         read_session(written(tmp_path, text))
 

@@ -60,7 +60,7 @@ def test_a_stop_that_is_too_long_is_a_stop() -> None:
         assert long_winded.recv(2048).startswith(ANSWER + bytes(16)) and asked == ["a" * 64]
 
 
-def test_an_answer_from_elsewhere_or_to_another_question_does_not_count() -> None:
+def test_stop_port_ignores_answers_from_elsewhere() -> None:
     with open_stop_port(LOOPBACK, 0) as silent, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as liar:
         port = silent.getsockname()[1]
         answers: list[object] = []

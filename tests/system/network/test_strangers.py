@@ -113,7 +113,7 @@ def served(hal: Session) -> None:
     hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
 
 
-def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out() -> None:
+def test_stranger_invalid_intent_is_counted_and_ignored() -> None:
     with meeting("worm", "worm") as (hal, session):
         served(hal)
         client = Client(session, "navigation")
@@ -158,7 +158,7 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
         stranger.undeclare()
 
 
-def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> None:
+def test_stranger_oversized_message_never_arrives_and_link_survives() -> None:
     with meeting("worm", "worm", "worm") as (hal, session, stranger):
         heard: list[int] = []
         for listener in (hal, session):
@@ -189,7 +189,7 @@ def test_large_images_arrive_where_they_are_expected() -> None:
         assert readers[1].drain() == []
 
 
-def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
+def test_expired_lease_is_a_fault_despite_simultaneous_request() -> None:
     config, answers = run_config(clock_mode="realtime", services={}), list[Answer]()
     with meeting("worm") as (session,):
         host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
@@ -202,7 +202,7 @@ def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_t
     assert host.authority.state == "fault" and host.authority.faults[-1].what == "lease_expired"
 
 
-def test_a_flood_is_dropped_unread_but_for_the_newest_that_is_wanted() -> None:
+def test_stranger_flood_is_dropped_except_newest_wanted_sample() -> None:
     with meeting("worm", "worm") as (hal, session):
         reader, asked = session.reader(keys.JOINTS, JointState), list[int]()
         joints, after = hal.publisher(keys.JOINTS, JointState, lossless=True), session.reader(keys.CLOCK, Clock)

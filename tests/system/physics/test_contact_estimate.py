@@ -19,7 +19,7 @@ from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Imu, Pose
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.truth import TrueState
+from snakesim_sim_backend.state.truth import TrueState
 
 NEAR_M, MIN_FORCE_N = 0.08, 2.0
 FROM_TICK, EVERY = 30, 2

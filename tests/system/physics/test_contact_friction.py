@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_sim_backend.state.contacts import TouchReader
 from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
 
 MU, PRESS_N = 0.3, 2.0  # of the wall; on each link
@@ -46,7 +46,7 @@ class Pressed:
 
 
 @pytest.mark.parametrize("step_s", [0.002, 0.0005])
-def test_a_body_that_slides_along_a_wall_is_braked_by_mu_times_what_presses_it_on(step_s: float) -> None:
+def test_wall_friction_brakes_body_by_mu_times_normal_force(step_s: float) -> None:
     body = Pressed(step_s=step_s)
     body.data.qvel[0] = 1.0
     body.for_s(0.1)
@@ -73,7 +73,7 @@ def test_it_stands_below_mu_and_slides_above() -> None:
     assert body.speed_m_s == pytest.approx(0.1 * MU * PRESS_N * body.links / body.mass_kg, rel=0.05)
 
 
-def test_what_rubs_on_a_block_drags_it_along_by_as_much() -> None:
+def test_wall_friction_drags_a_block_by_same_force() -> None:
     body = Pressed(mass_kg=5.0, base_friction=0.0)
     body.forces_w[:] = 0.0
     body.data.qvel[:] = 0.0
@@ -85,7 +85,7 @@ def test_what_rubs_on_a_block_drags_it_along_by_as_much() -> None:
     assert body.mass_kg * body.data.qvel[:2] + block == pytest.approx(before, abs=0.01)
 
 
-def test_a_state_that_was_saved_goes_on_as_if_it_had_never_been() -> None:
+def test_friction_state_restored_continues_unchanged() -> None:
     body = Pressed()
     body.data.qvel[0] = 0.5
     body.forces_w[:, 0] = 0.5 * MU * PRESS_N
@@ -99,7 +99,7 @@ def test_a_state_that_was_saved_goes_on_as_if_it_had_never_been() -> None:
     assert other.qpos.tolist() == body.data.qpos.tolist()
 
 
-def test_nothing_rubs_any_more_on_a_body_that_is_put_elsewhere_after_its_state_was_restored() -> None:
+def test_friction_of_body_moved_after_restore_is_zero() -> None:
     body = Pressed()
     body.data.qvel[0] = 0.5
     body.for_s(0.1)
@@ -126,7 +126,7 @@ def test_rolled_up_a_snake_whose_links_rub_comes_to_rest(friction: float) -> Non
 
 
 @pytest.mark.parametrize(("slope", "slides_m_s2"), [(0.35, 0.0), (0.45, 0.05 * G)])
-def test_on_a_slope_it_stands_below_the_ground_s_friction_and_slides_above(slope: float, slides_m_s2: float) -> None:
+def test_slope_body_slides_only_above_ground_friction(slope: float, slides_m_s2: float) -> None:
     """The ground is level but for 10 um, and gravity is turned."""
     uneven = {"height_m": 1e-5, "wavelength_m": 0.8, "area_m": 6.0}
     config = make_config(scene={"ground": {"friction": 0.4, "heightfield": uneven}})

@@ -27,7 +27,7 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
         slow("surveyed_clutter", FIELD, 0.3, 0.35, 0.15),
     ],
 )
-def test_what_is_asked_of_obstacles_comes_true_while_the_body_moves(
+def test_requested_obstacle_forces_are_reached_while_moving(
     scenario: str, also: dict[str, Any], correlation: float, error: float, empty: float
 ):
     result = snakesim.run(scenario, controller="obstacle_aided", duration=6, set=also)
@@ -46,7 +46,7 @@ def test_drives_without_torque_mode_push_by_their_shape():
 
 
 @pytest.mark.slow
-def test_a_body_that_nothing_can_push_moves_on_towards_its_goal():
+def test_body_without_push_points_moves_towards_goal():
     alone = {"scene.random_field": [], "scene.pegs_along_route": [], "start.on_route": False}
     found = snakesim.run("surveyed_clutter", controller="obstacle_aided", duration=6, set=alone).summary
     assert "in search of contacts" in (found.reported_reason or "")

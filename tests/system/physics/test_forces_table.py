@@ -6,7 +6,7 @@ import pytest
 from snakesim_testing.runs.solved_and_measured import STEP_S, causes, measured
 
 
-def test_forces_of_every_physics_step_are_those_that_the_contact_sensor_averages():
+def test_step_forces_average_to_contact_sensor_samples():
     result, forces = measured("triplet", "obstacle_aided", duration=2.0)
     steps = round(0.05 / STEP_S)
     at_end = [float(force[-steps:].mean()) for force in forces.values()]

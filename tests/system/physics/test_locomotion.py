@@ -34,7 +34,7 @@ def propelled(whole: Run) -> list[int]:
 @pytest.mark.parametrize(
     "noise", [(), *(pytest.param((seed,), marks=pytest.mark.slow) for seed in ("seed=2", "seed=3"))]
 )
-def test_35_newtons_move_the_snake_half_a_metre_in_10_seconds_by_turns_that_pass_backward(noise: tuple[str, ...]):
+def test_triplet_with_35_newtons_moves_half_a_meter(noise: tuple[str, ...]):
     whole = triplet(*noise)
     assert whole.record.time_s[-1] <= 10.0
     assert whole.moved_m >= 0.5
@@ -51,7 +51,7 @@ def test_it_ends_when_the_obstacle_at_the_tail_is_lost():
 
 
 @pytest.mark.parametrize("what", ["blind", pytest.param("lost", marks=pytest.mark.slow)])
-def test_without_a_world_or_a_trajectory_it_stands_still_and_then_goes_on(what: str):
+def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     gap = range(200, 400)
     blind, lost = (gap, ()) if what == "blind" else ((), gap)
     whole = run(configure("triplet"), duration_s=8.0, blind=blind, lost=lost)
@@ -66,7 +66,7 @@ def test_without_a_world_or_a_trajectory_it_stands_still_and_then_goes_on(what: 
     assert set(whole.states[gap.start + 2 : gap.stop]) <= {"NotLocomoting", "Idle"}
 
 
-def test_one_joint_is_in_torque_mode_and_all_others_in_position_mode():
+def test_triplet_has_one_torque_joint_and_others_in_position():
     whole = triplet()
     pushing = np.array([report.propulsion_joint is not None for report in whole.reports])
     torque_joints = (whole.record.mode == Mode.TORQUE).sum(axis=1)
@@ -75,7 +75,7 @@ def test_one_joint_is_in_torque_mode_and_all_others_in_position_mode():
     assert np.isin(whole.record.mode, [Mode.TORQUE, Mode.POSITION]).all()
 
 
-def test_the_propulsion_joint_leaves_its_reference_and_the_others_do_not():
+def test_triplet_only_propulsion_joint_leaves_its_reference():
     """As in the paper's Figure 12."""
     whole = triplet()
     off = np.abs(whole.record.angle_rad - np.array([report.reference_rad for report in whole.reports]))
@@ -87,7 +87,7 @@ def test_the_propulsion_joint_leaves_its_reference_and_the_others_do_not():
     assert np.median(off[settled]) < 0.02
 
 
-def test_nothing_is_saturated_or_limited_in_the_case_study_and_commands_are_smooth():
+def test_triplet_case_study_commands_are_smooth_and_never_limited():
     whole = triplet()
     assert not any(report.saturated for report in whole.reports)
     assert not whole.record.host.limited_commands
@@ -125,7 +125,7 @@ def test_no_command_jumps_at_a_hand_over():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clearance_m", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
-def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushing(clearance_m: float):
+def test_braking_obstacles_between_push_points_do_not_stop_pushing(clearance_m: float):
     config = configure("triplet")
     route = known(make_route(config.scene))
     way_m = 0.04 + clearance_m + 0.05
@@ -142,7 +142,7 @@ def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushin
 
 
 @pytest.mark.slow
-def test_on_a_wave_too_steep_for_neighbours_contacts_further_apart_push():
+def test_steep_wave_pushes_with_contacts_further_apart():
     whole = run(configure("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
     assert whole.moved_m > 1.0
     assert set(whole.states[STARTED:]) == {"Locomoting"} and not any(report.jammed for report in whole.reports)
@@ -163,7 +163,7 @@ def test_two_newtons_are_too_little_and_said_to_be():
     assert not any(report.jammed for report in whole.reports)
 
 
-def test_what_contacts_carry_is_told_and_not_what_is_asked_for():
+def test_push_report_contains_measured_not_requested_forces():
     """Of 8 N, twice the drag of 3.9 N: a push-point that is not touched keeps a part away."""
     whole = run(configure("peg_row", f"{TRIPLET}.propulsion_n=8"), duration_s=5.0)
     assert whole.states[-1] == "NotLocomoting" and not any(report.jammed for report in whole.reports)
@@ -172,7 +172,7 @@ def test_what_contacts_carry_is_told_and_not_what_is_asked_for():
     assert missing.startswith("(no contact at peg_0_") and "too little against the friction of the ground" in missing
 
 
-def test_a_body_that_is_clear_of_every_peg_is_not_called_jammed():
+def test_body_clear_of_every_peg_is_not_jammed():
     thin = ("robot.chain.modules=10", "robot.module.length_m=0.09", "robot.module.radius_m=0.025")
     row = "scene.reference_robot={spacing_m = 0.09, radius_m = 0.025}"  # as it is, not in proportion
     whole = run(configure("peg_row", *thin, row), duration_s=4.0)
@@ -185,7 +185,7 @@ def test_a_body_that_is_clear_of_every_peg_is_not_called_jammed():
 
 
 @pytest.mark.slow
-def test_three_body_lengths_without_a_stop_each_triplet_handed_over_backward():
+def test_triplet_travels_three_body_lengths_with_backward_hand_overs():
     whole = run(configure("peg_row"))
     body_m = whole.record.config.robot.length_m
     assert whole.moved_m >= 3 * body_m >= 4.29
@@ -209,7 +209,7 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
 
 
 @pytest.mark.slow
-def test_a_robot_with_pitch_joints_moves_on_hills_among_random_pegs():
+def test_robot_with_pitch_joints_crosses_hills_among_pegs():
     whole = run(configure("mamba_hills", "controller=obstacle_triplet"))
     assert whole.moved_m >= 0.3
     axes = [joint.axis for joint in whole.record.description.joints]
@@ -255,7 +255,7 @@ def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.0, -1.0])
-def test_in_clutter_without_its_search_for_contacts_nothing_but_the_push_moves_it(scale: float):
+def test_clutter_without_contact_search_moves_only_by_push(scale: float):
     """Neither the paths that are replanned, since it stands, nor a push of the wrong sign, which only shifts it."""
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")
     alone = (f"control.push_scale={scale}", "control.search_after_s=0")

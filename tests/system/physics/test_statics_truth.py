@@ -169,7 +169,7 @@ def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
 
 
 @a_few_benches
-def test_so_they_are_with_shipped_servos_whose_targets_lead_by_the_load(bench: Bench):
+def test_statics_holds_with_servo_targets_that_lead_by_load(bench: Bench):
     shipped = with_shipped(bench)
     gives_way, _ = settle(shipped)
     tension, force = settle(shipped, ahead_rad=bench.loads_nm / shipped.config.robot.motor.stiffness_nm_per_rad)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, build
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import G, make_config
@@ -155,7 +155,7 @@ def test_a_reversed_wave_drifts_the_other_way_by_as_much(wave: Wave) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # 60 runs, in steps of down to 0.5 ms
 @pytest.mark.parametrize("step_s", [0.0005, 0.001, 0.002])
-def test_twenty_waves_drift_as_their_reverse_does_and_as_at_every_step(step_s: float) -> None:
+def test_waves_drift_oppositely_when_reversed(step_s: float) -> None:
     sums, differences, speeds = [], [], []
     for wave in random_waves(20):
         there = swim(wave, step_s).drift_mm_s
@@ -169,7 +169,7 @@ def test_twenty_waves_drift_as_their_reverse_does_and_as_at_every_step(step_s: f
     assert max(sums) < GHOST_MM_S and max(differences) < GHOST_MM_S
 
 
-def test_a_reflected_snake_goes_the_reflected_way_and_a_turned_one_the_turned_way() -> None:
+def test_reflected_or_rotated_snake_moves_reflected_or_rotated() -> None:
     wave, yaw_rad = Wave(bend=0.04), 0.7
     reflected = Wave(-wave.amplitude, bend=-wave.bend)
     plain = swim(wave).center[-1]

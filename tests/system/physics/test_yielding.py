@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_sim_backend.model import build
+from snakesim_sim_backend.model.build import build
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from snakesim_testing.messages import raises_error
@@ -45,7 +45,7 @@ class Pushed:
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_a_post_on_a_spring_gives_way_by_force_over_stiffness_and_comes_back(direction: float) -> None:
+def test_spring_post_yields_by_force_over_stiffness_and_returns(direction: float) -> None:
     post = Pushed("cylinder", PEG | {"stiffness_n_per_m": 500.0})
     towards = np.array([math.cos(direction), math.sin(direction)])
     moved = post.for_s(3.0, tuple(20.0 * towards))
@@ -61,7 +61,7 @@ def test_a_post_on_a_spring_gives_way_by_force_over_stiffness_and_comes_back(dir
         *(pytest.param(direction, 0.0005, marks=pytest.mark.slow) for direction in (DIRECTIONS[0], *DIRECTIONS[2:])),
     ],
 )
-def test_a_block_stands_below_the_friction_of_its_foot_and_slides_above_it(direction: float, step_s: float) -> None:
+def test_block_slides_only_above_friction_of_its_foot(direction: float, step_s: float) -> None:
     towards = np.array([math.cos(direction), math.sin(direction)])
     block = Pushed("box", BLOCK, step_s)
     held = block.for_s(1.0, tuple(0.9 * HOLDS_N * towards))
@@ -93,13 +93,13 @@ def test_a_block_that_turns_is_moved_sideways_by_any_force() -> None:
     assert turned[0] > 0.01 > 1e-4 > alone[0]
 
 
-def test_a_spring_that_the_step_cannot_follow_is_refused_with_what_would_do() -> None:
+def test_spring_too_stiff_for_time_step_is_refused_with_advice() -> None:
     with raises_error(ConfigError, code="scene/invalid", field="it", value=100000):
         Pushed("cylinder", PEG | {"stiffness_n_per_m": 1e5})
     Pushed("cylinder", PEG | {"stiffness_n_per_m": 1e5, "mass_kg": 1.0})
 
 
-def test_under_emulated_modules_obstacles_yield_as_well_and_are_none_of_the_robots_joints() -> None:
+def test_yielding_obstacles_under_emulated_modules_are_no_joints() -> None:
     loose = {"cylinder": [PEG | {"position_m": [0.5, 0.1], "mass_kg": 1.0, "stiffness_n_per_m": 5e5}]}
     physics_model = MujocoPhysicsModel(make_config(scene=loose), PhysicsModelSettings(timestep_s=0.0005))
     bent = np.full(13, 3.0)
@@ -115,7 +115,7 @@ def test_under_emulated_modules_obstacles_yield_as_well_and_are_none_of_the_robo
     assert [load.link for load in physics_model.loads()] == sorted({load.link for load in physics_model.loads()})
 
 
-def test_a_leaning_peg_is_where_its_foot_is_and_leans_as_far_as_it_says() -> None:
+def test_leaning_peg_has_its_foot_position_and_angle() -> None:
     config = make_config(scene={"cylinder": [PEG | {"lean_rad": 0.3, "lean_towards_rad": 2.0}]})
     sim = build(config, SimSettings(), motors=False)
     data, found = mujoco.MjData(sim.model), np.zeros(1, dtype=np.int32)
@@ -130,7 +130,7 @@ def test_a_leaning_peg_is_where_its_foot_is_and_leans_as_far_as_it_says() -> Non
 
 
 @pytest.mark.slow  # posts and blocks alone stand above
-def test_a_snake_gets_on_where_what_it_pushes_holds_and_pushes_away_what_does_not() -> None:
+def test_snake_advances_at_fixed_obstacles_and_displaces_loose_ones() -> None:
     peg = "scene.pegs_along_route.0."
     fixed, held, pushed = (
         run(configure("peg_row", *(peg + text for text in made)), duration_s=6.0).moved_m

@@ -39,7 +39,7 @@ def test_what_was_set_before_has_no_effect(computer: Path) -> None:
 
 
 @pytest.mark.parametrize("flags", ["flags : fpu sse2\n", "Features : fp asimd\n", "", None])
-def test_a_processor_that_cannot_or_is_not_known_is_left_alone(computer: Path, flags: str | None) -> None:
+def test_arithmetic_of_unknown_processor_is_not_pinned(computer: Path, flags: str | None) -> None:
     """Code for AVX2 would crash there."""
     if flags is not None:
         computer.write_text(flags)
@@ -66,7 +66,7 @@ def test_what_a_process_computes_with_is_measured() -> None:
     assert measured_with("import numpy; arithmetic.pin()", **old) == measured_with("pass", **old)
 
 
-def test_a_digest_of_other_arithmetic_is_said_to_be_the_computers_own() -> None:
+def test_arithmetic_digest_of_other_kernels_is_marked_as_local() -> None:
     other = {**arithmetic.COMMON, "BLAS": "00000000", "C library": "00000000"}
     assert arithmetic.find_differing_parts(other) == ["BLAS", "C library"]
     said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(other))
@@ -75,7 +75,7 @@ def test_a_digest_of_other_arithmetic_is_said_to_be_the_computers_own() -> None:
     assert arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts({})) == "0123456789abcdef"
 
 
-def test_a_newer_wheel_is_named_and_no_computer_is_blamed_for_it() -> None:
+def test_arithmetic_difference_of_newer_wheel_names_the_wheel() -> None:
     of_2_5 = {**arithmetic.COMMON, "BLAS": "3f7c15b6"}
     assert arithmetic.find_differing_parts(of_2_5) == ["BLAS of NumPy 2.5"]
     said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(of_2_5))

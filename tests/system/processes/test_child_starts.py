@@ -86,7 +86,7 @@ def is_protected(call: ast.Call, around: ast.AST) -> bool:
     return has_environment and {"python_command", "child_environment"} <= called
 
 
-def test_every_python_child_is_started_with_the_command_line_and_environment_made_for_it() -> None:
+def test_child_processes_all_start_with_prepared_command_and_environment() -> None:
     found = {path: list(starts_in(path)) for path in FILES}
     assert sum(map(len, found.values())) > 15, "the search finds nothing any more"
     unprotected = {

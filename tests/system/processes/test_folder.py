@@ -78,7 +78,7 @@ def test_half_written_files_of_a_killed_process_are_removed(tmp_path: Path) -> N
     assert content(out) == {}
 
 
-def test_a_second_process_is_refused_before_it_touches_anything_and_a_killed_one_lets_go(tmp_path: Path) -> None:
+def test_run_folder_in_use_refuses_second_process_until_killed(tmp_path: Path) -> None:
     out = tmp_path / "run"
     holder = subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True)
     try:
@@ -120,9 +120,7 @@ def test_many_that_want_one_folder_at_once(tmp_path: Path) -> None:
             assert b"Traceback" not in err or b"ConfigError" in err
 
 
-def test_nothing_is_written_into_a_folder_that_was_just_moved_aside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_folder_moved_aside_is_not_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, aside, open_file = tmp_path / "run", tmp_path / "aside", os.open
     leave(out, notes_txt="mine")
 
@@ -152,7 +150,7 @@ def test_the_folder_that_one_is_in_is_not_moved_away(tmp_path: Path, monkeypatch
     assert content(tmp_path) == {"config.json": "x"}
 
 
-def test_a_run_that_is_given_no_folder_gets_a_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_folder_is_new_when_none_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     first = default_folder("triplet")
     first.mkdir(parents=True)

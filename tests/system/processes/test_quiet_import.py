@@ -8,7 +8,7 @@ import pytest
 
 IMPORTED = """
 import os, sys
-import snakesim_sim_backend.model
+import snakesim_sim_backend.model.build
 import mujoco
 from mujoco.rendering.classic import gl_context
 assert "glfw" not in sys.modules, "it has searched for a window library"

@@ -47,7 +47,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_file_finds_its_neighbours_and_nothing_that_it_does_not_name(folder: Path) -> None:
+def test_plugin_file_imports_neighbors_and_only_what_it_names(folder: Path) -> None:
     command = python_command("-c", LOADS, str(folder))
     ended = subprocess.run(
         command, env=child_environment(), cwd=folder, capture_output=True, text=True, timeout=60, check=False

@@ -23,7 +23,7 @@ class BrokenError(RuntimeError):
     """What nobody expected."""
 
 
-def test_a_worker_begins_again_after_an_error_and_reports_it_once(capfd: pytest.CaptureFixture[str]) -> None:
+def test_worker_restarts_after_error_and_reports_it_once(capfd: pytest.CaptureFixture[str]) -> None:
     attempts, dropped = list[int](), list[Exception]()
 
     def work() -> None:

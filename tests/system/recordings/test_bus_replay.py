@@ -51,7 +51,7 @@ def test_a_lost_answer_is_found(run: Path, tmp_path: Path) -> None:
     assert "joint_4, " in ended.out and "1 of 50 ticks differ" in ended.out
 
 
-def test_a_log_that_a_power_loss_has_cut_is_compared_up_to_there(run: Path, tmp_path: Path) -> None:
+def test_bus_replay_of_cut_log_compares_up_to_the_cut(run: Path, tmp_path: Path) -> None:
     log = tmp_path / "cut.log"
     whole = run.with_name("bus.log").read_bytes()
     cut_at = whole.index(b"\n", 3 * len(whole) // 5) + 8
@@ -76,7 +76,7 @@ def test_what_candump_prints_without_times_gives_them_too(run: Path, tmp_path: P
     assert "the frames have no times" in ended.out
 
 
-def test_a_log_of_drives_of_another_type_is_not_read_as_if_modules_had_sent_it(run: Path, tmp_path: Path) -> None:
+def test_bus_replay_refuses_log_of_another_drive_type(run: Path, tmp_path: Path) -> None:
     log = tmp_path / "odrive.log"
     heartbeats = "".join(f"(1700000000.{tick:06d}) can0 {node << 5 | 1:03X}#0000000001000000 R\n"
                          for tick in range(20) for node in range(1, 14))  # fmt: skip

@@ -47,9 +47,7 @@ def lost(whole_path: Path, path: Path) -> Counter[str]:
     return before - after
 
 
-def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key(
-    run: Path, whole: bytes, tmp_path: Path
-) -> None:
+def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(run: Path, whole: bytes, tmp_path: Path) -> None:
     damaged, following = chunks(whole)[2:4]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     reader = RecordingReader(path)
@@ -112,7 +110,7 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
 
 
 @pytest.mark.slow
-def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole: bytes, tmp_path: Path) -> None:
+def test_undamaged_recording_is_not_reported_and_names_its_command(whole: bytes, tmp_path: Path) -> None:
     for name in ("whole.mcap", "a.mcap"):
         written(tmp_path / name, whole)
     for command in COMMANDS:
@@ -126,7 +124,7 @@ def test_a_whole_recording_says_nothing_of_it_and_how_its_run_is_repeated(whole:
     assert "Save the effective configuration below as <code>config.json</code>" in page
 
 
-def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: bytes, tmp_path: Path) -> None:
+def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(run: Path, whole: bytes, tmp_path: Path) -> None:
     first = chunks(whole)[0]
     written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
     ended = snakesim("recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
@@ -189,7 +187,7 @@ def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: P
     assert summary.mean_speed_m_s == pytest.approx(summarise(intact.record, "complete").mean_speed_m_s, rel=1e-6)
 
 
-def test_an_episode_after_a_gap_begins_with_a_picture_of_its_own(whole: bytes, tmp_path: Path) -> None:
+def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path: Path) -> None:
     """What a camera showed before the gap is not what the robot saw behind it."""
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     damaged = chunks(whole)[len(chunks(whole)) // 2]
@@ -218,7 +216,7 @@ def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
     assert f"between {record.time_s[before]:.2f} and {record.time_s[after]:.2f} s" in sentence
 
 
-def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: bytes, tmp_path: Path) -> None:
+def test_truncated_recording_says_nothing_about_end_of_run(whole: bytes, tmp_path: Path) -> None:
     written(tmp_path / "whole.mcap", whole)
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     snakesim("recording", "report", "a.mcap", cwd=tmp_path)
@@ -248,7 +246,7 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
     assert list(reader.read_messages()) and reader.finished and not reader.missing
 
 
-def test_a_bad_lz4_chunk_and_an_impossible_time_are_damage_as_any_other(whole: bytes, tmp_path: Path) -> None:
+def test_damaged_lz4_chunk_and_impossible_time_are_reported(whole: bytes, tmp_path: Path) -> None:
     first, second = chunks(whole)[:2]
     bad = packed(b"abc", "lz4", data=b"no lz4 at all")
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :]))
@@ -294,7 +292,7 @@ NAMED = {  # the class that is made another; how a run names that one, how the r
 
 
 @pytest.mark.parametrize("kind", NAMED)
-def test_what_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, kind: str) -> None:
+def test_recording_runs_named_files_only_on_request(tmp_path: Path, kind: str) -> None:
     base, own, shipped = NAMED[kind]
     (tmp_path / "mine.py").write_text(
         "from pathlib import Path\n"
@@ -325,7 +323,7 @@ def test_what_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, 
         (tmp_path / "ran").unlink(missing_ok=True)
 
 
-def test_a_folder_with_a_black_box_tells_of_its_recording_too(run: Path, whole: bytes, tmp_path: Path) -> None:
+def test_damaged_recording_is_reported_for_its_run_folder(run: Path, whole: bytes, tmp_path: Path) -> None:
     for path in run.iterdir():
         if path.is_file():
             written(tmp_path / path.name, path.read_bytes())

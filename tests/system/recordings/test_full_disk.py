@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from snakesim.training.curve import write_curve
-from snakesim.training.search import Generation
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.store import write_tables
 from snakesim_testing.harness.file_size import max_file_size
@@ -14,7 +12,6 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 FITS_BYTES = 2000  # less than any of these exports takes
-GENERATION = Generation(0, 10, 0.1, 0.2, None, None, None)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=lambda one: one if isinstance(one, str) else "",
 )
-def test_an_export_that_does_not_fit_is_named_and_leaves_nothing(
+def test_export_on_full_disk_is_named_and_leaves_nothing(
     run: Path, tmp_path: Path, command: list[str], name: str
 ) -> None:
     out = tmp_path / name
@@ -51,10 +48,18 @@ def test_an_export_that_does_not_fit_is_named_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def write_learning_curve(folder: Path) -> None:
+    # Imported here: it takes a second, and each worker imports this file.
+    from snakesim.training.curve import write_curve
+    from snakesim.training.search import Generation
+
+    write_curve(folder, [Generation(0, 10, 0.1, 0.2, None, None, None)] * 200)
+
+
 @pytest.mark.parametrize(
     ("write", "name"),
     [
-        (lambda folder: write_curve(folder, [GENERATION] * 200), "curve.csv"),
+        (write_learning_curve, "curve.csv"),
         (lambda folder: write_tables(folder, [], {}), "results.parquet"),
     ],
     ids=["curve", "tables"],

@@ -28,8 +28,8 @@ LONG = ["triplet", "--controller", "hold", "--duration", "30", "--clock-mode", "
 SHORT = ["triplet", "--duration", "5", "--seed", "7"]
 RATE_HZ = 50
 IN_ONE, LOCKED = ["--in-process"], "mount -o remount,ro ."
-FULL = "No space left on device; the run goes on"
-READ_ONLY = "Read-only file system; the run goes on, but nothing of it is recorded"
+FULL = "No space left on device; the run continues"
+READ_ONLY = "Read-only file system; the run continues, but nothing of it is recorded"
 
 
 def handles(pid: int, number: signal.Signals) -> bool:
@@ -47,7 +47,7 @@ def newest_status(session: Session) -> Status:
 # --- kills -----------------------------------------------------------------------------------------------------
 
 
-def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Path) -> None:
+def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 100, "two seconds")
@@ -100,7 +100,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
 
 
 @pytest.mark.slow
-def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
+def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
         assert command.tell(run, "robot", "disarm").code == 0
         assert run.end() == 1, run.said()
@@ -158,7 +158,7 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
         ("size=1M", f"mkdir run; echo '{{}}' > run/config.json; {LOCKED}", IN_ONE, READ_ONLY),
     ],
 )
-def test_a_full_or_read_only_disk_neither_ends_nor_changes_a_run(
+def test_record_on_full_or_readonly_disk_does_not_affect_run(
     tmp_path: Path, digest: str, options: str, prepare: str, more: list[str], warning: str
 ) -> None:
     ended, left = in_a_file_system(tmp_path, options, prepare, *SHORT, *more)
@@ -233,7 +233,7 @@ def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Pat
 
 
 @pytest.mark.slow
-def test_a_disk_that_hangs_delays_neither_ticks_nor_a_stop_nor_the_end(tmp_path: Path, hangs: Path) -> None:
+def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hangs: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--stay") as run:
         wait_until(lambda: (tmp_path / "run" / "host.json").is_file(), "the first numbers on disk")
         hangs.touch()

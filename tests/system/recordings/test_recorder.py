@@ -51,7 +51,7 @@ def sighted_live(address: str, origin: str | None = None) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_path: Path) -> None:
+def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG) as run:
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)

@@ -123,7 +123,7 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
         assert len(stock) == kept
 
 
-def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: Path) -> None:
+def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
     with max_file_size(20_000):
         recording = RecordingWriter(tmp_path / "a.mcap")
         for tick in range(5000):
@@ -152,7 +152,7 @@ def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(tap.drain()) == 1
 
 
-def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tap_module, "MAX_BYTES", 100)
     monkeypatch.setattr(tap_module, "LIMIT_S", 0.2)
     network = LocalNetwork()
@@ -173,7 +173,7 @@ def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> Non
     assert not (tmp_path / "copy.mcap").exists()
 
 
-def test_a_recorder_that_is_told_to_end_waits_for_what_its_host_sends_before_it_leaves(tmp_path: Path) -> None:
+def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
     endpoint, told = free_endpoint(), threading.Event()
     link, path = Link(endpoint, "planar13"), tmp_path / "a.mcap"
     recorder = threading.Thread(target=lambda: record_to_file(link, path, lambda: not told.is_set(), after_host=True))
@@ -193,7 +193,7 @@ def test_a_recorder_that_is_told_to_end_waits_for_what_its_host_sends_before_it_
     ]
 
 
-def test_a_sample_that_comes_before_the_description_is_kept_with_its_own_schema(tmp_path: Path) -> None:
+def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     own = keys.custom_key("left")
     early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0)

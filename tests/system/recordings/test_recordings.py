@@ -41,7 +41,7 @@ def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
     assert alone.missing == whole.missing == []
 
 
-def test_without_a_black_box_for_lack_of_room_the_hosts_numbers_stay(run: Path, tmp_path: Path) -> None:
+def test_recordings_without_black_box_keep_numbers_of_host(run: Path, tmp_path: Path) -> None:
     content, host = (run / RECORDING).read_bytes(), RunRecord.load(run).host
     (tmp_path / RECORDING).write_bytes(content[: len(content) * 2 // 3])
     record = RunRecord.load(tmp_path, host)
@@ -49,7 +49,7 @@ def test_without_a_black_box_for_lack_of_room_the_hosts_numbers_stay(run: Path, 
     assert f"{200 - len(record.time_s)} of 200 ticks are missing in the black box" in record.missing
 
 
-def test_a_run_tells_of_ticks_that_never_came_to_its_recorder(run: Path, tmp_path: Path) -> None:
+def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_path: Path) -> None:
     for file in run.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / RECORDING).unlink()
@@ -137,7 +137,7 @@ def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
     assert {"/planar13_camera/joint_states", keys.CLOCK} <= {topic for topic, _ in decoded}
 
 
-def test_a_message_of_a_later_version_is_decoded_as_it_stands() -> None:
+def test_recordings_with_later_message_version_are_decoded_as_stored() -> None:
     later = DecoderFactory().decoder_for(
         "msgpack", Schema(id=1, name="snakesim.Whisker", encoding="jsonschema", data=b"{}")
     )

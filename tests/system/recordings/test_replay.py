@@ -44,7 +44,7 @@ def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) 
     assert (again.control, again.worlds) == (before.control, before.worlds)
 
 
-def test_an_answer_to_the_last_tick_which_no_run_waits_for_may_be_lacking_and_no_other(recorded: Path) -> None:
+def test_replay_allows_only_last_answer_to_be_missing(recorded: Path) -> None:
     comparison = Replay(recorded / RECORDING, []).run()
     last = max(comparison.recorded)
     del comparison.recorded[last], comparison.recorded[last - 5]

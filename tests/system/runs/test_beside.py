@@ -52,7 +52,7 @@ def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) -> None:
+def test_failed_service_is_restarted_and_waits_for_arming(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "raises"))
     with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
         run.wait_for("fault: ")

@@ -14,7 +14,7 @@ from snakesim_testing.messages import raises_error
 SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 
 
-def test_a_robot_of_position_servos_without_measurements_runs_what_needs_none() -> None:
+def test_position_servos_without_measurements_run_undemanding_controllers() -> None:
     sets = ("controller=lateral_undulation", "duration_s=2", *SERVOS)
     result = simulate(load("peg_row", [parse_set(text) for text in sets]).config)
     assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0.0) > 0.1
@@ -22,7 +22,7 @@ def test_a_robot_of_position_servos_without_measurements_runs_what_needs_none() 
     assert set(result.record.mode.flat) <= {Mode.PASSIVE, Mode.POSITION}
 
 
-def test_a_controller_that_has_not_said_what_it_needs_is_named_at_its_first_command() -> None:
+def test_controller_without_declared_needs_is_named_at_first_command() -> None:
     class Pushes(Hold):
         def update(self, observation):  # pyright: ignore
             command = super().update(observation)

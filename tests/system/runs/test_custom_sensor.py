@@ -112,7 +112,7 @@ def suite(folder: Path, robot: str, clause: str) -> Ended:
 
 
 @pytest.mark.slow
-def test_the_contract_suite_accepts_it_and_refuses_it_when_it_lies(tmp_path: Path, robot: str) -> None:
+def test_contract_suite_accepts_custom_sensor_and_refuses_false_one(tmp_path: Path, robot: str) -> None:
     clauses = " or ".join([*SAID, "sensor_listed", "description"])
     honest = suite(tmp_path, robot, clauses)
     assert honest.code == 0, honest.out[-3000:]

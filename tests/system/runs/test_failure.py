@@ -21,7 +21,7 @@ LONG = ["triplet", "--controller", "hold", "--duration", "600"]
 
 
 @pytest.mark.parametrize("clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
-def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path: Path, clock_mode: str) -> None:
+def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, clock_mode: str) -> None:
     with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             statuses = session.reader(keys.STATUS, Status)
@@ -72,7 +72,7 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, cloc
 
 
 @pytest.mark.slow  # tests/system/host/test_control_service.py has what control reports of it
-def test_a_controller_that_is_too_slow_is_named_as_the_cause_of_the_stop(tmp_path: Path) -> None:
+def test_slow_controller_is_named_as_cause_of_stop(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(
         "import time\n\n"
         "from snakesim_gnc.control.hold import Hold\n\n\n"

@@ -42,7 +42,7 @@ class Failing(Hold):
 """
 
 
-def test_a_controller_that_fails_ends_the_run_in_a_safe_stop(tmp_path: Path) -> None:
+def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(FAILING)
     result = simulate(load("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config)
     assert "control ended: controller" in result.summary.ended and "no idea" in result.summary.ended
@@ -80,9 +80,7 @@ class Compiled(Hold):
 """
 
 
-def test_a_controller_that_does_not_return_ends_the_run_in_a_safe_stop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_process_controller_that_hangs_ends_in_safe_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_LIMIT_S", 2.0)
     (tmp_path / "endless.py").write_text(ENDLESS)
@@ -126,7 +124,7 @@ def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch:
     assert (tmp_path / "run" / REPORT).is_file()
 
 
-def test_a_run_that_ends_in_a_fault_is_the_same_each_time() -> None:
+def test_in_process_run_with_fault_is_repeatable() -> None:
     config = load("peg_row", [parse_set("duration_s=3"), parse_set('faults=["mute:joint_3@0.5"]')]).config
     first, second = (simulate(config).summary for _ in range(2))
     assert "joint_3" in first.ended

@@ -52,7 +52,7 @@ def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> 
 
 
 @pytest.mark.slow  # above is a robot with a camera, too
-def test_so_does_a_robot_with_a_camera_like_the_robot_without(tmp_path: Path) -> None:
+def test_in_process_digest_of_robot_is_unchanged_by_camera(tmp_path: Path) -> None:
     """An image of the camera is named by the clock, and is there for whoever reads it at that tick."""
     seeing = same_both_ways(tmp_path / "run", "peg_row", "--duration", "1", "--set", "robot=planar13_camera")
     blind = simulate(load("peg_row", [parse_set("duration_s=1")]).config)

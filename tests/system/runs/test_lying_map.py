@@ -48,14 +48,14 @@ def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], 
     return record.worlds, config
 
 
-def test_perceived_is_the_true_map_and_to_the_bit_the_same_whatever_the_scene_file_says():
+def test_perceived_map_is_independent_of_scene_file():
     honest, _ = worlds("perceived")
     deceived, _ = worlds("perceived", deceived=True)
     common = min(len(honest), len(deceived))
     assert common > 20 and honest[1:common] == deceived[1:common]  # how often tick 0 is shown is chance
 
 
-def test_dead_reckoning_takes_no_pose_and_still_knows_where_it_is() -> None:
+def test_dead_reckoning_localizes_without_pose_sensor() -> None:
     reported, _ = worlds("perceived", "mission.localization=dead_reckoning")
     assert all(world.pose_timestamp_ns is None for world in reported)
     sd_m = reported[-1].base_position_sd_m

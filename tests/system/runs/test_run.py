@@ -51,7 +51,7 @@ def starved(pid: int) -> Iterator[None]:
 
 
 @pytest.mark.slow  # it takes a core from every other test
-def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_path: Path) -> None:
+def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
     arguments = [
         "triplet",
         "--controller",

@@ -65,7 +65,7 @@ def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]
     return summary.command_digest
 
 
-def test_a_service_of_a_file_publishes_a_pose_in_processes_and_in_one(home: Path) -> None:
+def test_file_service_publishes_pose_in_all_process_layouts(home: Path) -> None:
     assert digest_of(home, "many", run_to_summary) == digest_of(home, "one", in_process.run_to_summary)
 
 
@@ -97,7 +97,7 @@ def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path) -> None:
+def test_file_service_starts_alone_by_path_or_name(home: Path) -> None:
     """It waits for a host, of which there is none, and says under which name."""
     for name in ("./lab/mocap.py:MotionCapture", "sensor"):
         command = [*SNAKESIM, "start", "service", name, "triplet", "--set", NAMED, "--endpoint", free_endpoint()]
@@ -133,9 +133,7 @@ class Lost(MotionCapture):
         *(pytest.param(*row, marks=pytest.mark.slow) for row in (("realtime", "number"), ("one", "rotation"))),
     ],
 )
-def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(
-    home: Path, clock_mode: str, wrong: str
-) -> None:
+def test_malformed_message_is_named_in_log_and_run(home: Path, clock_mode: str, wrong: str) -> None:
     field, words = MALFORMED[wrong]
     lost = LOST.replace("{}", field)
     (home / "lab" / "lost.py").write_text(f"import msgspec\nimport numpy as np\n{SERVICE}{lost}")
@@ -172,7 +170,7 @@ class Silent(MotionCapture):
 
 
 @pytest.mark.slow
-def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Path) -> None:
+def test_run_names_missing_stream_and_stops_after_stated_time(home: Path) -> None:
     (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
     flags = [*SHORT, "--set", "services.sensor.plugin=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
     ended, summary = run_to_summary(home / "run", *flags)
@@ -195,7 +193,7 @@ class Frozen(MotionCapture):
 """
 
 
-def test_control_holds_when_a_service_tells_an_old_pose_again_and_again(home: Path) -> None:
+def test_control_holds_while_service_repeats_an_old_pose(home: Path) -> None:
     (home / "lab" / "frozen.py").write_text("import msgspec\n" + SERVICE + FROZEN)
     code = ["--set", "services.sensor.plugin=./lab/frozen.py:Frozen", "--duration", "1"]
     ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
@@ -205,7 +203,7 @@ def test_control_holds_when_a_service_tells_an_old_pose_again_and_again(home: Pa
     )
 
 
-def test_a_service_for_the_pose_brings_no_contacts_and_nobody_waits_for_them(home: Path) -> None:
+def test_pose_service_alone_makes_no_one_wait_for_contacts(home: Path) -> None:
     """On a robot whose file has no contact sensors."""
     robot = (home / "bare.toml").read_text()
     bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.contacts]"))

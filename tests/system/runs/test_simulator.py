@@ -23,7 +23,7 @@ RUN = ["peg_row", "--duration", "1"]
 
 
 @pytest.mark.slow  # tests/system/host/test_simulated_time.py
-def test_a_run_that_was_paused_stepped_and_reset_has_the_digest_of_one_that_was_not(tmp_path: Path) -> None:
+def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None:
     plain = simulate(load(RUN[0], [parse_set("duration_s=1")]).config).summary
     out = tmp_path / "run"
     with running(out, *RUN) as run:

@@ -37,7 +37,7 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path) -> None:
+def test_control_without_stream_holds_and_continues_when_it_returns(tmp_path: Path) -> None:
     """The others, one by one, are rows of the fault table."""
     key, limit_s = "guidance/world", 0.22
     ended, summary = run_with_fault(tmp_path / "run", f"drop:{key}@{FROM_S}-{TO_S}")

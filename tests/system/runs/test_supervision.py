@@ -98,7 +98,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
     assert summary.ticks > 0 and "host was ended by SIGKILL; restart in 0.5 s" in run.said()
 
 
-def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_path: Path) -> None:
+def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot, before = Robot(session), run.part("control")
@@ -115,11 +115,11 @@ def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_pat
             robot.reaches("armed")
         summary = interrupt(run)
     assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
-    assert summary.ended == "interrupted" and "go on with `snakesim robot reset`" in run.said()
+    assert summary.ended == "interrupted" and "continue with `snakesim robot reset`" in run.said()
 
 
 @pytest.mark.slow  # a row of the fault table
-def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
+def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)

@@ -26,7 +26,7 @@ STILL = (
 )
 
 
-def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_path: Path) -> None:
+def test_silent_standing_controller_does_not_locomote(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(STILL)
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
     assert ended.code == 0 and summary.locomoting_fraction == 0.0
@@ -36,7 +36,7 @@ def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_p
 
 
 @pytest.mark.slow
-def test_a_snake_that_moves_locomotes_from_when_it_is_seen_to_move(tmp_path: Path) -> None:
+def test_moving_snake_locomotes_from_first_measured_motion(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
     assert ended.code == 0 and summary.path_distance_m is not None and summary.path_distance_m > 0.5
     assert summary.locomoting_fraction is not None and summary.locomoting_fraction > 0.95
@@ -44,7 +44,7 @@ def test_a_snake_that_moves_locomotes_from_when_it_is_seen_to_move(tmp_path: Pat
     assert states[0] == "NotLocomoting" and states[-1] == "Locomoting"
 
 
-def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Path) -> None:
+def test_missing_clock_after_end_of_run_is_ignored(tmp_path: Path) -> None:
     _, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "1")
     assert summary.last_state not in (None, "PowerOff")
     last = RunRecord.load(tmp_path / "run").control[-1]

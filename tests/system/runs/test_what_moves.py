@@ -73,7 +73,7 @@ def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
         ("mixed", {"odrive": ["can0"], "dynamixel": ["/dev/pts/7"]}, False),
     ],
 )
-def test_drives_on_buses_are_emulated_only_if_no_real_one_can_be_on_any(
+def test_emulation_is_stated_only_without_real_drives(
     monkeypatch: pytest.MonkeyPatch, backend: str, buses: dict[str, list[str]], emulated: bool
 ) -> None:
     monkeypatch.setattr(can_family, "open_wire", lambda channel, *_rates: SimpleNamespace(channel=channel))
@@ -109,7 +109,7 @@ def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatc
         robot.close()
 
 
-def test_a_run_says_it_at_its_begin_and_at_its_end(tmp_path: Path) -> None:
+def test_run_states_emulation_at_start_and_end(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", "odrive", "--duration", "0.1")
     assert summary.emulated
     first, second, *others = ended.out.splitlines()

@@ -62,7 +62,7 @@ def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
     assert "with none" not in compared.out and UNRECORDED in compared.out + compared.err
 
 
-def test_without_a_pose_sensor_a_controller_of_joints_runs_alone_and_any_other_by_dead_reckoning(
+def test_run_without_pose_sensor_uses_joints_or_dead_reckoning(
     tmp_path: Path,
 ) -> None:
     short = ["triplet", "--in-process", "--duration", "1", "--unset", "robot.sensors.pose"]
@@ -70,7 +70,7 @@ def test_without_a_pose_sensor_a_controller_of_joints_runs_alone_and_any_other_b
     assert ended.code == 0 and summary.pose_from is None, ended.err
     ended, summary = run_to_summary(tmp_path / "pushed", *short)
     assert ended.code == 0 and summary.pose_from == "dead_reckoning" and summary.contacts_from == "sensor", ended.err
-    assert summary.path_distance_m is None and (summary.reckoned_distance_m or 0.0) > 0.03
+    assert summary.path_distance_m is None and (summary.dead_reckoned_distance_m or 0.0) > 0.03
     wrong = snakesim("run", *short, "--unset", "robot.sensors.contact", "--out", "wrong", cwd=tmp_path)
     assert wrong.code == 2 and "contact" in wrong.err and not (tmp_path / "wrong").exists()
 
@@ -89,7 +89,7 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_the_report_shows_a_perceived_map_and_the_planned_paths_beside_the_truth(tmp_path: Path) -> None:
+def test_report_shows_perceived_map_and_paths_beside_truth(tmp_path: Path) -> None:
     film = playback(simulate(load("clutter", [parse_set("duration_s=1")]).config, tmp_path / "run").record)
     assert film is not None and film.data["maps"] and film.data["paths"]
     maps, paths, last = film.data["maps"], film.data["paths"], film.data["frames"][-1]

@@ -130,7 +130,7 @@ def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
     assert heading.split() == list(COLUMNS) and len(lines) == 3
 
 
-def test_a_module_that_only_says_who_it_is_has_nothing_made_up() -> None:
+def test_can_scan_of_minimal_module_invents_no_values() -> None:
     rows, _ = scanned(identity(5, 1), identity(0, 2), identity(63, 3))
     assert [row["node"] for row in rows] == ["0", "5", "63"]
     for row in rows:
@@ -147,7 +147,7 @@ def test_scan_of_an_interface_that_is_not_there() -> None:
         run(["drive", "scan", "can", "nocan7"])
 
 
-def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     channel = f"scan-{uuid.uuid4().hex[:8]}"
     theirs = [
         can.Message(arbitration_id=0x705, data=b"\x05", is_extended_id=False),

@@ -38,7 +38,7 @@ def test_where_twins_run(section: dict[str, Any], where: str) -> None:
         ("pose_listen", "host:port"),
     ],
 )
-def test_a_bad_value_is_named_with_its_file_and_what_is_wanted(key: str, value: Any) -> None:
+def test_can_settings_bad_value_is_named_with_file_and_expectation(key: str, value: Any) -> None:
     with raises_error(
         ConfigError,
         code=("config/invalid-value", "config/out-of-range"),

@@ -17,7 +17,7 @@ CONTROLLERS = [Hold, PathFollowing, ObstacleTriplet]
 
 @pytest.mark.parametrize("without", ["world", "trajectory"])
 @pytest.mark.parametrize("plugin", CONTROLLERS)
-def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
+def test_blind_controller_without_push_holds_and_continues_without_jump(plugin, without):
     stage = make_stage()
     controller = plugin(stage.robot, plugin.Parameters())
 
@@ -48,7 +48,7 @@ def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
 
 @pytest.mark.parametrize("without", ["world", "trajectory"])
 @pytest.mark.parametrize("plugin", [PathFollowing, ObstacleTriplet])
-def test_before_it_knows_anything_it_holds_its_first_pose_and_says_what_is_missing(plugin, without):
+def test_blind_controller_before_data_holds_pose_and_names_it(plugin, without):
     stage = make_stage()
     controller = plugin(stage.robot, plugin.Parameters())
     observation = stage.observe(0, TAIL_S_M, without=without)

@@ -92,7 +92,7 @@ def test_progress_gives_the_present_from_an_old_world_model(speed_m_s):
     assert located.tail_s_m == pytest.approx(0.3 + speed_m_s * 60 * PERIOD_S, abs=1e-3)
 
 
-def test_a_pose_that_is_repeated_is_no_body_that_stands_still():
+def test_body_on_path_repeated_pose_is_not_standing_still():
     """Guidance goes on making world models when the motion capture has stopped."""
     stage, progress = make_stage(), make_progress()
     follow(progress, stage, 0.2, 61)
@@ -105,7 +105,7 @@ def test_a_pose_that_is_repeated_is_no_body_that_stands_still():
         assert located.tail_s_m == pytest.approx(0.3 + 0.2 * tick * PERIOD_S, abs=2e-3)
 
 
-def test_a_body_that_was_lost_is_found_again_where_it_is():
+def test_body_on_path_lost_body_is_located_again():
     stage, progress = make_stage(), make_progress()
     follow(progress, stage, 0.2, 61)
     for tick in range(61, 161):

@@ -53,7 +53,7 @@ def test_the_same_joint_keeps_its_turn():
     assert hand_over.torque_nm(0.0) == pytest.approx(1.2)
 
 
-def test_a_new_reference_does_not_move_the_targets_and_differences_fade_away():
+def test_bumpless_new_reference_keeps_targets_and_fades_differences():
     hand_over = HandOver(ROBOT)
     hand_over.start(state(ROBOT, 0.5), np.zeros(4))
     hand_over.shift(np.full(4, 0.2))

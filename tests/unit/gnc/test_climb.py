@@ -36,7 +36,7 @@ def test_a_path_rises_where_it_leads_over_a_platform(yaw_rad: float) -> None:
 
 
 @pytest.mark.parametrize("tail_s_m", [-0.9, -0.3, 0.2, 0.6, 1.1, 1.5])
-def test_every_part_of_the_body_is_as_high_as_the_path_where_it_is(tail_s_m: float) -> None:
+def test_climb_every_body_part_has_height_of_path(tail_s_m: float) -> None:
     angles = Climb(make_robot(18, ("yaw", "pitch"))).angles_rad([RISE], tail_s_m)
     lengths = [link.length_m for link in make_robot(18, ("yaw", "pitch")).links]
     wanted = [line_height_m([RISE], tail_s_m + s) for s in np.cumsum([0.0, *lengths])]

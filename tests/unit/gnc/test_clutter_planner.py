@@ -82,7 +82,7 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
 
 
 @pytest.mark.parametrize("density", [12.0, pytest.param(8.0, marks=pytest.mark.slow)])
-def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -> None:
+def test_planner_path_avoids_obstacles_and_allows_pushing(density: float) -> None:
     obstacles, body = field(density)
     made = ObstacleGrid(obstacles)
     found = path_of(BeamSearch(made, SEARCH).search_ahead(body, 0.0, 60))
@@ -99,7 +99,7 @@ def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -
     assert points[0] == pytest.approx(body[0], abs=0.01)
 
 
-def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None:
+def test_planner_body_standing_still_gets_new_path_then_backs_out() -> None:
     obstacles, body = field()
     made = planner(obstacles)
     seen = [planned(made, body, at_s) for at_s in np.arange(0.0, 6.0, 0.2).tolist()]
@@ -109,7 +109,7 @@ def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None
 
 
 @pytest.mark.slow
-def test_a_body_that_has_left_where_it_stood_gets_a_path_from_where_it_lies() -> None:
+def test_planner_displaced_body_gets_path_from_where_it_lies() -> None:
     obstacles, body = field()
     made = planner(obstacles)
     stood = [planned(made, body, at_s) for at_s in np.arange(0.0, 1.2, 0.2).tolist()][-1]
@@ -148,7 +148,7 @@ def test_a_goal_is_reached() -> None:
 
 
 @pytest.mark.parametrize("heading_rad", [0.7, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.7, 3.0))])
-def test_a_heading_that_is_asked_for_counts_and_not_the_mission(heading_rad: float) -> None:
+def test_planner_requested_heading_overrides_mission(heading_rad: float) -> None:
     obstacles, body = field()
     made = planner(obstacles, HeadingGoal(distance_m=0.1))
     ahead = planned(made, body)
@@ -168,7 +168,7 @@ def turns(made: ClutterPlanner, body: np.ndarray, count: int, heading_rad: float
     return [made.update(20 * k, world(0.01 * k, []), body, desired) for k in range(count)]
 
 
-def test_no_turn_does_more_than_its_share_and_the_path_before_is_followed_until_the_plan_is_there() -> None:
+def test_planner_follows_old_path_while_work_per_turn_is_bounded() -> None:
     obstacles, body = field()
     made = planner(obstacles)
     route = Route(np.concatenate([body, body[-1] + np.array([[1.0, 0.0], [5.0, 0.0]])]))

@@ -49,13 +49,13 @@ def estimated(torques, imu, pose: Pose | None = None) -> list[EstimatedPush]:
 
 
 @pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, pose(velocity_w=(0.3, 0.0, 0.0)))])
-def test_nothing_is_felt_where_nothing_pushes_but_the_ground_by_friction(friction, moves):
+def test_contact_estimate_without_contact_is_zero_despite_ground_friction(friction, moves):
     torques, imu, *_ = readings([], friction=friction, acceleration=(-friction * GRAVITY_M_S2, 0.0))
     assert estimated(torques, imu, pose=moves) == []
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_pushes_that_accelerate_the_body_are_found_with_their_place_side_and_force(side):
+def test_contact_estimate_locates_side_and_force_of_accelerating_pushes(side):
     """The last one is as strong as it must be for the body not to turn."""
 
     def pushes(last_n):
@@ -80,7 +80,7 @@ def test_pushes_that_accelerate_the_body_are_found_with_their_place_side_and_for
         assert all(0.5 < c.confidence <= 1.0 for c in near)
 
 
-def test_a_robot_that_sends_no_imu_readings_is_taken_at_its_torques():
+def test_contact_estimate_without_imu_relies_on_torques():
     imu = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     assert estimated([0.0] * COUNT, imu) == []
 

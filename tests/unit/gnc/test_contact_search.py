@@ -45,7 +45,7 @@ def period_s(commands: list[ControllerCommand]) -> float:
     return len(head) * 0.01 / int(np.argmax(np.abs(np.fft.rfft(head - head.mean()))))
 
 
-def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again() -> None:
+def test_contact_search_of_standing_body_ends_with_path_retried() -> None:
     stage, controller = searching(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
     alone = stands(controller, stage, range(300))
     searches = [SEARCHES in command.telemetry.reason for command in alone]
@@ -61,7 +61,7 @@ def test_a_body_that_stands_searches_for_contacts_and_then_tries_its_path_again(
 
 
 @pytest.mark.parametrize("among_pegs", [True, False])
-def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) -> None:
+def test_contact_search_fruitless_wave_is_replaced_by_the_other(among_pegs: bool) -> None:
     stage, controller = searching(among_pegs=among_pegs, shape_nm_per_rad=0.0)
     seen = stands(controller, stage, range(1010))
     periods = [period_s(seen[first : first + 240]) for first in (150, 450, 750)]
@@ -71,7 +71,7 @@ def test_a_wave_that_leads_nowhere_gives_way_to_the_other_one(among_pegs: bool) 
 
 
 @pytest.mark.slow
-def test_a_body_that_has_come_on_by_pushing_begins_with_a_slow_wave_and_goes_on_with_the_fast_one() -> None:
+def test_contact_search_wave_starts_slow_and_continues_fast() -> None:
     stage, controller = searching(among_pegs=True, shape_nm_per_rad=0.0)
     for tick in range(100):
         controller.update(stage.observe(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
@@ -89,7 +89,7 @@ def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
     assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [pytest.approx(0.8, rel=0.05)] * 3
 
 
-def test_noise_of_the_pose_does_not_hide_that_a_body_stands() -> None:
+def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
     (stage, controller), noise = searching(search_after_s=1.2), np.random.default_rng(1)
     observations = (stage.observe(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
     assert any(SEARCHES in controller.update(observation).telemetry.reason for observation in observations)
@@ -139,13 +139,13 @@ def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
     return ForceFeedbackWave(stage.robot).reference_rad(observation, 0.3)
 
 
-def test_joints_twice_as_far_apart_bend_twice_as_much_and_so_along_the_same_curve() -> None:
+def test_contact_search_bends_along_same_curve_for_any_joint_spacing() -> None:
     near, apart = felt_by(make_stage(13)), felt_by(make_stage(14, ("yaw", "pitch")))
     assert apart[::2] == pytest.approx(2.0 * near[::2]) and np.ptp(near) > 0.5
     assert not apart[1::2].any()
 
 
-def test_a_torque_is_felt_by_how_much_it_is_of_the_limit() -> None:
+def test_contact_search_scales_torque_by_its_limit() -> None:
     weak, strong = (felt_by(make_stage(torque_nm=limit_nm), 0.2 * limit_nm) for limit_nm in (3.5, 7.0))
     assert weak == pytest.approx(strong) and weak != pytest.approx(felt_by(make_stage()))
 
@@ -164,7 +164,7 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
 
 
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
-def test_a_body_that_moves_as_it_is_to_does_not_search_whatever_carries_it(speed_m_s: float) -> None:
+def test_contact_search_of_moving_body_does_not_start(speed_m_s: float) -> None:
     stage, controller = searching()
     stage.speed_m_s = speed_m_s
     moving = [controller.update(stage.observe(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
@@ -174,7 +174,7 @@ def test_a_body_that_moves_as_it_is_to_does_not_search_whatever_carries_it(speed
 @pytest.mark.parametrize(
     "pegs", [[], [Obstacle(name="p", shape="cylinder", position_w=(0.5, 0.12, 0.1), radius_m=0.05)]]
 )
-def test_a_body_in_a_u_that_nothing_can_push_is_no_error(pegs: list[Obstacle]) -> None:
+def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[Obstacle]) -> None:
     stage = make_stage()
     turn = np.linspace(-np.pi / 2, np.pi / 2, 40)
     bend = np.column_stack([0.7 + 0.12 * np.cos(turn), 0.12 + 0.12 * np.sin(turn)])

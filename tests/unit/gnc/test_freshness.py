@@ -94,7 +94,7 @@ def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
         ({"pose_timestamp_ns": 2**62}, "sensor/pose is stamped 4.61e+09 s ahead of the robot's clock"),
     ],
 )
-def test_a_world_model_is_as_old_as_what_it_was_made_of(made: dict[str, Any], words: str) -> None:
+def test_freshness_of_world_model_is_that_of_its_inputs(made: dict[str, Any], words: str) -> None:
     assert limits(pose=100.0, contacts=100.0).check_world(world(**made), NOW) == words
 
 

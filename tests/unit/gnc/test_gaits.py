@@ -28,7 +28,7 @@ def moved_m(record: RunRecord) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), pytest.param(-0.2, 1.0, marks=pytest.mark.slow)])
-def test_sidewinding_travels_sideways_and_to_the_side_that_is_asked_for(pitch_rad: float, side: float) -> None:
+def test_sidewinding_travels_sideways_to_the_requested_side(pitch_rad: float, side: float) -> None:
     along, across = moved_m(on_flat_ground("duration_s=5", f"control.pitch_rad={pitch_rad}").record)
     assert side * across > 0.8 and abs(along) < 0.6 * abs(across)
 
@@ -39,7 +39,7 @@ def test_rolling_travels_sideways() -> None:
 
 
 @pytest.mark.slow
-def test_a_raised_head_is_level_above_the_ground_and_looks_around() -> None:
+def test_raised_head_is_level_above_ground_and_looks_around() -> None:
     record = on_flat_ground("controller=raised_head", "duration_s=7").record
     shapes = [record.nodes_w(k) for k in range(400, 650)]
     heads = np.array([nodes[-2:] for nodes in shapes if nodes is not None])
@@ -55,7 +55,7 @@ def test_at_speed_zero_a_gait_stands() -> None:
 
 
 @pytest.mark.parametrize("gait", [Sidewinding, Rolling, RaisedHead])
-def test_a_bent_robot_that_cannot_do_it_stays_bent_and_says_why(gait: type[Controller[Any]]) -> None:
+def test_gait_of_bent_robot_keeps_shape_and_states_reason(gait: type[Controller[Any]]) -> None:
     stage = make_stage()
     controller = gait(stage.robot, gait.Parameters())
     commands = [controller.update(stage.observe(tick, 0.3)) for tick in range(200)]

@@ -89,6 +89,6 @@ def test_a_wrong_one_is_named(answer: Any) -> None:
         update(answer)
 
 
-def test_somebody_who_presses_ctrl_c_is_no_fault_of_the_controller() -> None:
+def test_guarded_keyboard_interrupt_is_no_controller_fault() -> None:
     with pytest.raises(KeyboardInterrupt):
         update(KeyboardInterrupt)

@@ -52,7 +52,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_the_configuration_is_in_force_first_with_its_schema_and_valid_parameters_make_the_controller_anew(
+def test_live_parameters_start_from_configuration_and_rebuild_the_controller(
     bench: Bench,
 ):
     reported = bench.in_force()

@@ -92,7 +92,7 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
 
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
-def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m: float) -> None:
+def test_margin_joints_do_not_work_against_each_other(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
     thrifty, smallest = (
         push_forward(nodes, touches, one, contact_gap_scale_m=0.005) for one in (slope, np.zeros_like(slope))
@@ -104,7 +104,7 @@ def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m:
 
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55])
-def test_dearer_contacts_leave_the_push_to_three_that_can_do_it_alone(tail_s_m: float) -> None:
+def test_margin_contacts_with_extra_cost_leave_push_to_others(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
     three = np.argsort(touches.body_s_m)[:3]
     dearer = np.full(len(touches), 1000.0)

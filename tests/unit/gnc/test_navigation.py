@@ -30,7 +30,7 @@ def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float
     return found.speed_m_s, found.reason
 
 
-def test_the_trajectory_is_as_old_as_the_world_model_that_it_was_planned_from() -> None:
+def test_trajectory_age_is_that_of_its_world_model() -> None:
     planner = KnownPath(ROUTE, [PEG], 0.15)
     blind = planner.update(0, None, MISSION)
     assert blind.assumed_obstacle_friction == 0.15
@@ -46,7 +46,7 @@ def test_the_path_ends() -> None:
     assert there.finished and there.speed_m_s == 0.0 and there.reason == "the path is finished"
 
 
-def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops_as_it_does_when_asked_to() -> None:
+def test_intent_expires_after_its_validity_and_robot_stops() -> None:
     intents = Intents(MISSION_M_S)
     assert desired(intents, None, 0.0) == (MISSION_M_S, "")
     asked = intent(1.0)
@@ -60,7 +60,7 @@ def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops_as_it_
     assert desired(intents, intent(60.2, go=False), 60.3) == (0.0, "ann wants it to stop")
 
 
-def test_an_intent_may_ask_for_less_time_and_gets_no_more_than_the_longest() -> None:
+def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> None:
     intents, brief = Intents(MISSION_M_S), intent(0.0, valid_for_ns=SECOND // 2)
     assert desired(intents, brief, 0.5)[0] == 0.1 and desired(intents, brief, 0.6)[0] == 0.0
     intents, endless = Intents(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
@@ -72,7 +72,7 @@ def test_an_intent_may_ask_for_less_time_and_gets_no_more_than_the_longest() -> 
 @pytest.mark.parametrize(
     ("at_s", "words"), [(20.2, "stamped 10.2 s ahead of the robot's clock"), (8.0, "has expired: it is 2 s old")]
 )
-def test_what_is_stamped_in_the_future_or_long_ago_is_refused(at_s: float, words: str) -> None:
+def test_intent_with_future_or_old_timestamp_is_refused(at_s: float, words: str) -> None:
     intents = Intents(MISSION_M_S)
     speed, why = desired(intents, intent(at_s), 10.0)
     assert speed == MISSION_M_S and words in why  # nobody has taken over from the mission
@@ -92,7 +92,7 @@ def test_nobody_goes_faster_than_a_mission_may(speed_m_s: float) -> None:
     assert speed == MISSION_M_S and f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
 
 
-def test_a_direction_holds_while_the_robot_stands_and_until_somebody_wants_the_mission_again() -> None:
+def test_intent_direction_holds_while_standing_until_mission_resumes() -> None:
     intents = Intents(MISSION_M_S)
     assert intents.desired(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
     expired = intents.desired(None, 2 * SECOND)
@@ -101,7 +101,7 @@ def test_a_direction_holds_while_the_robot_stands_and_until_somebody_wants_the_m
     assert intents.desired(intent(2.2), 2_200_000_000).heading_w_rad is None
 
 
-def test_after_another_start_of_the_robot_an_intent_of_before_does_not_count_at_the_same_time_again() -> None:
+def test_intent_before_a_robot_restart_is_ignored_afterwards() -> None:
     intents, asked = Intents(MISSION_M_S), intent(50.0)
     assert desired(intents, asked, 50.1)[0] == 0.1
     intents.start_over()
@@ -113,7 +113,7 @@ def test_after_another_start_of_the_robot_an_intent_of_before_does_not_count_at_
     assert desired(fresh, None, 0.0) == (MISSION_M_S, "")
 
 
-def test_what_a_sender_asked_for_before_its_stop_does_not_set_the_robot_in_motion_again() -> None:
+def test_intent_sent_before_a_stop_does_not_move_robot() -> None:
     intents = Intents(MISSION_M_S)
     assert desired(intents, intent(1.0, valid_for_ns=5 * SECOND), 1.1)[0] == 0.1
     assert desired(intents, intent(2.0, go=False, valid_for_ns=5 * SECOND), 2.1) == (0.0, "ann wants it to stop")

@@ -11,7 +11,7 @@ HELD_NM = 0.6  # that every joint is measured with
 
 
 @pytest.mark.parametrize("lost", ["world", "trajectory"])
-def test_from_torque_mode_it_goes_on_holding_with_the_torque_that_is_there(lost: str):
+def test_obstacle_aided_leaving_torque_mode_holds_with_present_torque(lost: str):
     stage = make_stage()
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
     observations = [stage.observe(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
@@ -26,7 +26,7 @@ def test_from_torque_mode_it_goes_on_holding_with_the_torque_that_is_there(lost:
     assert by_spring_nm == pytest.approx(HELD_NM, rel=0.1)
 
 
-def test_a_body_that_nothing_can_push_holds_its_shape_in_position_mode():
+def test_obstacle_aided_body_without_push_holds_in_position_mode():
     stage = make_stage()
     stage.pegs = []
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())

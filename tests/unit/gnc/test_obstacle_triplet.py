@@ -23,7 +23,7 @@ def stay(controller, stage, ticks, **more):
     return [controller.update(stage.observe(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
 
 
-def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved_triplet():
+def test_triplet_one_joint_pushes_while_all_others_hold_shape():
     stage = make_stage()
     command = stay(make_controller(stage), stage, 100)
     report = command.telemetry
@@ -49,7 +49,7 @@ def test_one_joint_pushes_all_others_hold_the_shape_and_the_report_is_the_solved
     assert 1 < known(report.condition) < 20
 
 
-def test_on_request_servos_lead_by_the_load_that_they_are_to_hold():
+def test_triplet_servo_targets_lead_by_load_when_requested():
     stage = make_stage()
     controller = make_controller(stage, load_ratio=1.0, load_filter_s=0.05)
     command = stay(controller, stage, 99)
@@ -85,7 +85,7 @@ def test_a_joint_that_has_swung_out_pushes_less():
         assert pushed[-1] == pytest.approx(share * 35.0, rel=0.05)
 
 
-def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():
+def test_triplet_joint_off_its_reference_returns_to_position_mode():
     stage = make_stage()
     stage.pegs = stage.pegs[1:4]
     controller = make_controller(stage, guard_s=0.5)
@@ -98,7 +98,7 @@ def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():
     assert joint in [controller.update(stage.observe(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(60, 80)]
 
 
-def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
+def test_triplet_saturated_joint_is_reported_with_reduced_force():
     stage = make_stage(torque_nm=1.0)
     command = stay(make_controller(stage), stage, 100)
     report = command.telemetry
@@ -109,7 +109,7 @@ def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
     assert abs(report.bending_torque_nm[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
 
 
-def test_the_torque_does_not_step_when_another_triplet_takes_over_the_same_joint():
+def test_triplet_hand_over_to_same_joint_keeps_torque_continuous():
     stage = make_stage()
     stage.pegs, tail_s_m = stage.pegs[:5], 0.2
     controller = make_controller(stage, stall_s=5.0)
@@ -151,7 +151,7 @@ def test_fewer_than_three_push_points_do_not_push(pegs):
     assert command.telemetry.reason
 
 
-def test_standing_still_is_told_and_a_jam_is_let_go_of():
+def test_triplet_standing_still_is_reported_and_jam_released():
     stage = make_stage()
     controller = make_controller(stage, stall_s=0.5, release_s=0.2)
     contacts = [make_contact("peg_1", (400.0, 0.0, 0.0)), make_contact("peg_2", (-390.0, 0.0, 0.0))]

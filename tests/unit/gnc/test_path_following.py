@@ -14,7 +14,7 @@ def make_controller(stage, **parameters) -> PathFollowing:
     return PathFollowing(stage.robot, PathFollowingParameters(**parameters))
 
 
-def test_a_held_body_is_asked_for_no_more_than_the_look_ahead():
+def test_path_following_held_body_is_commanded_at_most_look_ahead():
     stage = make_stage()
     controller = make_controller(stage, look_ahead_m=0.03)
     command = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(200)][-1]

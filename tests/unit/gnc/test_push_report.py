@@ -30,7 +30,7 @@ def pushing(pegs: Sequence[Obstacle]):
     return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), contact_gap_scale_m=0.005)
 
 
-def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
+def test_push_report_forces_sum_to_requested_push() -> None:
     world = make_world(obstacles=[peg("c", 0.9, -1), peg("a", 0.3, -1), peg("b", 0.6, 1)])
     touches, push = pushing(world.obstacles)
     reported = push_points(BODY, world, touches, push, 10.0)

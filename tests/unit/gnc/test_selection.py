@@ -60,7 +60,7 @@ def test_a_peg_is_met_at_its_inflection():
     ],
     ids=["ball on the left", "ball on the right", "corner of a turned box"],
 )
-def test_what_stands_beside_a_straight_path_is_met_where_it_is_nearest(y_m, shape, clearance_m):
+def test_selection_beside_straight_path_uses_nearest_obstacle_point(y_m, shape, clearance_m):
     contact = plan_contact(STRAIGHT, Obstacle(name="it", position_w=(2.0, y_m, 0.0), **shape), 0.04, **NEAR)
     assert contact.point_w == pytest.approx((2.0, 0.0), abs=1e-3)
     assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y_m)))
@@ -84,7 +84,7 @@ def test_push_points_are_those_that_the_body_covers():
         assert point.gap_m == pytest.approx(CLEARANCE_M, abs=2e-3)
 
 
-def test_a_body_that_is_off_the_path_is_too_far_from_its_push_points():
+def test_selection_body_off_path_is_too_far_from_push_points():
     near, _ = points_at(0.2, off_w=(0.07, 0.0))
     assert near  # that is mostly along the path
     far, _ = points_at(0.2, off_w=(0.0, 0.08))
@@ -112,7 +112,7 @@ def test_every_three_on_alternating_sides_are_a_triple(sides):
 
 
 @given(st.floats(0.0, 1.2), st.floats(0.05, 0.5), st.one_of(st.none(), st.integers(0, 12)))
-def test_the_propulsion_joint_is_the_first_ahead_of_the_middle_contact(behind, distance, present):
+def test_selection_propulsion_joint_is_first_ahead_of_middle_contact(behind, distance, present):
     joint = find_propulsion_joint(NODE_S, behind, behind + distance, present, 0.003)
     between = [i for i in range(13) if behind < NODE_S[i + 1] < behind + distance]
     if joint is None:
@@ -136,7 +136,7 @@ def choices_in_row(count=7):
     return [Choice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
 
 
-def test_the_present_triplet_stays_and_its_successor_shares_most_push_points():
+def test_selection_keeps_triplet_and_successor_shares_most_push_points():
     row = choices_in_row()
     assert choose_triplet(row, row[3].triplet, switch_fraction=0.5) is row[3]
     rest = [row[0], row[1], row[4], row[6]]

@@ -54,7 +54,7 @@ PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  #
 
 def cause(**more):
     given = {
-        "wanted_n": 35.0,
+        "desired_n": 35.0,
         "force_n": 30.0,
         "net_force": along(*PUSHED),
         "push_points": ("peg_0", "peg_1", "peg_2"),
@@ -67,7 +67,7 @@ def cause(**more):
     return explain(**{**given, **more})
 
 
-def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
+def test_stall_contacts_that_carry_load_are_no_jam():
     stall = cause()
     assert not stall.jammed and not stall.release_triplet
     assert stall.reason == (
@@ -83,9 +83,9 @@ def test_a_push_point_that_is_not_felt_is_named():
 
 
 @pytest.mark.parametrize("saturated", [None, "joint_7"])
-@pytest.mark.parametrize("wanted_n", [8.0, 35.0, 300.0])
-def test_a_body_that_touches_nothing_is_not_jammed(wanted_n, saturated):
-    stall = cause(wanted_n=wanted_n, net_force=along(), weight_n=40.0, saturated=saturated)
+@pytest.mark.parametrize("desired_n", [8.0, 35.0, 300.0])
+def test_a_body_that_touches_nothing_is_not_jammed(desired_n, saturated):
+    stall = cause(desired_n=desired_n, net_force=along(), weight_n=40.0, saturated=saturated)
     assert not stall.jammed and not stall.release_triplet and "no obstacle touches the body" in stall.reason
 
 
@@ -111,13 +111,13 @@ def test_a_jam_is_what_obstacles_hold_back():
         (
             {"saturated": "joint_7"},
             "contacts push it on with 29.5 N, too little against the friction of the ground; "
-            "joint_7 at its limit of torque gives no more of the 35.0 N wanted",
+            "joint_7 at its limit of torque gives no more of the 35.0 N desired",
         ),
         ({"weight_n": 40.0}, ""),
-        ({"swung": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N wanted"),
+        ({"swung": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N desired"),
     ],
 )
-def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given, words):
+def test_stall_straining_body_that_stands_is_released_without_jam(given, words):
     stall = cause(**given)
     assert stall.release_triplet and not stall.jammed
     assert words in stall.reason and not stall.reason.startswith("jam")

@@ -63,7 +63,7 @@ def test_a_body_that_stops_stands_still_a_second_later():
             assert advance.distance_m is not None and advance.distance_m < 0.005
 
 
-def test_nothing_is_known_before_the_first_measurement_and_after_a_time_without_any_it_begins_anew():
+def test_states_are_unknown_before_first_sample_and_after_a_gap():
     advance = RecentAdvance()
     assert advance.distance_m is None
     advance.add(0.0, (0.0, 0.0, 0.0))

@@ -98,7 +98,7 @@ def test_nothing_depends_on_where_the_world_is(case, turn, x, y):
 
 
 @given(cases())
-def test_a_mirror_image_has_the_same_forces_and_the_opposite_torque(case):
+def test_statics_of_mirror_image_has_equal_forces_opposite_torque(case):
     mirror = np.array([1.0, -1.0])
     mirrored = Case(case.points * mirror, case.normals * mirror, case.tangent * mirror, case.joint * mirror).solve()
     solved = case.solve()
@@ -116,7 +116,7 @@ def test_forces_scale_with_propulsion_and_torque_also_with_size(case, force, siz
 
 
 @given(cases())
-def test_the_papers_equations_1_to_11_with_the_corrected_one_give_the_same(case):
+def test_statics_agrees_with_corrected_paper_equations(case):
     """Equation (3) is used as f_tau = (r x tau)/|r|^2, and (5)-(9) accordingly; unknown are lambda_1, lambda_2, tau."""
     o_1, o_2, o_3 = case.points
     n_1, n_2, n_3 = case.normals
@@ -145,7 +145,7 @@ def test_the_papers_equations_1_to_11_with_the_corrected_one_give_the_same(case)
 
 
 @given(cases(), st.lists(st.tuples(st.floats(-0.2, 0.9), st.floats(-0.3, 0.3)), min_size=1, max_size=8))
-def test_bending_torque_is_the_same_from_ahead_and_from_behind_and_at_the_propulsion_joint_its_torque(case, joints):
+def test_statics_bending_torque_from_head_and_tail_agrees(case, joints):
     places = np.array([0.0, 0.3, 0.6])
     solved = case.solve()
     pushed = add_tether(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
@@ -182,7 +182,7 @@ def test_conditioning_is_a_choice():
 
 
 @pytest.mark.parametrize("from_contact_m", [0.1, 0.0])
-def test_a_joint_on_the_third_normal_or_at_its_contact_has_no_authority(from_contact_m):
+def test_statics_joint_at_contact_or_third_normal_has_no_authority(from_contact_m):
     case = at_inflections(0.3)
     solved = replace(case, joint=case.points[2] - from_contact_m * case.normals[2]).solve()
     assert not solved.feasible

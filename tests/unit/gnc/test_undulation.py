@@ -36,9 +36,7 @@ def test_the_wave_travels_from_head_to_tail() -> None:
 
 
 @pytest.mark.parametrize(("lag_rad", "bends"), [(0.9, 1.0), (-0.9, -1.0)])
-def test_the_head_steers_towards_the_path_and_against_its_bend_if_the_wave_goes_to_it(
-    lag_rad: float, bends: float
-) -> None:
+def test_undulation_head_steers_to_path_and_against_its_bend(lag_rad: float, bends: float) -> None:
     stage = make_stage()
     straight = references(LateralUndulation(stage.robot, LateralUndulationParameters(lag_rad=lag_rad)), stage, 1)
     stage.route = Route([(0.0, 0.0), (2.0, 0.0), (2.0, 3.0)])
@@ -46,7 +44,7 @@ def test_the_head_steers_towards_the_path_and_against_its_bend_if_the_wave_goes_
     assert bends * (np.mean(steered[0]) - np.mean(straight[0])) > 0.01
 
 
-def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> None:
+def test_undulation_standing_body_is_pushed_harder_up_to_limit() -> None:
     stage = make_stage()
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters(max_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE))
     first, *_, last = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(400)]
@@ -71,7 +69,7 @@ def test_a_scaled_push_is_turned_round() -> None:
     assert forward @ back < 0 and np.abs(still[-1] - still[0]).max() < 1e-6
 
 
-def test_a_push_reckons_with_the_friction_that_the_path_was_planned_with() -> None:
+def test_undulation_push_uses_friction_of_the_planned_path() -> None:
     tilts: list[float] = []
     for friction in (0.0, 0.2):
         stage = make_stage()
@@ -89,7 +87,7 @@ def test_a_push_of_random_sign_goes_both_ways() -> None:
     assert along.max() > 0.0 > along.min()
 
 
-def test_a_compliant_wave_shrinks_where_it_meets_resistance_and_not_otherwise() -> None:
+def test_undulation_compliant_wave_shrinks_only_at_resistance() -> None:
     stage, parameters = make_stage(), CompliantUndulationParameters(softness_rad_per_nm=0.1, steering=0.0)
 
     def largest(resistance: float) -> float:
@@ -114,7 +112,7 @@ def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
     assert all(one == held[0] for one in held)
 
 
-def test_a_jammed_wave_travels_the_other_way_for_a_while_and_one_that_comes_on_does_not() -> None:
+def test_undulation_jammed_wave_reverses_for_a_while() -> None:
     parameters = CompliantUndulationParameters(softness_rad_per_nm=0.0, steering=0.0, jam_after_s=0.5, back_s=0.3)
     stage = make_stage()
     jammed, free = (references(CompliantUndulation(stage.robot, parameters), stage, 200, speed) for speed in (0.0, 0.2))

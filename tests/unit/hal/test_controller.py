@@ -54,7 +54,7 @@ def test_a_subclass_with_update_alone_has_all_defaults() -> None:
     assert command.setpoints.target == list(state(robot).angle_rad)
 
 
-def test_parameters_are_checked_by_the_controllers_struct_and_errors_name_file_or_flag() -> None:
+def test_controller_parameters_are_checked_by_struct_naming_file_or_flag() -> None:
     assert decode_parameters(Gained, {"gain": 2.0}, "a.toml", "controllers.p").gain == 2.0
     with pytest.raises(ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"):
         decode_parameters(Gained, {"gian": 1}, "a.toml", "controllers.p")
@@ -83,7 +83,7 @@ def test_a_shipped_controller_declares_only_what_the_base_class_knows(name: str)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_declarations_of_a_shipped_controller_have_the_types_of_the_base_class(name: str) -> None:
+def test_controller_shipped_declarations_have_types_of_base_class(name: str) -> None:
     controller = load_controller(name)
     assert issubclass(controller.Parameters, msgspec.Struct)
     for declaration in DECLARATIONS - {"Parameters"}:
@@ -125,7 +125,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_preflight_refuses_what_is_no_controller_and_says_how_to_write_one(wrong: str, tmp_path: Path) -> None:
+def test_controller_preflight_refuses_other_classes_with_instructions(wrong: str, tmp_path: Path) -> None:
     text, words = WRONG[wrong]
     file = tmp_path / "wave.py"
     file.write_text(text)

@@ -23,19 +23,24 @@ MODULE_FAULTS = {  # made of the names of fault bits and states
 }
 
 
-def iterate_sources() -> Iterator[ast.Module]:
+CODE_NODES = (ast.Assign, ast.Call, ast.Constant, ast.FunctionDef, ast.keyword)
+
+
+def iterate_nodes() -> Iterator[ast.AST]:
+    """Every node of the product's source that may hold a code."""
     for path in sorted(REPOSITORY.glob("snakesim*/**/*.py")):
         if path.name not in REGISTRIES and path.parts[len(REPOSITORY.parts)] != "snakesim_testing":
-            yield ast.parse(path.read_text(encoding="utf-8"))
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            yield from (node for node in ast.walk(tree) if isinstance(node, CODE_NODES))
 
 
 def find_texts(node: ast.AST) -> set[str]:
     return {part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)}
 
 
-def find_codes(source: ast.Module) -> Iterator[str]:
+def find_codes(nodes: list[ast.AST]) -> Iterator[str]:
     """The texts that `code` is set to: as an argument, as a default of a class, as a constant, or returned."""
-    for node in ast.walk(source):
+    for node in nodes:
         match node:
             case ast.keyword(arg="code", value=value) | ast.Assign(targets=[ast.Name(id="code")], value=value):
                 yield from find_texts(value)
@@ -47,27 +52,29 @@ def find_codes(source: ast.Module) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def sources() -> list[ast.Module]:
-    return list(iterate_sources())
+def nodes() -> list[ast.AST]:
+    return list(iterate_nodes())
 
 
-def test_codes_of_errors_are_those_of_the_registry(sources: list[ast.Module]) -> None:
-    used = {code for source in sources for code in find_codes(source) if re.fullmatch(r"[a-z0-9]+/[a-z-]+", code)}
+def test_codes_of_errors_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
+    used = {code for code in find_codes(nodes) if re.fullmatch(r"[a-z0-9]+/[a-z-]+", code)}
     assert used == set(ERROR_CODES)
 
 
-def test_faults_are_those_of_the_registry(sources: list[ast.Module]) -> None:
-    texts = {text for source in sources for text in find_texts(source)}
+def test_faults_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
+    constants = [node.value for node in nodes if isinstance(node, ast.Constant)]
+    texts = {value for value in constants if isinstance(value, str)}
     assert set(FAULT_CODES) - texts <= MODULE_FAULTS
     assert set(REFUSAL_CODES) <= texts
     used: set[str] = set()
-    for source in sources:
-        for node in ast.walk(source):
-            match node:
-                case ast.Call(func=ast.Name(id="Fault"), keywords=keywords):
-                    used |= {text for word in keywords if word.arg == "what" for text in find_texts(word.value)}
-                case ast.Call(func=ast.Name(id="Finding" | "report"), args=[ast.Constant(value=str(word)), *_]):
-                    used.add(word)
+    for node in nodes:
+        match node:
+            case ast.Call(func=ast.Name(id="Fault"), keywords=keywords):
+                used |= {text for word in keywords if word.arg == "what" for text in find_texts(word.value)}
+            case ast.Call(func=ast.Name(id="Finding" | "report"), args=[ast.Constant(value=str(word)), *_]):
+                used.add(word)
+            case _:
+                pass
     assert used <= set(FAULT_CODES)
 
 

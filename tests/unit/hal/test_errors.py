@@ -31,6 +31,6 @@ def described(folder: Path, package: str) -> str:
         ("site-packages", "another", r"_linalg.py line \d+"),
     ],
 )
-def test_a_line_of_the_plugin_is_named_and_none_of_numpy(tmp_path: Path, folder: str, package: str, place: str) -> None:
+def test_error_location_is_plugin_line_and_not_of_numpy(tmp_path: Path, folder: str, package: str, place: str) -> None:
     said = described(tmp_path / folder, package)
     assert re.fullmatch(rf"raised LinAlgError: Singular matrix \({place}\)", said)

@@ -98,7 +98,7 @@ def test_a_request_is_checked_like_a_text() -> None:
 
 
 @given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
-def test_a_plan_gives_every_change_once_in_the_order_of_time(given_: list[Injection], looks: list[float]) -> None:
+def test_injection_plan_yields_each_change_once_in_time_order(given_: list[Injection], looks: list[float]) -> None:
     plan, seen = InjectionPlan(given_), []
     for now_s in [*sorted(looks), inf]:
         due = plan.until(now_s)
@@ -142,7 +142,7 @@ def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
         check_backend_can(run_config(faults=["cut:bus_2@1"]), **does)
 
 
-def test_a_host_by_itself_refuses_what_only_a_run_can_do() -> None:
+def test_injection_by_host_alone_refuses_killing_processes() -> None:
     check_without_run(run_config(faults=["hang:control@1", "mute:joint_2@1"]))
     with raises_error(ConfigError, code="injection/not-supported"):
         check_without_run(run_config(faults=["mute:joint_2@1", "kill:control@1"]))

@@ -25,7 +25,7 @@ class Undemanding(Service):
         return []
 
 
-def test_nobody_is_there_before_it_hears_the_joints_because_once_armed_they_are_not_sent_again() -> None:
+def test_service_waits_for_the_joints_before_it_answers_ticks() -> None:
     network = LocalNetwork()
     hal = network.session()
     hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)

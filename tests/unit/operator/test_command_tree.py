@@ -123,7 +123,7 @@ def test_a_package_adds_a_noun_and_a_command(monkeypatch: pytest.MonkeyPatch) ->
         assert "arm_rest" in make_parser().format_help()
 
 
-def test_a_command_without_its_noun_is_reported_and_the_others_work(
+def test_command_without_noun_is_reported_and_others_work(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     added(monkeypatch)

@@ -19,7 +19,7 @@ def test_the_latency_timer_is_the_adapters(tmp_path: Path) -> None:
     assert latency_s("/dev/pts/3", tmp_path) == 0.0
 
 
-def test_a_port_is_for_one_alone_and_what_came_too_late_is_thrown_away(tmp_path: Path) -> None:
+def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -> None:
     pty, log = Pty(), tmp_path / "bytes.txt"
     with log.open("w") as file:
         wire = SerialWire(pty.path, 1_000_000, file)
@@ -60,7 +60,7 @@ def test_a_port_that_is_not_there_is_named() -> None:
         SerialWire("/dev/ttyUSB77", 57600)
 
 
-def test_a_computer_that_pauses_in_a_write_has_not_lost_its_port(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_serial_port_survives_a_pause_of_the_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     pty = Pty()
     wire = SerialWire(pty.path, 1_000_000)
     write = serial.Serial.write

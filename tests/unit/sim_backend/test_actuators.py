@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.model import build
+from snakesim_sim_backend.model.build import build
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config
@@ -36,7 +36,7 @@ def test_a_motor_without_response_time_answers_at_once():
     assert torque(run) == pytest.approx(0.0, abs=NOTHING)
 
 
-def test_before_the_first_command_there_is_no_torque_even_when_spun_beyond_the_limit_of_speed():
+def test_actuator_before_first_command_has_no_torque_at_any_speed():
     run = fast_run()
     run.sim.data.qvel[6] = 20.0
     for _ in range(50):
@@ -45,7 +45,7 @@ def test_before_the_first_command_there_is_no_torque_even_when_spun_beyond_the_l
 
 
 @pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
-def test_torque_stays_within_the_robot_s_and_the_command_s_limit(mode):
+def test_actuator_torque_stays_within_robot_and_command_limits(mode):
     run = fast_run(HEAVY_ROTOR)
     run.command(mode, -100.0, limit=50.0)
     run.go(0.2)
@@ -55,7 +55,7 @@ def test_torque_stays_within_the_robot_s_and_the_command_s_limit(mode):
     assert torque(run) == pytest.approx(-1.5)
 
 
-def test_a_lowered_limit_takes_hold_no_faster_than_the_motor_can_follow():
+def test_actuator_lowered_limit_applies_at_motor_response():
     run = fast_run(HEAVY_ROTOR)
     run.command(Mode.TORQUE, 6.0)
     run.go(0.2)
@@ -84,7 +84,7 @@ def test_the_motor_does_not_drive_a_joint_beyond_its_speed():
     assert torques[-1] < 0.1
 
 
-def test_below_nine_tenths_of_the_speed_the_full_torque_is_there():
+def test_actuator_below_nine_tenths_speed_has_full_torque():
     run = fast_run(HEAVY_ROTOR)
     limit = run.config.robot.limits.speed_rad_s
     run.sim.data.qvel[6] = 0.85 * limit
@@ -96,7 +96,7 @@ def test_below_nine_tenths_of_the_speed_the_full_torque_is_there():
 
 @pytest.mark.parametrize("before", list(Mode))
 @pytest.mark.parametrize("after", list(Mode))
-def test_a_change_of_mode_moves_the_torque_only_as_the_motor_responds(before, after):
+def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
     targets = {Mode.PASSIVE: 0.0, Mode.POSITION: 0.1, Mode.VELOCITY: 1.5, Mode.TORQUE: -2.0}
     run = fast_run(HEAVY_ROTOR)
     robot = run.config.robot

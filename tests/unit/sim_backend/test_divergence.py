@@ -11,7 +11,7 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config
 
 
-def test_a_runaway_names_tick_joint_and_value_and_the_last_good_state_stays():
+def test_divergence_names_tick_joint_and_value_and_keeps_last_state():
     run = Run(make_config())
     run.command(Mode.POSITION, 0.1)
     run.go(0.1)

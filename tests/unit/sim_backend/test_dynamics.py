@@ -15,9 +15,9 @@ ICE = {"ground": {"friction": 0.0}}
 
 def loads_n(run: Run) -> NDArray[np.float64]:
     """On every foot."""
-    ground = run.sim.physics.ground
-    assert ground is not None
-    return ground.normal_force_n
+    forces_n = run.sim.physics.laws.foot_forces_n
+    assert forces_n is not None
+    return forces_n
 
 
 def kinetic_energy(run):
@@ -107,7 +107,7 @@ def test_a_snake_that_slides_does_not_hop():
 
 @pytest.mark.parametrize("along", [(1.0, 0.0), (0.0, 1.0), (0.7, -0.7)])
 @pytest.mark.parametrize(("tilt", "slides"), [(0.9, False), (1.1, True)])
-def test_a_snake_on_a_slope_slides_only_beyond_the_angle_of_friction(along, tilt, slides):
+def test_snake_on_slope_slides_only_beyond_friction_angle(along, tilt, slides):
     friction = 0.3
     run = Run(make_config({"chain": {"modules": 8}}, {"ground": {"friction": friction}}))
     run.command([Mode.POSITION] * 8, CURLED)
@@ -156,7 +156,7 @@ def test_sliding_along_an_obstacle_rubs_with_the_obstacle_s_friction(obstacle):
     assert np.median(ratios) == pytest.approx(friction, rel=0.02, abs=1e-6)
 
 
-def test_the_contact_force_of_a_snake_pushed_at_a_peg_is_the_push():
+def test_contact_force_of_snake_pushed_at_peg_equals_push():
     peg = {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "name": "post"}]}
     run = Run(make_config({"chain": {"modules": 4}}, {**ICE, **peg}))
     run.command(Mode.POSITION)

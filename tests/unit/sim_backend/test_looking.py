@@ -12,7 +12,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
-from snakesim_sim_backend.flat_ground import SINK_M
+from snakesim_sim_backend.laws.flat_ground import SINK_M
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config
 
@@ -45,7 +45,7 @@ def metres(image):
     return np.where(counts > 0, counts * image.scale_m, np.nan)
 
 
-def test_a_post_ahead_is_as_far_and_as_wide_as_geometry_says():
+def test_depth_of_a_post_has_geometric_distance_and_width():
     image = seen(looking(POST))
     depth_m = metres(image)
     row, middle = depth_m[int(image.cy_px)], int(image.cx_px)
@@ -71,7 +71,7 @@ def test_the_ground_is_as_far_as_height_and_pitch_say():
     assert np.isnan(depth_m[~below]).all()
 
 
-def test_a_camera_looks_where_its_yaw_and_pitch_and_its_message_say():
+def test_camera_points_along_its_yaw_pitch_and_message():
     ball = {"sphere": [{"position_m": [0.7, 1.0], "radius_m": 0.1, "center_height_m": 0.9}]}
     run = looking(ball, link=6, position_m=[0.05, 0.0, 0.1], yaw_rad=1.4, pitch_rad=-0.6)
     image = seen(run)
@@ -86,7 +86,7 @@ def test_a_camera_looks_where_its_yaw_and_pitch_and_its_message_say():
     assert np.linalg.norm(point_w - [0.7, 1.0, 0.9]) == pytest.approx(0.1, abs=0.003)
 
 
-def test_the_robot_sees_its_own_body_but_not_the_link_that_carries_the_camera():
+def test_camera_sees_body_but_not_its_own_link():
     back = {"position_m": [0.02, 0.0, 0.2], "yaw_rad": 3.1415, "pitch_rad": 0.3}
     image = seen(looking(**back))
     bottom = metres(image)[-1, 80]
@@ -137,7 +137,7 @@ def test_noise_and_dropouts_have_the_size_of_the_robot_file():
     assert np.nanstd(found * np.cos(angles)) == pytest.approx(0.01, rel=0.1)
 
 
-def test_a_sonar_of_ones_own_is_a_file_and_a_line_in_the_robot_file():
+def test_custom_sonar_is_one_file_and_one_robot_line():
     """The example of docs/how-to/custom-sensors.md."""
     sonar = {"model": f"{Path(__file__).parents[3] / 'examples' / 'sonar.py'}:Sonar", "settings": {"cone_rad": 0.5}}
     aside = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.2], "radius_m": 0.05, "height_m": 1.0}]}
@@ -167,7 +167,7 @@ def test_rendered_depth_is_that_of_the_rays():
     assert np.quantile(off_m, 0.99) < 0.004
 
 
-def test_a_colour_image_comes_beside_the_depth_and_shows_the_same():
+def test_color_image_accompanies_depth_and_shows_the_same():
     run = rendered(color=True)
     image = seen(run, keys.color_key("head"))
     assert isinstance(image, ColorImage)

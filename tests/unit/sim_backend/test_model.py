@@ -10,7 +10,7 @@ from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
 
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
-def test_masses_lengths_limits_and_motors_are_those_of_the_robot_file(name):
+def test_model_masses_lengths_limits_and_motors_match_robot_file(name):
     config = make_config({"motor": {"friction_nm": 0.12, "viscous_nm_s_per_rad": 0.03}}, base_robot=name)
     robot, model = config.robot, open_sim(config).sim.model
     links = [model.body(f"link_{i}") for i in range(robot.chain.modules + 1)]
@@ -35,7 +35,7 @@ def test_masses_lengths_limits_and_motors_are_those_of_the_robot_file(name):
     ]
 
 
-def test_inertia_of_a_link_is_that_of_a_capsule_of_its_mass():
+def test_model_link_inertia_is_that_of_a_capsule():
     config = make_config()
     model = open_sim(config).sim.model
     r, length, mass = config.robot.module.radius_m, config.robot.module.length_m, config.robot.module.mass_kg

@@ -49,7 +49,7 @@ def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
     assert run.sim.true_state().contacts == []
 
 
-def test_an_obstacle_may_be_called_as_a_link_or_the_ground():
+def test_obstacle_may_have_the_name_of_a_link():
     pegs = [
         {"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])
     ]

@@ -12,10 +12,10 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.model.tether import WINCH_N_S_PER_M
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, Tether
-from snakesim_sim_backend.tether import WINCH_N_S_PER_M
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import G, Run, make_config
@@ -135,7 +135,7 @@ def test_without_torque_it_stays_where_it_lies():
 # --- torques ------------------------------------------------------------------------------------------------------
 
 
-def test_a_free_joint_speeds_up_as_its_links_and_rotor_allow_and_the_gauge_feels_the_links_alone():
+def test_free_joint_accelerates_by_inertia_and_gauge_measures_links():
     """Two equal bars, straight and free, open about their joint without pushing each other: inertia is half a bar's."""
     rotor, torque = 0.004, 0.03
     config = make_config({"chain": {"modules": 1}, "motor": {"armature_kg_m2": rotor}}, ICE)
@@ -147,7 +147,7 @@ def test_a_free_joint_speeds_up_as_its_links_and_rotor_allow_and_the_gauge_feels
     assert physics_model.shaft_torque_nm()[0] == pytest.approx(torque - rotor * expected, rel=1e-3)
 
 
-def test_a_joint_stops_at_its_limit_and_the_gauge_feels_the_motor_push_there():
+def test_joint_at_its_limit_stops_and_gauge_measures_motor():
     physics_model = make_physics_model(make_config({**FOUR, "limits": {"angle_rad": 0.3}}, ICE))
     pass_time(physics_model, [0.0, 0.4, 0.0, 0.0], seconds=2.0)
     assert physics_model.angle_rad[1] == pytest.approx(0.3, abs=5e-3)
@@ -155,7 +155,7 @@ def test_a_joint_stops_at_its_limit_and_the_gauge_feels_the_motor_push_there():
     assert physics_model.shaft_torque_nm()[1] == pytest.approx(0.4, rel=1e-2)
 
 
-def test_at_rest_the_shaft_has_the_motor_s_torque_less_what_dry_friction_holds():
+def test_shaft_at_rest_has_motor_torque_minus_dry_friction():
     """Friction of the ground holds the links, so nothing moves: first without, then with dry friction in the joints."""
     grippy = {"ground": {"friction": 1.0}}
     held = [0.02, -0.01, 0.03, 0.0]
@@ -188,7 +188,7 @@ def test_in_motion_the_shafts_carry_what_the_outer_links_need(motor):
     assert np.ptp(physics_model.angle_rad) > 0.3
 
 
-def test_a_position_loop_run_once_a_step_moves_it_as_the_simulator_s_own_motors_do():
+def test_position_loop_once_a_step_equals_simulator_motors():
     """All the way within a thousandth of the motion, and the torques within 3 % of the greatest."""
     config = make_config({"chain": {"modules": 6}}, rate_hz=1000)
     physics_model, run = make_physics_model(config), Run(config, timestep_s=0.001)
@@ -213,14 +213,14 @@ def test_a_position_loop_run_once_a_step_moves_it_as_the_simulator_s_own_motors_
 # --- what is felt -------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_felt_where_nothing_touches_but_the_ground_nor_by_a_robot_without_imus():
+def test_contact_forces_without_contact_or_imus_are_zero():
     physics_model = make_physics_model(make_config({"sensors!": {"joints": {}}}))
     assert physics_model.loads() == []
     pass_time(physics_model)
     assert physics_model.loads() == [] and physics_model.imu() is None
 
 
-def test_a_motor_that_bends_the_snake_between_three_pegs_feels_the_moment_of_their_pushes():
+def test_motor_between_three_pegs_measures_their_moment():
     """A peg on the left of its middle and one on the right of each end: bent to the right, it is jammed."""
     places = [(0.03, -0.0905), (0.24, 0.0905), (0.62, -0.0905)]
     pegs = {"cylinder": [{"position_m": list(place), "radius_m": 0.05} for place in places]}
@@ -265,7 +265,7 @@ def test_loads_are_the_sums_of_the_true_touches(friction):
     assert most_on_one > 1
 
 
-def test_imus_feel_what_they_would_if_they_were_computed_in_every_step():
+def test_imu_samples_equal_those_computed_every_step():
     physics_model = make_physics_model(make_config(scene=PEG))
     model, other = physics_model.sim.model, mujoco.MjData(physics_model.sim.model)
     for k in range(300):
@@ -321,7 +321,7 @@ def test_a_tether_tows_it():
 
 
 @pytest.mark.parametrize("torque", [math.nan, math.inf, 1e12])
-def test_what_blows_up_is_reported_at_once_and_for_good_and_no_number_is_lost(torque):
+def test_diverging_physics_is_reported_at_once_and_permanently(torque):
     config = make_config()
     physics_model = make_physics_model(config)
     pass_time(physics_model, seconds=0.01)
@@ -340,7 +340,7 @@ def test_what_blows_up_is_reported_at_once_and_for_good_and_no_number_is_lost(to
     assert np.array_equal(physics_model.angle_rad, good)
 
 
-def test_a_firmware_that_swings_up_is_found_out_and_the_joint_named():
+def test_oscillating_firmware_is_detected_and_joint_named():
     """A stiff loop, with a light rotor and no lag, whose damping acts too strongly for the step."""
     physics_model = make_physics_model(make_config({"motor": {"armature_kg_m2": 1e-6}}, ICE))
     with raises_error(BackendError, code="simulator/diverged"):

@@ -20,7 +20,7 @@ def overheat(end_s: float = inf) -> Injection:
     return Injection("overheat", "joint_3", 0.0, end_s)
 
 
-def test_power_comes_at_its_rate_and_a_cold_robot_is_at_ambient():
+def test_power_sample_keeps_its_rate_and_starts_at_ambient():
     run = Run(make_config(WITH))
     sensor = SensorDescription(key=keys.POWER, rate_hz=5.0, delay_s=0.0)
     assert sensor in run.sim.describe().sensors

@@ -77,7 +77,7 @@ def test_weak_touches_go_unfelt():
     assert run.sensed(Contacts).contacts == []
 
 
-def test_an_imu_on_a_spinning_snake_feels_the_pull_to_the_centre():
+def test_imu_on_spinning_snake_measures_centripetal_acceleration():
     run = Run(make_config(scene={"ground": {"friction": 0.0}}))
     spin, middle = 2.0, 13 * 0.11 / 2
     run.sim.data.qvel[5] = spin
@@ -91,7 +91,7 @@ def test_an_imu_on_a_spinning_snake_feels_the_pull_to_the_centre():
     assert np.array(imu.acceleration_m_s2)[:, 0] == pytest.approx(-(spin**2) * (centers - middle), abs=0.05)
 
 
-def test_pose_velocities_are_the_change_of_the_pose_in_the_world():
+def test_pose_velocity_is_the_derivative_of_pose():
     run = Run(make_config(scene={"ground": {"friction": 0.0}}, rate_hz=1000))
     run.sim.data.qvel[:6] = [0.3, -0.2, 0.0, 0.0, 0.0, 1.5]
     run.go(0.3)
@@ -151,7 +151,7 @@ def test_noise_has_the_deviations_of_the_robot_file():
         (100, 1000.0, [0, 1, 2, 3, 4]),
     ],
 )
-def test_a_sensor_is_due_whenever_a_period_of_its_own_has_passed(tick_hz, sensor_hz, due):
+def test_sensor_is_due_after_each_of_its_periods(tick_hz, sensor_hz, due):
     run = Run(make_config({"chain": {"modules": 1}, "sensors": {"pose": {"rate_hz": sensor_hz}}}, rate_hz=tick_hz))
     ticks = []
     for _ in range(due[-1] + 1):

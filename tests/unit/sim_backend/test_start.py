@@ -7,8 +7,8 @@ import pytest
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.scenario import find_start_pose, load
 from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.flat_ground import SINK_M
-from snakesim_sim_backend.ground import make_heights
+from snakesim_sim_backend.laws.flat_ground import SINK_M
+from snakesim_sim_backend.model.ground import make_heights
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import Run, make_config
 
@@ -33,7 +33,7 @@ def stays(run, seconds=1.0, within_m=2e-3):
     assert np.abs(end.velocities_rad_s).max() < 0.02
 
 
-def test_on_flat_ground_it_lies_at_its_start_at_rest_at_time_0():
+def test_start_on_flat_ground_is_at_rest_at_time_zero():
     config = load("triplet").config
     run = Run(config)
     state, pose = run.sim.true_state(), find_start_pose(config)
@@ -46,7 +46,7 @@ def test_on_flat_ground_it_lies_at_its_start_at_rest_at_time_0():
     stays(run)
 
 
-def test_hills_have_the_height_asked_for_and_repeat_for_a_seed():
+def test_start_hills_have_requested_height_and_repeat_for_seed():
     uneven = uneven_of(make_config(scene=HILLS))
     heights = make_heights(uneven)
     assert (heights.min(), heights.max()) == pytest.approx((-0.03, 0.03))

@@ -33,7 +33,7 @@ def test_it_does_not_hold_along_its_own_pull():
     assert run.sim.true_state().base_position_w[0] == pytest.approx(-0.5 * 1.0 / 1.2, rel=0.05)
 
 
-def test_it_hardly_holds_to_the_side_and_without_a_tether_there_is_no_tension():
+def test_tether_hardly_holds_sideways_and_has_tension_only_if_present():
     run, free = pulled([0.0, 0.5, 0.0]), pulled([0.0, 0.5, 0.0], tether=None)
     run.go(0.5)
     free.go(0.5)

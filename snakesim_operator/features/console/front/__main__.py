@@ -52,7 +52,11 @@ def _run(arguments: argparse.Namespace) -> int:
 async def _serve_until_signal(server: FrontServer) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
-    on_stop_signal(lambda: loop.call_soon_threadsafe(ended.set))
+
+    def end() -> None:
+        loop.call_soon_threadsafe(ended.set)
+
+    on_stop_signal(end)
     await server.run(ended)
 
 

@@ -16,12 +16,12 @@ from typing import Protocol
 from snakesim_hal.base.workers import ErrorReport
 from snakesim_operator.base.byte_relay import relay_bytes
 from snakesim_operator.features.console.front.requests import (
-    MAX_HEAD_BYTES,
     BadRequest,
     FrontRequest,
     check_head,
     read_head,
 )
+from snakesim_operator.features.console.front.waiting import Connection, WaitingConnections
 
 STOP_PATH = "/stop"
 REQUESTER = "a page's second stop"
@@ -31,10 +31,10 @@ MAX_WAITING = 256  # connections whose request is not complete; a browser opens 
 MAX_PAGES = 160  # connections to the page server; each page has one, and a few more while it loads
 MAX_AT_STOP = 64  # connections that have shown the token, and request a stop or ask whether it is ready
 HEAD_LIMIT_S = 10.0  # from the connection to the end of its request's head
-KEEP_LIMIT_S = 10.0  # from one request for the stop to the next one over the same connection; pages send one a second
+KEEP_LIMIT_S = 90.0  # between two requests for the stop; a page sends one a second, in the background one a minute
 BACKLOG = 1024  # connections that the kernel keeps until they are accepted; it may have a lower limit
 MAX_ACCEPTED_AT_ONCE = 32  # then the requests that have arrived are read
-TEST_PERIOD_S = 0.1  # how often the stop's self-test is started if it is due
+POLL_S = 0.1  # how often old requests are closed, and the stop's self-test is started if it is due
 
 REASONS = {
     200: "OK",
@@ -104,44 +104,43 @@ class FrontServer:
         self._reported: set[str] = set()
         self._errors = ErrorReport("console front")
         # Connections.
-        self._waiting: dict[asyncio.StreamWriter, None] = {}  # oldest first
+        self._waiting = WaitingConnections(MAX_WAITING, self._begin)
+        self._tasks: set[asyncio.Task[None]] = set()  # of the connections that do not wait
         self._at_stop: set[asyncio.StreamWriter] = set()
         self._open_pages = 0
 
     async def run(self, ended: asyncio.Event) -> None:
         """Serve until the event is set."""
+        loop = asyncio.get_running_loop()
         # asyncio uses its `backlog` also as the number of connections that it accepts at once.
-        server = await asyncio.start_server(
-            self._serve_connection, sock=self._listening, limit=MAX_HEAD_BYTES, backlog=MAX_ACCEPTED_AT_ONCE
-        )
+        server = await loop.create_server(self._waiting.create, sock=self._listening, backlog=MAX_ACCEPTED_AT_ONCE)
         self._listening.listen(BACKLOG)
         try:
             while not ended.is_set():
+                self._waiting.abort_older_than(HEAD_LIMIT_S)
                 if self._stop is not None:
                     self._stop.test_if_due()
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(ended.wait(), TEST_PERIOD_S)
+                    await asyncio.wait_for(ended.wait(), POLL_S)
         finally:
             server.close()
 
-    async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one connection to its end."""
-        self._waiting[writer] = None
-        if len(self._waiting) > MAX_WAITING:
-            oldest = next(iter(self._waiting))
-            del self._waiting[oldest]
-            oldest.transport.abort()
+    def _begin(self, head: bytes, connection: Connection) -> None:
+        """Serve a connection whose first request is complete, in a task of its own."""
+        task = asyncio.ensure_future(self._serve_connection(head, *connection))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve_connection(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve one connection to its end. head: of its first request."""
         try:
-            head = await read_head(reader, HEAD_LIMIT_S)
-            self._waiting.pop(writer, None)
             while await self._answer(head, reader, writer):
                 head = await read_head(reader, KEEP_LIMIT_S)
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # the client has gone, or did not send a proper request in time
+            pass  # the client has gone, or did not send another request in time
         except Exception as error:  # noqa: BLE001 - this connection's outermost frame
             self._errors.write(error)
         finally:
-            self._waiting.pop(writer, None)
             self._at_stop.discard(writer)
             writer.close()
 

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -39,6 +40,21 @@ EXAMPLE_TARGETS: dict[TargetType, str] = {
 SIMULATOR_SPEEDS: tuple[str, ...] = ("0.1", "0.25", "0.5", "1", "2", "5", "10")  # multiples of real time
 
 
+@dataclass(frozen=True)
+class ControlContext:
+    """What the controls of every viewer act on, and their places in the panel."""
+
+    token: ControlToken  # decides which viewer has control
+    operations: Operations  # sends commands to the robot
+    admission: Admission  # decides which messages of a page count
+    commissioning: Commissioning  # runs steps; all viewers share one
+    get_snapshot: Callable[[], RobotSnapshot | None]  # returns the newest one; None while there is no robot
+    on_control_changed: Callable[[], None]  # called when a viewer took or released control
+    control_folder: viser.GuiFolderHandle
+    parameters_tab: viser.GuiFolderHandle
+    commissioning_tab: viser.GuiFolderHandle
+
+
 class ViewerControls:
     """The buttons and inputs of one viewer, and what they do.
 
@@ -46,63 +62,47 @@ class ViewerControls:
     that receives messages.
     """
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        control_folder: viser.GuiFolderHandle,
-        token: ControlToken,
-        operations: Operations,
-        get_snapshot: Callable[[], RobotSnapshot | None],
-        parameters_tab: viser.GuiFolderHandle,
-        on_control_changed: Callable[[], None],
-        admission: Admission,
-        commissioning: Commissioning,
-        commissioning_tab: viser.GuiFolderHandle,
-    ) -> None:
+    def __init__(self, client: viser.ClientHandle, context: ControlContext) -> None:
         """Add the controls to the viewer's page.
 
         Args:
             client: The viewer's page.
-            control_folder: The place of the buttons.
-            token: Decides which viewer has control.
-            operations: Sends commands to the robot.
-            get_snapshot: Returns the newest snapshot; None while there is no robot.
-            parameters_tab: The place of the controller's parameters.
-            on_control_changed: Called when this viewer took or released control.
-            admission: Decides which messages of the page count.
-            commissioning: Runs steps; all viewers share one.
-            commissioning_tab: The place of the buttons for it.
+            context: What the controls act on.
         """
         self.client = client
         self.viewer = client.client_id
         # What the controls act on.
-        self._token = token
-        self._operations = operations
-        self._get_snapshot = get_snapshot
-        self._on_control_changed = on_control_changed
-        self._admission = admission
+        self._token = context.token
+        self._operations = context.operations
+        self._get_snapshot = context.get_snapshot
+        self._on_control_changed = context.on_control_changed
+        self._admission = context.admission
         # What this viewer has done.
         self._free_operations = threading.Semaphore(MAX_OPERATIONS_AT_ONCE)
         self._offers_unchecked = False  # the host refused to arm because the joints were not checked
         self._errors = ErrorReport(f"console, {self.name}")
         # The controls.
-        self._parameters_tab = parameters_tab
+        self._parameters_tab = context.parameters_tab
         self._parameter_form: ParameterForm | None = None
-        with control_folder:
+        with context.control_folder:
             self._add_control_buttons()
             self._add_simulator_controls()
             self.drive = DriveControls(
-                client, admission, self._is_in_control, get_snapshot, partial(operations.drive, self.name)
+                client,
+                self._admission,
+                self._is_in_control,
+                self._get_snapshot,
+                partial(self._operations.drive, self.name),
             )
             self._add_fault_controls()
-        with parameters_tab:
+        with self._parameters_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
         self._admit_controls()
         self._commissioning_controls = CommissioningControls(
             client,
-            commissioning_tab,
-            commissioning,
-            admission,
+            context.commissioning_tab,
+            context.commissioning,
+            self._admission,
             self._is_in_control,
             self.run_operation,
             self._on_late_press,

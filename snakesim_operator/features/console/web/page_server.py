@@ -70,7 +70,7 @@ class BrowserRelay:
 
     async def _serve(self) -> None:
         """Serve until the context ends."""
-        server = unix_serve(
+        server = await unix_serve(
             self._serve_browser,
             sock=self._listening,
             process_request=self._answer_request,
@@ -79,8 +79,9 @@ class BrowserRelay:
             compression=None,
             logger=self._quiet_logger,
         )
-        async with server:
-            await self._ended.wait()
+        await self._ended.wait()
+        server.close()
+        await server.wait_closed()
 
     # --- pages -----------------------------------------------------------------------------------------------
 
@@ -126,9 +127,11 @@ class BrowserRelay:
     async def _connect_to_viser(self, connection: ServerConnection, browser: Browser) -> None:
         """Open a connection to viser for a browser, and relay messages in both directions until either side ends."""
         protocols = None if connection.subprotocol is None else [connection.subprotocol]
-        options = {"compression": None, "max_size": None, "ping_interval": None, "proxy": None}
         with self._viser.expect_browser(browser) as address:
-            async with connect(address, subprotocols=protocols, **options) as to_viser:
+            opening = connect(
+                address, subprotocols=protocols, compression=None, max_size=None, ping_interval=None, proxy=None
+            )
+            async with opening as to_viser:
                 await _relay_messages(browser, connection, to_viser)
         if to_viser.close_code not in UNSENT_CODES:  # such as that the page is of another version
             await connection.close(to_viser.close_code, to_viser.close_reason or "")

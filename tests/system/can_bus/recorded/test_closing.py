@@ -65,7 +65,7 @@ def test_poses_need_a_delay_that_somebody_has_stated() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.03])
-def test_a_pose_of_twins_is_as_old_as_the_robot_file_says(delay_s: float) -> None:
+def test_closing_pose_of_emulators_has_age_of_robot_file(delay_s: float) -> None:
     """To the bit, in lockstep; and the description says so."""
     with loop(config(robot__sensors__pose__delay_s=delay_s), physics_model="mujoco") as run:
         (sensor,) = [s for s in run.backend.describe().sensors if s.key == keys.POSE]
@@ -80,7 +80,7 @@ def test_a_pose_of_twins_is_as_old_as_the_robot_file_says(delay_s: float) -> Non
         assert len(late) == 20 - round(delay_s / 0.01)
 
 
-def test_what_is_wrong_is_told_even_when_the_bus_no_longer_takes_the_stop() -> None:
+def test_closing_reports_errors_even_when_stop_cannot_be_sent() -> None:
     """The cause is not lost to the error of the bus."""
     with loop() as run:
         armed(run)

@@ -64,7 +64,7 @@ def test_bring_up_enables_nothing() -> None:
         assert run.faults == [] and run.true_speed_rad_s == [0.0] * 30
 
 
-def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_silent_module_is_reported_and_everything_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     class Deaf(RecordedWire):
         def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
             super().__init__(channel, peer)
@@ -141,14 +141,14 @@ def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest
     assert WIRES == []
 
 
-def test_joints_are_described_with_the_serials_and_the_firmware_that_their_modules_say() -> None:
+def test_opening_describes_joints_with_serials_and_firmware() -> None:
     with loop() as run:
         joints = run.backend.describe().joints
         assert len({joint.serial for joint in joints}) == 4 and all(len(joint.serial) == 8 for joint in joints)
         assert [joint.firmware for joint in joints] == ["1.0"] * 4
 
 
-def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
+def test_opening_waits_for_answers_as_long_as_fullest_bus() -> None:
     triplet = load_scenario("triplet", [parse_set("clock_mode=realtime")]).config
     assert answer_limit_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
     two = CanSettings(channels=["can0", "can1"])
@@ -158,7 +158,7 @@ def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
 # --- a period ----------------------------------------------------------------------------------------------
 
 
-def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> None:
+def test_opened_command_acts_one_period_after_its_state() -> None:
     change_at = 15
     speeds = []
     for torque_nm in (0.0, 1.0):
@@ -176,7 +176,7 @@ def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> 
     assert moved[change_at + 2 :].all(), "and acts from then on"
 
 
-def test_a_period_has_one_sync_and_one_set_point_for_each_module() -> None:
+def test_opened_period_has_one_sync_and_one_setpoint_per_module() -> None:
     with loop() as run:
         run.arm()
         for _ in range(20):

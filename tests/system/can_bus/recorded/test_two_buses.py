@@ -87,7 +87,7 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
     assert NoProcess.stopped == stopped + 1 and [wire.closed for wire in WIRES] == [1, 1]
 
 
-def test_in_lockstep_nothing_that_twins_said_is_still_on_its_way_when_a_tick_goes_on(
+def test_two_buses_in_lockstep_have_no_frames_left_in_flight(
     two_buses: Callable[..., Loop],
 ) -> None:
     run = two_buses([3, 1])
@@ -102,7 +102,7 @@ def test_in_lockstep_nothing_that_twins_said_is_still_on_its_way_when_a_tick_goe
     run.backend.close()
 
 
-def test_a_module_on_the_wrong_bus_is_found_before_anything_is_enabled(two_buses: Callable[..., Loop]) -> None:
+def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(two_buses: Callable[..., Loop]) -> None:
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         two_buses([2, 2], bring_up_limit_s=0.3)
     assert [wire.closed for wire in WIRES] == [1, 1]
@@ -119,7 +119,7 @@ def test_a_driver_whose_twins_have_died_ends(two_buses: Callable[..., Loop], mon
         run.run(1)
 
 
-def test_a_bus_that_fails_does_not_keep_the_other_from_hearing(two_buses: Callable[..., Loop]) -> None:
+def test_two_buses_failure_of_one_does_not_block_the_other(two_buses: Callable[..., Loop]) -> None:
     run = two_buses([3, 1])
     run.arm()
 

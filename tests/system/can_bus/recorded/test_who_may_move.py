@@ -43,7 +43,7 @@ from snakesim_testing.can.recorded_wire import (
         ("estop", ["emergency"], EMERGENCY, ["clear"]),
     ],
 )
-def test_only_an_armed_robot_gets_set_points_and_what_stopped_it_stays_until_somebody_clears(
+def test_setpoints_are_sent_only_to_armed_robot_until_a_stop(
     lifecycle: LifecycleState, said: list[str], state: ModuleState, cleared: list[str]
 ) -> None:
     with loop() as run:
@@ -70,7 +70,7 @@ def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) ->
         assert run.faults == [] and max(run.true_speed_rad_s[-10:]) > 0.1
 
 
-def test_an_arming_and_a_stop_that_are_lost_are_said_again_to_those_who_need_it() -> None:
+def test_lost_arming_and_stop_frames_are_sent_again() -> None:
     with loop() as run:
         WIRES[0].loses = lambda frame: (
             is_action(frame, CommandAction.ARM, CommandAction.STOP) and parse_node(frame.id) == BROADCAST
@@ -83,7 +83,7 @@ def test_an_arming_and_a_stop_that_are_lost_are_said_again_to_those_who_need_it(
         assert run.states() == [DISARMED] * JOINTS
 
 
-def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
+def test_module_that_disarmed_itself_is_not_armed_again_automatically() -> None:
     with loop() as run:
         go(run, "armed", 3)
         assert run.states() == [ARMED] * JOINTS
@@ -94,7 +94,7 @@ def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
         assert [(fault.what, fault.joint) for fault in run.faults] == [("module_not_armed", "joint_2")]
 
 
-def test_an_emergency_that_is_lost_is_said_until_everybody_has_heard() -> None:
+def test_lost_emergency_frame_is_repeated_until_all_modules_confirm() -> None:
     lost: list[Frame] = []
 
     def lose_some(frame: Frame) -> bool:
@@ -112,7 +112,7 @@ def test_an_emergency_that_is_lost_is_said_until_everybody_has_heard() -> None:
 # --- frames that the bus does not take ---------------------------------------------------------------------
 
 
-def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
+def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
     with loop() as run:
         run.arm()
         start = run.tick
@@ -134,7 +134,7 @@ def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
         assert run.faults == [] and run.states() == [ARMED] * JOINTS
 
 
-def test_a_bus_that_takes_no_sync_is_told_even_when_nothing_is_armed() -> None:
+def test_bus_without_sync_is_reported_even_when_disarmed() -> None:
     with loop() as run:
         run.run(2)
         WIRES[0].refuses = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
@@ -146,7 +146,7 @@ def test_a_bus_that_takes_no_sync_is_told_even_when_nothing_is_armed() -> None:
 # --- modules that restart ----------------------------------------------------------------------------------
 
 
-def test_a_restarted_module_is_not_armed_before_it_has_its_parameters() -> None:
+def test_restarted_module_is_not_armed_before_its_parameters_are_set() -> None:
     with loop(faults=["reboot:joint_2@0.3"]) as run:
         run.arm()
         module = module_of(run, 2)
@@ -164,7 +164,7 @@ def test_a_restarted_module_is_not_armed_before_it_has_its_parameters() -> None:
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 40.0
 
 
-def test_a_robot_is_not_armed_while_a_module_does_not_take_its_parameters() -> None:
+def test_robot_is_not_armed_while_module_rejects_parameters() -> None:
     with loop(faults=["reboot:joint_2@0.3"]) as run:
         WIRES[0].loses = lambda frame: parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
         run.run(60)

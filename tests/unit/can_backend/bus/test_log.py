@@ -20,7 +20,7 @@ class OnFile(VirtualWire):
         return 42
 
 
-def test_what_is_taken_and_what_comes_is_logged_in_order_and_everything_else_is_the_wires_own(tmp_path: Path) -> None:
+def test_log_of_sent_and_received_frames_keeps_their_order(tmp_path: Path) -> None:
     path, other = tmp_path / "bus.log", VirtualWire("can3")
     with open_log(path) as log:
         wire, neighbor = (LoggedWire(OnFile(channel), log) for channel in ("can3", "can4"))

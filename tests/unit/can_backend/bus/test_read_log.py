@@ -94,16 +94,14 @@ def test_what_candump_prints_is_read_with_its_times(tmp_path: Path, option: str)
         (COMPACT[:70] + "\0\0\0\n" + COMPACT, 7, "line 2: "),
     ],
 )
-def test_of_a_log_that_was_cut_all_whole_frames_are_read_and_the_dropped_line_is_named(
-    tmp_path: Path, cut: str, frames: int, report: str
-) -> None:
+def test_read_log_of_cut_file_names_the_dropped_line(tmp_path: Path, cut: str, frames: int, report: str) -> None:
     log = log_of(tmp_path, cut)
     assert len(list(log)) == frames
     line = next(iter(log.report()))
     assert line.startswith(f"1 line is no whole frame and was left out: {report}") and len(line) < 200
 
 
-def test_a_last_line_without_its_end_is_whole_if_it_says_its_direction(tmp_path: Path) -> None:
+def test_read_log_last_line_without_newline_is_accepted_with_direction(tmp_path: Path) -> None:
     log = log_of(tmp_path, COMPACT.splitlines()[0])
     assert len(list(log)) == 1 and list(log.report()) == []
 

@@ -111,7 +111,7 @@ def test_everybody_is_found_and_only_asked_who_they_are(modules: Modules) -> Non
     assert discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
 
 
-def test_it_listens_on_for_a_second_module_with_the_same_id(modules: Modules) -> None:
+def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Modules) -> None:
     answered_at: list[float] = []
 
     def watch_the_last(frame: Frame) -> list[Frame]:
@@ -128,7 +128,7 @@ def test_it_listens_on_for_a_second_module_with_the_same_id(modules: Modules) ->
     assert 0xBAD in [i.serial for i in found if i.node == 2] and len(found) == 5
 
 
-def test_it_ends_soon_when_all_are_found_and_at_the_limit_when_not(modules: Modules) -> None:
+def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None:
     began = time.monotonic()
     find_modules([modules.bus], 5.0)
     assert time.monotonic() - began < 2.0
@@ -144,7 +144,7 @@ def test_an_answer_that_is_lost_is_asked_for_again(modules: Modules) -> None:
     assert len(actions(modules.heard)) > 1, "asked again"
 
 
-def test_other_frames_are_handed_on_and_cut_ones_do_no_harm(modules: Modules) -> None:
+def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(modules: Modules) -> None:
     beat = heartbeat(3, 1.0)
     cut = Frame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
     for frame in (beat, cut):
@@ -261,7 +261,7 @@ def test_what_is_lost_is_asked_again(modules: Modules, way: str) -> None:
     assert time.monotonic() - began > ASK_EVERY_S
 
 
-def test_answers_that_come_twice_or_cut_or_for_another_index_are_no_answers(modules: Modules) -> None:
+def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Modules) -> None:
     def noisily(frame: Frame) -> list[Frame]:
         other = load_layouts()[Opcode.PARAMETER_ANSWER].encode(
             parse_node(frame.id), index=200, result=ParameterResult.UNKNOWN_INDEX
@@ -282,7 +282,7 @@ def test_other_frames_are_not_lost_while_it_waits(modules: Modules) -> None:
     assert beat in handed_on
 
 
-def test_a_value_out_of_range_is_told_with_node_name_value_and_range(modules: Modules) -> None:
+def test_bring_up_value_out_of_range_names_node_and_range(modules: Modules) -> None:
     with raises_error(BackendError, code="drive/parameter-refused"):
         configure_modules([modules.bus], wanted(stiffness=2e5), 5.0)
 
@@ -294,7 +294,7 @@ def test_an_armed_module_refuses(modules: Modules) -> None:
         configure_modules([modules.bus], wanted(), 5.0)
 
 
-def test_a_result_that_this_version_does_not_know_is_a_refusal(modules: Modules) -> None:
+def test_bring_up_unknown_result_code_counts_as_refusal(modules: Modules) -> None:
     def oddly(frame: Frame) -> list[Frame]:
         if parse_opcode(frame.id) != Opcode.PARAMETER_ANSWER:
             return [frame]

@@ -15,9 +15,7 @@ AT_REST_RAD_S = 0.05
 
 
 @pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
-def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_rest(
-    kind: str, what: str, within: int
-) -> None:
+def test_module_fault_names_its_joint_and_stops_the_robot(kind: str, what: str, within: int) -> None:
     with loop(faults=[f"{kind}:joint_3@{START_TICK / 100}"]) as run:
         run.arm()
         run.run(START_TICK - run.tick, run.waving)
@@ -40,12 +38,12 @@ def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_res
             cleared_and_armed_again(run)
 
 
-def test_a_module_that_is_there_twice_is_found_before_anything_is_enabled() -> None:
+def test_duplicate_module_is_detected_before_any_drive_is_enabled() -> None:
     with raises_error(BackendError, code="drive/not-complete"), loop(faults=["duplicate:joint_3@0"]):
         pass
 
 
-def test_a_fault_that_persists_is_told_again_after_clearing_and_once_it_has_passed_the_robot_arms_where_it_is() -> None:
+def test_persistent_fault_is_reported_again_and_blocks_arming_until_gone() -> None:
     with loop(faults=["leak:joint_1@0.3-0.8"]) as run:
         run.arm()
         run.run(60, run.waving)

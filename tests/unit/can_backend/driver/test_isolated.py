@@ -151,7 +151,7 @@ def swallowed(robot: Lame, *joints: int) -> None:
     ("driven", "joints", "max_isolated"),
     [(True, [2], 0), (True, [2], 1), (True, [2, 3], 1), (True, [2, 3], 2), (False, [2], 1)],
 )
-def test_who_clears_before_a_period_has_passed_clears_all_the_same(
+def test_isolated_joint_reset_within_one_period_still_clears(
     driven: bool, joints: list[int], max_isolated: int
 ) -> None:
     with lame_robot(max_isolated) as robot:

@@ -43,7 +43,7 @@ def test_the_first_samples_may_be_the_slowest_of_all() -> None:
     assert camera.read(0.0) == [None] and camera.late_ms(camera.stamp(40.0)) == pytest.approx(40.0)
 
 
-def test_a_reader_that_slept_takes_what_is_fresh_and_no_jump_is_seen() -> None:
+def test_mocap_reader_after_a_pause_uses_newest_pose_without_jump() -> None:
     camera = running()
     camera.now_ns += 400 * MS
     assert camera.read(*range(390, -10, -10)) == ["late"] * 14 + [None] * 26

@@ -32,7 +32,7 @@ def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[ModuleParamete
 
 
 @pytest.mark.parametrize("name", list_shipped("robots"))
-def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(name: str) -> None:
+def test_parameters_of_every_module_exclude_ratings_and_stay_in_range(name: str) -> None:
     robot = decode(read_part(name, "robots"), RobotFile)
     wanted = plan_parameters(robot, CanSettings(), ReportSchedule(100.0))
     assert list(wanted) == list(range(1, robot.chain.modules + 1))
@@ -43,7 +43,7 @@ def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(n
             assert allowed.writable and allowed.low <= value <= allowed.high, parameter.name
 
 
-def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
+def test_parameters_of_a_geared_module_describe_its_own_shaft() -> None:
     own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
     first, second = (plan_parameters(robot, CanSettings(), ReportSchedule(100.0))[node] for node in (1, 2))
@@ -84,9 +84,7 @@ def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
 
 
 @pytest.mark.parametrize(("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)])
-def test_the_safe_action_is_the_robots_the_watchdog_that_of_the_settings_and_reports_come_as_often_as_fits(
-    action: str, motion: SafeMotion
-) -> None:
+def test_parameters_take_stop_mode_from_robot_and_watchdog_from_settings(action: str, motion: SafeMotion) -> None:
     robot = changed("safety", action=action)
     told = plan_parameters(robot, CanSettings(watchdog_s=0.05), ReportSchedule(100.0, 3, 17))[1]
     names = (

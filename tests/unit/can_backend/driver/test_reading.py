@@ -11,7 +11,7 @@ from snakesim_testing.can.readings import JOINTS, angles, reading
 # --- states ------------------------------------------------------------------------------------------------
 
 
-def test_states_three_syncs_late_are_taken_and_those_of_four_have_a_wrong_count() -> None:
+def test_reading_states_up_to_three_syncs_late_are_accepted() -> None:
     for late, taken in ((3, True), (4, False)):
         made = reading(2)
         syncs(made, late + 1, [1, 3])
@@ -31,7 +31,7 @@ def test_an_older_state_never_replaces_a_newer_one() -> None:
     assert made.modules[1].double_answers == 0, "late is not twice"
 
 
-def test_two_answers_to_one_sync_are_counted_once_a_sync_and_in_a_row() -> None:
+def test_reading_two_answers_to_one_sync_count_once() -> None:
     made = reading()
     module = made.modules[1]
     for expected in (1, 2, 3):
@@ -73,7 +73,7 @@ def test_it_is_complete_when_everybody_has_answered() -> None:
     assert made.complete
 
 
-def test_forces_are_waited_for_at_the_syncs_that_ask_for_them() -> None:
+def test_reading_waits_for_forces_only_at_requested_syncs() -> None:
     made = reading()
     begin(made, contacts=True, tail=True)
     answer(made)

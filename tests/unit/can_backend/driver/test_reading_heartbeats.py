@@ -25,7 +25,7 @@ from snakesim_testing.can.readings import JOINTS, angles, reading
 # --- forces, IMUs, health ----------------------------------------------------------------------------------
 
 
-def test_forces_of_another_sync_do_not_count_and_old_ones_are_forgotten() -> None:
+def test_forces_of_another_sync_are_ignored_and_old_ones_dropped() -> None:
     made = reading()
     begin(made, contacts=True)
     made.process_frame(contact(2, made.sync - 1, force_x=9.0))
@@ -67,7 +67,7 @@ UPTIMES = {  # s, and how many restarts they are by then
 
 
 @pytest.mark.parametrize("uptimes", UPTIMES.values(), ids=list(UPTIMES))
-def test_only_an_uptime_that_goes_back_and_on_from_there_is_a_restart(uptimes: list[tuple[float, int]]) -> None:
+def test_uptime_that_restarts_and_continues_means_module_restart(uptimes: list[tuple[float, int]]) -> None:
     made = reading()
     for uptime_s, restarts in uptimes:
         made.process_frame(heartbeat(2, uptime_s))
@@ -88,7 +88,7 @@ def test_a_heartbeat_tells_state_faults_and_reason() -> None:
 
 
 @pytest.mark.parametrize("state", [ModuleState.FAULT, ModuleState.EMERGENCY])
-def test_a_latched_state_without_a_reason_needs_clearing_after_three_syncs(state: ModuleState) -> None:
+def test_latched_state_without_reason_needs_clearing_after_three_syncs(state: ModuleState) -> None:
     made = reading()
     for needed in (False, False, True):
         syncs(made, 1, state=state)
@@ -132,9 +132,7 @@ ours = st.builds(
 
 @given(st.lists(any_frame | ours, max_size=40), st.lists(st.booleans(), min_size=40, max_size=40))
 @example([Frame(frame_id(Opcode.JOINT_STATE, 2), b"")], [False] * 40)
-def test_whatever_comes_nothing_raises_and_only_intact_states_move_a_joint(
-    frames: list[Frame], sync_before: list[bool]
-) -> None:
+def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(frames: list[Frame], sync_before: list[bool]) -> None:
     made = reading()
     for frame, contacts in zip(frames, sync_before, strict=False):
         if contacts:

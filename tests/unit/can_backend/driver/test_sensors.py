@@ -53,7 +53,7 @@ def contacts_of(samples: Samples) -> Contacts:
 # --- joints ------------------------------------------------------------------------------------------------
 
 
-def test_every_state_has_its_age_and_is_valid_for_the_lease() -> None:
+def test_joint_state_age_is_reported_and_valid_for_the_lease() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
     fresh = sensors.make_samples(7, 70 * 10**6).joints
@@ -141,7 +141,7 @@ def capsule_point(along_m: float, polar: float, bearing: float, length_m: float,
     polar=st.just(0.0) | st.floats(-1.4, 1.4),
     bearing=st.floats(-math.pi, math.pi),
 )
-def test_a_touch_anywhere_on_a_capsule_comes_back_within_the_steps_of_the_bus(
+def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
     link: int, share: float, polar: float, bearing: float
 ) -> None:
     run = config(**EVERYTHING)
@@ -193,7 +193,7 @@ def test_an_imu_message_holds_only_what_is_new() -> None:
     assert keys.IMU not in sensors.make_samples(2, 0).others
 
 
-def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
+def test_power_sample_at_two_hertz_marks_unknown_values_invalid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
     reading.process_frame(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
@@ -208,7 +208,7 @@ def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
     assert all(len(column) == JOINTS for column in (found.voltage_v, found.current_a, found.motor_c, found.board_c))
 
 
-def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
+def test_power_values_of_a_module_expire() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
     reading.process_frame(health(2, voltage=23.5))

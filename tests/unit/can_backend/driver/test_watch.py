@@ -64,9 +64,7 @@ WRONGS = [
 
 
 @pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
-def test_it_is_named_in_time_with_joint_and_cause_once_and_again_after_a_clearing(
-    speak: Speak, after: int, what: str, cause: str
-) -> None:
+def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, after: int, what: str, cause: str) -> None:
     bench = Bench()
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
     assert bench.tick(speak) == [Finding(what, WHO + cause, 1, alone=what not in CONCERNS_ALL)]
@@ -92,13 +90,13 @@ def test_a_module_that_talks_nonsense_is_not_silent(bad: Speak) -> None:
     assert bench.ticks(1) == []
 
 
-def test_a_module_that_was_never_heard_is_silent_and_no_more_is_claimed() -> None:
+def test_watch_module_never_received_is_reported_only_as_silent() -> None:
     reading, watch = ModuleReports(1), ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
     found = [f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]]
     assert said(found) == [("module_silent", 0)] and found[0].cause.endswith("ms")
 
 
-def test_a_silent_module_whose_heart_beats_is_told_from_a_dead_one() -> None:
+def test_watch_silent_module_with_heartbeat_differs_from_dead_one() -> None:
     bench = Bench()
     bench.tick(lambda reading: reading.process_frame(heartbeat(2, 1.0)))
     (found,) = bench.ticks(2, quiet)
@@ -119,7 +117,7 @@ def restarting(bench: Bench) -> list[Finding]:
     return found
 
 
-def test_a_restart_is_told_once_with_its_joint_and_what_it_lost() -> None:
+def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
     bench = Bench()
     found = restarting(bench) + bench.ticks(10)
     assert said(found) == [("module_restarted", 1)]
@@ -130,7 +128,7 @@ def test_a_restart_is_told_once_with_its_joint_and_what_it_lost() -> None:
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
 
 
-def test_who_has_not_its_parameters_is_told_once_when_the_robot_is_armed_with_its_joint() -> None:
+def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
     bench = Bench()
     assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
@@ -157,7 +155,7 @@ def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
 
 
-def test_of_a_joint_that_is_set_aside_only_what_concerns_all_is_told() -> None:
+def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
     bench = Bench()
     bench.isolated = {1}
     assert bench.ticks(9, answering(ModuleState.FAULT)) == []
@@ -181,7 +179,7 @@ def test_water_after_heat_is_told_again_with_all_reasons() -> None:
     assert bench.ticks(9, HOT_AND_WET) == [Finding("module_overheat", WHO + reasons, 1, alone=False)]
 
 
-def test_a_fault_whose_heartbeat_is_lost_is_told_by_its_state() -> None:
+def test_watch_fault_without_heartbeat_is_reported_from_state() -> None:
     bench = Bench()
     found = bench.ticks(9, answering(ModuleState.FAULT))
     assert said(found) == [("module_fault", 1)]
@@ -208,7 +206,7 @@ def test_an_emergency_is_as_it_should_be_only_in_one(
     assert said(bench.ticks(9, answering(ModuleState.EMERGENCY))) == reported
 
 
-def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
+def test_watch_module_that_does_not_arm_is_reported_after_grace() -> None:
     bench = Bench()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     found = [bench.tick(answering(ModuleState.DISARMED)) for _ in range(20)]
@@ -219,7 +217,7 @@ def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
     ]
 
 
-def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:
+def test_watch_module_armed_within_grace_is_not_reported() -> None:
     bench = Bench()
     bench.lifecycle = "armed"
     assert bench.ticks(ARM_GRACE) == []
@@ -229,7 +227,7 @@ def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:
     assert bench.ticks(10) == []
 
 
-def test_who_was_armed_and_says_that_it_is_not_is_told_at_once() -> None:
+def test_watch_module_that_disarms_itself_is_reported_at_once() -> None:
     bench = Bench()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     assert bench.ticks(2) == [], "within the grace"

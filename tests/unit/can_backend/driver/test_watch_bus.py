@@ -112,7 +112,7 @@ def test_a_module_is_not_silent_that_was_not_asked() -> None:
     assert said(bench.tick(quiet)) == [("module_silent", 1)]
 
 
-def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
+def test_bus_watch_interface_down_is_not_also_reported_stuck() -> None:
     bench = Bench()
     down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
     assert said(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]

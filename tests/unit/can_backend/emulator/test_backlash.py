@@ -10,7 +10,7 @@ from snakesim_testing.can.driver_loop import config
 BACKLASH_RAD = 0.03
 
 
-def test_a_drive_turns_through_its_backlash_before_its_link_moves_and_others_move_as_ever() -> None:
+def test_backlash_drive_turns_through_gap_before_its_link_moves() -> None:
     run = config(3)
     joints = run.robot.joint_table
     backlash_rad = {"joint_2": BACKLASH_RAD}

@@ -51,7 +51,7 @@ def test_the_host_s_frames_take_their_time():
     assert bus.next_us() <= MAX_AHEAD_US + FULL
 
 
-def test_a_newer_frame_takes_the_place_of_an_unsent_one_but_answers_are_all_sent():
+def test_bus_newer_setpoint_replaces_unsent_one_but_answers_are_kept():
     bus = BusTime()
     bus.record_host_frame(make_sync(0, 0), 0.0)
     for mark in range(5):
@@ -79,7 +79,7 @@ def test_a_babbler_fills_what_the_others_leave():
 
 
 @pytest.mark.parametrize(("joints", "rate_hz"), [(13, 50), (18, 100), (30, 50)])
-def test_measured_load_is_the_computed_one_and_every_answer_comes_in_its_period(joints: int, rate_hz: int):
+def test_bus_measured_load_equals_computed_and_no_answer_is_late(joints: int, rate_hz: int):
     late, before, after, _ = run_at(joints, rate_hz)
     assert after.load_since(before) == pytest.approx(bus_load(joints, ReportSchedule(rate_hz)), rel=0.05)
     assert set(late) == {0} and after.replaced == 0

@@ -94,7 +94,7 @@ def test_time_passes_only_from_sync_to_later_sync(syncs: list[tuple[int, int]]):
         assert physics_model.steps == steps
 
 
-def test_two_buses_with_one_sync_time_share_one_step_of_time():
+def test_chain_two_buses_with_same_sync_share_one_step():
     physics_model = Pushed(5)
     made = chain(config(5), physics_model=physics_model, channels=["vcan0", "vcan1"])
     for tick in range(3):
@@ -108,7 +108,7 @@ def test_two_buses_with_one_sync_time_share_one_step_of_time():
     assert made.slots[3].module._pending is None, "node 4 is on the other bus"
 
 
-def test_forces_are_felt_by_the_link_in_front_and_the_tail():
+def test_chain_contact_force_is_measured_by_neighbor_links():
     made = chain(config(**SENSORS), physics_model=Pushed(4))
     made.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     made.receive(0, make_sync(0, 0))
@@ -174,7 +174,7 @@ def test_the_watchdog_ends_within_the_step_in_stepped_time_too():
     assert ups[0] == pytest.approx(0.1 + 0.05 + 0.1, abs=0.0011)
 
 
-def test_in_wall_clock_time_a_hiccup_is_caught_up_but_not_a_long_one():
+def test_chain_in_real_time_catches_up_only_short_pauses():
     physics_model = Pushed(4)
     made = chain(physics_model=physics_model, stepped=False)
     made.advance_to(150_000.0)
@@ -195,7 +195,7 @@ def test_overheating_fades_torque_before_it_stops():
     assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01) and states[0]["torque"] > 3.9
 
 
-def test_what_is_out_of_range_ends_at_the_end_of_the_range_and_nothing_raises():
+def test_chain_values_out_of_range_saturate_without_error():
     assert ANGLE.to_raw(99.0) == 32767 and ANGLE.to_raw(-99.0) == -32768
     assert ANGLE.to_raw_array(np.array([np.nan, np.inf, -np.inf, 0.1])) == [0, 32767, -32768, 1000]
     assert FORCE.to_raw(float("inf")) == 4095 and ALONG.to_raw(float("nan")) == 0

@@ -8,7 +8,7 @@ from snakesim_hal.model.fault_kinds import Injection
 from snakesim_testing.messages import raises_error
 
 
-def test_what_is_typed_is_a_fault_that_begins_or_ends_now():
+def test_emulator_typed_fault_starts_or_ends_immediately():
     fault = Injection("mute", "joint_2", 7.0)
     assert parse_typed_fault("mute joint_2\n", 4, 7.0) == (fault, True)
     assert parse_typed_fault("mute joint_2 off", 4, 7.0) == (fault, False)

@@ -56,7 +56,7 @@ def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
     assert len(module.frames) == 1
 
 
-def test_it_beats_ten_times_a_second_and_tells_its_health_twice():
+def test_firmware_sends_ten_heartbeats_and_two_health_reports_per_second():
     module = booted()
     for k in range(1, 1001):
         module.poll(BOOTED + k * MS)
@@ -71,7 +71,7 @@ def test_position_targets_end_at_the_angle_limit():
 
 
 @pytest.mark.parametrize(("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)])
-def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault: ModuleFault):
+def test_firmware_fault_remains_until_cause_is_gone_and_cleared(sensed: str, fault: ModuleFault):
     module = armed()
     module.health.leak, module.health.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
     module.poll(BOOTED + MS)
@@ -99,7 +99,7 @@ def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault:
         (0, 15, False),  # of before
     ],
 )
-def test_a_set_point_that_is_no_next_one_is_dropped_and_counting_goes_on_from_it(first: int, count: int, taken: bool):
+def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(first: int, count: int, taken: bool):
     module = armed()
     drive(module, first, BOOTED, target=1.0)
     drive(module, count, BOOTED, target=2.0)
@@ -141,7 +141,7 @@ def test_stopping_damps_until_at_rest():
     assert module.last_stop == LastStop.STOP
 
 
-def test_stopping_ends_after_the_watchdog_s_time_and_may_be_passive():
+def test_firmware_stopping_ends_after_watchdog_time():
     module = armed(stop_mode=0, watchdog=0.05)
     module.health.speed_rad_s = 3.0
     module.receive(make_command(CommandAction.STOP), BOOTED)
@@ -173,7 +173,7 @@ def test_a_reboot_forgets_what_was_not_saved():
     assert values[ModuleParameter.STIFFNESS] == 0.0 and values[ModuleParameter.DAMPING] == 2.0
 
 
-def test_the_uptime_of_a_module_stays_at_the_end_of_its_range() -> None:
+def test_firmware_uptime_saturates_at_end_of_range() -> None:
     """The protocol forbids a number that wraps around: an uptime of 0 would look like a restart."""
     module = booted()
     module._booted_us = -(2**32 - 50) * MS
@@ -193,7 +193,7 @@ def test_every_sync_is_answered_with_its_own_count():
     assert len(only(module.frames, Opcode.TAIL_CONTACT)) == 5
 
 
-def test_a_hanging_module_repeats_its_last_state_and_hardware_opens_the_bridge():
+def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bridge():
     module = armed()
     drive(module, 3, BOOTED)
     module.hangs = True
@@ -236,7 +236,7 @@ def give(module: ModuleFirmware, frame, now_us: float) -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(ANYTHING, PAUSES, st.booleans()), max_size=60))
-def test_only_armed_and_stopping_modules_drive_and_only_valid_set_points_feed(sent):
+def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
     module, now_us = booted(), BOOTED
     module.health.speed_rad_s = 1.0
     for frame, pause_us, leak in sent:

@@ -25,7 +25,7 @@ def test_a_torque_speeds_up_an_inertia():
     assert made.angle_rad[0] == pytest.approx(0.5 * 0.1 / INERTIA * 0.1**2, rel=0.02)
 
 
-def test_a_joint_that_is_let_go_comes_to_rest_and_never_turns_round():
+def test_released_joint_comes_to_rest_without_reversing():
     made = physics_model(drag_nm=0.1)
     push(made, 0.5, 0.02)
     speeds = []

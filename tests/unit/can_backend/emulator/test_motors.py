@@ -42,7 +42,7 @@ def test_a_motor_without_response_time_answers_at_once():
 
 
 @pytest.mark.parametrize("mode", list(Mode))
-def test_a_change_of_mode_moves_torque_only_as_the_motor_responds(mode):
+def test_motor_mode_change_moves_torque_at_motor_response(mode):
     motors, _ = motor()
     drive(motors, Mode.TORQUE, 3.0)
     for _ in range(100):
@@ -57,7 +57,7 @@ def test_a_change_of_mode_moves_torque_only_as_the_motor_responds(mode):
     assert motors.step(REST, REST)[0] == pytest.approx(3.0 * np.exp(-STEP_S / RESPONSE_S))
 
 
-def test_torque_stays_within_rated_and_the_set_point_s_limit_which_takes_hold_as_the_motor_can_follow():
+def test_motor_torque_stays_within_rating_and_setpoint_limit():
     motors, _ = motor()
     drive(motors, Mode.TORQUE, 30.0, limit=9.0)
     for _ in range(200):
@@ -70,7 +70,7 @@ def test_torque_stays_within_rated_and_the_set_point_s_limit_which_takes_hold_as
     assert motors.torque_nm[0] == 1.0
 
 
-def test_torque_fades_to_nothing_at_the_limit_of_speed_and_is_full_below_nine_tenths():
+def test_motor_torque_fades_to_zero_at_speed_limit():
     motors, _ = motor()
     drive(motors, Mode.TORQUE, RATED_NM)
     for speed, torque in ((0.89 * SPEED, RATED_NM), (SPEED, 0.0), (0.95 * SPEED, 0.5 * RATED_NM)):
@@ -81,7 +81,7 @@ def test_torque_fades_to_nothing_at_the_limit_of_speed_and_is_full_below_nine_te
     assert motors.step(REST, np.array([3 * SPEED]))[0] == 0.0, "and none when passive"
 
 
-def test_position_mode_of_the_shipped_robot_is_stable_at_1_ms_and_arrives():
+def test_motor_position_mode_at_1_ms_is_stable_and_arrives():
     run = load("triplet").config
     physics_model = InertiaModel(run, InertiaSettings())
     motors, m = Motors(run.robot, physics_model.step_s), run.robot.motor

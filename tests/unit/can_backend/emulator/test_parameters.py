@@ -23,7 +23,7 @@ def ask(module, *request, **given):
 
 
 @pytest.mark.parametrize("index", [p for p, r in PARAMETERS.items() if r.writable])
-def test_both_ends_of_every_range_can_be_written_in_single_precision(index):
+def test_parameter_range_ends_can_be_written_in_single_precision(index):
     module = booted()
     for end in (PARAMETERS[index].low, PARAMETERS[index].high):
         result, value = ask(module, index, end)

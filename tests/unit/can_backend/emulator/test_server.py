@@ -53,7 +53,7 @@ def send_tick(near: VirtualWire, tick: int) -> None:
         near.send(setpoint(tick, Mode.POSITION, 0.2, node=node))
 
 
-def test_by_the_clock_modules_boot_answer_and_follow_and_are_passive_after_the_watchdog_s_time_without_set_points():
+def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
     made = chain(stepped=False)
     with served(made) as (near, _, until):
         assert until(0.09) == []
@@ -72,7 +72,7 @@ def test_by_the_clock_modules_boot_answer_and_follow_and_are_passive_after_the_w
         assert [slot.module.state for slot in made.slots] == [ModuleState.FAULT] * JOINTS
 
 
-def test_what_slept_here_does_not_look_like_a_host_that_slept():
+def test_server_pause_does_not_look_like_a_host_pause():
     made = chain(stepped=False)
     with served(made) as (near, server, until):
         until(0.11)

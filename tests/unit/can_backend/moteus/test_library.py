@@ -59,7 +59,7 @@ def test_registers_modes_and_faults_have_their_numbers() -> None:
     ],
     ids=["position", "velocity", "torque"],
 )
-def test_a_command_of_ours_is_what_their_library_sends_for_it(law: dict[str, float]) -> None:
+def test_moteus_command_frame_equals_that_of_its_library(law: dict[str, float]) -> None:
     floats = dict.fromkeys((*law, "maximum_torque", "watchdog_timeout", "velocity_limit", "accel_limit"), moteus.F32)
     resolution = moteus.PositionResolution()
     for name, kind in floats.items():
@@ -85,7 +85,7 @@ def test_a_command_of_ours_is_what_their_library_sends_for_it(law: dict[str, flo
     assert values == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
 
 
-def test_a_stop_of_ours_is_theirs_and_ids_are_extended_where_theirs_are() -> None:
+def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
     stop = protocol.encode_subframe(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.STOPPED)
     assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
     asked = protocol.make_frame(0, 1, *MOTION, reply=True)
@@ -108,7 +108,7 @@ def bus() -> Any:
     emulator.close()
 
 
-def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: Any) -> None:
+def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
     ours, emulator, clock = bus
     client, number = theirs(3), 3
 
@@ -146,7 +146,7 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, "127 is the broadcast address"
 
 
-def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_file_says() -> None:
+def test_moteus_library_reads_every_frame_of_a_run() -> None:
     backend = MoteusBackend(CONFIG, MoteusSettings(physics_model="inertia"))
     drives = drives_of(backend)
     sent: list[Frame] = []
@@ -169,7 +169,7 @@ def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_
 
 
 @pytest.mark.parametrize("number", [0, 127])
-def test_the_ids_of_the_host_and_of_everybody_are_no_controllers(number: int) -> None:
+def test_moteus_ids_of_host_and_broadcast_are_no_controllers(number: int) -> None:
     """Their firmware's filters and mjbots' library take 127 for a broadcast: all controllers would follow one joint."""
     wrong = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
     with raises_error(ConfigError, code="drive/unsupported-setting"):
@@ -177,6 +177,6 @@ def test_the_ids_of_the_host_and_of_everybody_are_no_controllers(number: int) ->
     MoteusBackend.check(config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings())
 
 
-def test_real_controllers_need_to_be_configured_for_the_robot_and_a_reference() -> None:
+def test_moteus_real_controllers_need_configuration_and_reference() -> None:
     with raises_error(ConfigError, code="drive/unsupported-setting", field="servo.pid_position.kp"):
         MoteusBackend.check(CONFIG, MoteusSettings(kp_nm_per_turn=0.01))

@@ -42,7 +42,7 @@ SCALED = {"Vel_FF": 1000, "Torque_FF": 1000}  # integers by 0.001
 
 
 @pytest.mark.parametrize("message", SAME, ids=lambda message: message.name)
-def test_their_database_reads_what_we_write_and_we_read_what_it_writes(message: MessageId) -> None:
+def test_odrive_database_and_our_codec_read_each_other(message: MessageId) -> None:
     name, values = SAME[message]
     theirs = DATABASE.get_message_by_name(f"Axis0_{name}")
     ours = [round(value * SCALED[key]) if key in SCALED else value for key, value in values.items()]

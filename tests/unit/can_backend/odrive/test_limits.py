@@ -83,7 +83,7 @@ def endpoints_file(path: Path, **changed: Any) -> str:
 # --- current -------------------------------------------------------------------------------------------------
 
 
-def test_arming_never_raises_the_current_limit_that_an_axis_is_configured_for(robot: Robot) -> None:
+def test_odrive_arming_never_raises_configured_current_limit(robot: Robot) -> None:
     axis = robot.drives._emulator.axes[1]
     assert axis.current_soft_max_a == pytest.approx(NEEDED_A)
     robot.run(5, "disarmed")
@@ -95,12 +95,12 @@ def test_arming_never_raises_the_current_limit_that_an_axis_is_configured_for(ro
 
 
 @pytest.mark.parametrize("configured_a", [10.0, 0.5 * NEEDED_A])
-def test_a_joint_whose_torque_needs_more_than_its_axis_is_configured_for_is_refused(configured_a: float) -> None:
+def test_odrive_joint_torque_above_configured_current_is_refused(configured_a: float) -> None:
     with raises_error(BackendError, code="drive/not-complete"):
         Robot(mounted={"joint_2": MountedAxis(current_soft_max_a=configured_a)})
 
 
-def test_a_lower_limit_is_given_back_when_the_axis_is_idle_and_named_where_a_killed_driver_has_left_it(
+def test_odrive_lowered_limit_is_restored_when_idle_or_named(
     robot: Robot,
 ) -> None:
     """The next start reads it, and cannot know who has set it."""
@@ -119,7 +119,7 @@ def test_a_lower_limit_is_given_back_when_the_axis_is_idle_and_named_where_a_kil
     robot.backend._drives.bring_up()
 
 
-def test_a_joint_that_needs_more_than_the_driver_may_set_is_refused_before_the_start() -> None:
+def test_odrive_joint_torque_above_driver_limit_is_refused_before_start() -> None:
     """Of real axes without a file of endpoints that is 1 A: whatever the motor is, it stands it."""
     config = Robot.configuration()
     with raises_error(ConfigError, code="drive/unsupported-setting"):
@@ -130,7 +130,7 @@ def test_a_joint_that_needs_more_than_the_driver_may_set_is_refused_before_the_s
 
 
 @pytest.mark.parametrize(("max_current_a", "max_a"), [(None, 1.0), (200.0, 200.0)])
-def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are_unknown(
+def test_odrive_unread_axis_is_capped_and_logged_as_unknown(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, max_current_a: float | None, max_a: float
 ) -> None:
     made = CanDrives.__init__
@@ -160,7 +160,7 @@ def test_what_an_unread_axis_gets_is_capped_and_the_log_says_that_its_limits_are
     ],
     ids=["no watchdog", "another watchdog", "slower"],
 )
-def test_watchdog_and_speed_of_an_axis_are_as_the_robot_needs_them_or_it_is_refused(mounted: MountedAxis) -> None:
+def test_odrive_unsuitable_watchdog_or_speed_of_an_axis_is_refused(mounted: MountedAxis) -> None:
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         Robot(mounted={"joint_3": mounted})
 
@@ -191,7 +191,7 @@ def test_a_file_of_another_firmware_is_refused(tmp_path: Path) -> None:
         {"fw_version": 6},
     ],
 )
-def test_a_file_that_is_none_of_odrives_is_refused_before_the_start(tmp_path: Path, changed: dict[str, Any]) -> None:
+def test_odrive_file_of_another_kind_is_refused_before_start(tmp_path: Path, changed: dict[str, Any]) -> None:
     path = endpoints_file(tmp_path / "flat_endpoints.json", **changed)
     with raises_error(ConfigError, code="file/not-readable"):
         OdriveBackend.check(run_config(backend="odrive"), OdriveSettings(endpoints=[path]))
@@ -199,7 +199,7 @@ def test_a_file_that_is_none_of_odrives_is_refused_before_the_start(tmp_path: Pa
         OdriveBackend.check(run_config(backend="odrive"), OdriveSettings(endpoints=[str(tmp_path / "nothing.json")]))
 
 
-def test_an_axis_that_does_not_say_what_it_is_configured_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_odrive_axis_without_readable_configuration_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("snakesim_can_backend.odrive.emulator.EmulatedOdrive._answer_setting", lambda *_: None)
     with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
         Robot()

@@ -1,4 +1,4 @@
-"""`docs/reference/can-protocol.md` says what the DBC file, the parameters and the emulators' firmware say."""
+"""The pages `docs/reference/can-*.md` say what the DBC file, the parameters and the emulators' firmware say."""
 
 import re
 from collections.abc import Callable
@@ -27,14 +27,15 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.physics.thermal import HeatLimits
 
-TEXT = (Path(__file__).parents[4] / "docs" / "reference" / "can-protocol.md").read_text(encoding="utf-8")
+REFERENCE = Path(__file__).parents[4] / "docs" / "reference"
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in sorted(REFERENCE.glob("can-*.md")))
 NODE = 5
 
 
 def section(heading: str) -> str:
     """The text under a heading, up to the next one."""
     found = re.search(rf"^#+ {re.escape(heading)}\n(.*?)(?=^#|\Z)", TEXT, re.MULTILINE | re.DOTALL)
-    assert found, f"docs/reference/can-protocol.md has no heading {heading!r}"
+    assert found, f"docs/reference/can-*.md have no heading {heading!r}"
     return found[1]
 
 
@@ -239,7 +240,7 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
 # --- pictures and neighbors -------------------------------------------------------------------------------
 
 
-def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:
+def test_protocol_document_examples_contain_only_defined_frames() -> None:
     lengths = {int(opcode): load_layouts()[opcode].length for opcode in Opcode}
     for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):
         frame = Frame(int(identifier, 16), bytes.fromhex(data))

@@ -58,7 +58,7 @@ def test_every_enumeration_is_a_value_table() -> None:
         assert {number: str(name) for number, name in table.items()} == ours, (message, signal)
 
 
-def test_every_signal_of_that_name_has_its_table_and_no_narrower_range() -> None:
+def test_signal_with_a_table_has_no_narrower_range() -> None:
     for message in DATABASE.messages:
         for signal in message.signals:
             if signal.name in NAMED:
@@ -81,7 +81,7 @@ def test_directions() -> None:
         assert message.receivers == ({"Module"} if host else {"Host"}), message.name
 
 
-def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
+def test_checksum_is_last_byte_of_messages_that_have_one() -> None:
     for opcode, layout in load_layouts().items():
         assert ("checksum" in layout.signals) == (opcode in WITH_CHECKSUM)
         if opcode in WITH_CHECKSUM:
@@ -89,7 +89,7 @@ def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
             assert (signal.shift, signal.bits) == (8 * layout.length - 8, 8)
 
 
-def test_signals_of_a_message_do_not_overlap_but_for_the_targets_of_a_set_point() -> None:
+def test_signals_of_a_message_overlap_only_for_setpoint_targets() -> None:
     for opcode, layout in load_layouts().items():
         for a, b in combinations(layout.signals.values(), 2):
             shared = (a.mask << a.shift) & (b.mask << b.shift)
@@ -109,7 +109,7 @@ def checked(opcode: Opcode, node: int, payload: bytes) -> Frame:
 
 @pytest.mark.parametrize("opcode", sorted(WITH_CHECKSUM))
 @given(node=st.integers(FIRST_NODE, LAST_NODE), payload=st.binary(min_size=7, max_size=7))
-def test_every_single_wrong_bit_is_found_and_so_is_any_other_node(opcode: Opcode, node: int, payload: bytes) -> None:
+def test_checksum_detects_every_single_bit_error_and_wrong_node(opcode: Opcode, node: int, payload: bytes) -> None:
     frame = checked(opcode, node, payload)
     assert has_valid_checksum(frame)
     number = int.from_bytes(frame.data, "little")
@@ -122,5 +122,5 @@ def test_every_single_wrong_bit_is_found_and_so_is_any_other_node(opcode: Opcode
         assert has_valid_checksum(Frame(frame_id(opcode, other), frame.data)) == (other == node)
 
 
-def test_messages_with_a_checksum_differ_in_length_so_that_none_passes_for_another() -> None:
+def test_messages_with_checksum_have_distinct_lengths() -> None:
     assert len({load_layouts()[opcode].length for opcode in WITH_CHECKSUM}) == len(WITH_CHECKSUM)

@@ -67,7 +67,7 @@ def test_three_contacts_on_known_pegs_bring_the_pose_back(trust, turns, off_w):
     assert localizer.position_sd_m < 0.02
 
 
-def test_a_body_lies_in_no_peg_whether_it_feels_it_or_not():
+def test_anchoring_body_never_overlaps_a_peg():
     off = np.array([0.0, 0.02, 0.0])
     before, after = (held(off, pegs(), [], turns=n).base.planar_w for n in (0, 20))
     assert np.linalg.norm((after - TRUE_W)[:2]) < 0.7 * np.linalg.norm((before - TRUE_W)[:2])

@@ -48,7 +48,7 @@ def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
     assert len(off) == 0 or (np.median(off) < 0.004 and off.max() < 0.02)
 
 
-def test_noise_averages_out_over_a_column_and_dropouts_leave_no_gap():
+def test_depth_scan_averages_noise_and_bridges_dropouts():
     scan = look(SCENE, turned(0.0), eye=Eye(0.004, 0.004, 0.1))
     off = errors_m(scan, SCENE)
     assert len(off) > 20 and np.median(off) < 0.003
@@ -95,7 +95,7 @@ def test_a_beam_into_the_ground_is_no_obstacle():
     assert not np.isfinite(scan.range_m).any()
 
 
-def test_the_plane_follows_a_slope_and_not_what_stands_on_it():
+def test_depth_scan_ground_plane_follows_slope_but_not_objects():
     bottoms = np.column_stack([np.linspace(-1.4, 0, 14), np.zeros(14), 0.05 * np.linspace(-1.4, 0, 14)])
     plane = fit_plane_under(bottoms, np.zeros(2))
     assert plane == pytest.approx([0.0, 0.05, 0.0], abs=0.01)

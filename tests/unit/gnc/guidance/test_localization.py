@@ -16,7 +16,7 @@ def errors_m(drive: Drive, places) -> list[float]:
     return [math.dist(drive.world.localizer.base.planar_w[:2], here.base_w[:2]) for here in places]
 
 
-def test_with_a_pose_sensor_it_is_at_least_as_sure_as_that():
+def test_localization_with_pose_sensor_is_at_least_as_certain():
     drive = Drive([])
     off = errors_m(drive, drive.turns(100, images=False))
     assert np.median(off[5:]) < 0.0008 and drive.world.localizer.position_sd_m < 0.001
@@ -70,7 +70,7 @@ def test_a_late_pose_corrects_what_has_happened_since():
     assert math.dist(drive.world.localizer.base.planar_w[:2], drive.place(drive.turn - 1).base_w[:2]) < 0.012
 
 
-def test_the_history_gives_the_body_at_any_stamp_it_has_and_no_other():
+def test_localization_history_returns_body_only_at_stored_timestamps():
     drive = Drive([])
     history = BodyHistory(drive.robot)
     places = [drive.place(k) for k in range(60)]

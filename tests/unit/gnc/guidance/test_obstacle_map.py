@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snakesim_gnc.guidance import obstacle_map
-from snakesim_gnc.guidance.obstacle_map import KEPT_M, ObstacleMap
+from snakesim_gnc.guidance.obstacle_map import FORGET_DISTANCE_M, ObstacleMap
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_testing.gnc.rendered import box, cylinder, scanned
@@ -55,7 +55,7 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     assert off < 3 * reported.position_sd_m + 0.005
 
 
-def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name_and_one_elsewhere_is_something_new():
+def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
     map_ = mapped(cylinder("a", 0.8, 0.0))
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
@@ -121,9 +121,9 @@ def test_the_newest_look_counts_most_after_drift():
 def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
     monkeypatch.setattr(obstacle_map, "MAX_TRACKS", 64)
     map_ = mapped(cylinder("a", 0.8, 0.0))
-    map_.forget(np.array([[KEPT_M + 0.5, 0.0]]))
+    map_.forget(np.array([[FORGET_DISTANCE_M + 0.5, 0.0]]))
     assert len(map_.tracks) == 1
-    map_.forget(np.array([[KEPT_M + 1.0, 0.0]]))
+    map_.forget(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
     assert not map_.tracks
     map_.add_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
     assert len(map_.tracks) == 100

@@ -48,20 +48,20 @@ def test_so_it_is_on_hills():
 
 
 @pytest.mark.slow
-def test_without_a_pose_sensor_it_is_right_as_the_robot_sees_it():
+def test_perceived_world_without_pose_sensor_matches_robot_view():
     total = scored(Drive(random_field(3)), 300, pose=False)
     assert np.median(total.position_m) < 0.02
     assert total.ghosts <= 0.1 * total.reported
 
 
 @pytest.mark.slow
-def test_an_image_counts_where_it_was_taken_not_where_it_arrives():
+def test_perceived_image_counts_where_it_was_captured():
     """At 0.4 m/s an image is 16 mm old, and the head turns meanwhile."""
     drive = Drive(random_field(1), speed_m_s=0.4)
     assert np.median(scored(drive, 150).position_m) < 0.006
 
 
-def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
+def test_perceived_samples_without_body_pose_are_counted_and_ignored():
     drive = Drive(random_field(1))
     *_, here = drive.turns(30)
     image, before = drive.image(here, 30 * STEP_NS), reported(drive)
@@ -79,7 +79,7 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
 
 
 @pytest.mark.slow
-def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
+def test_perceived_world_after_streams_end_grows_uncertain():
     drive = Drive(random_field(1))
     list(drive.turns(60))
     drive.under_way.clear()
@@ -96,7 +96,7 @@ def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     assert all(o.last_seen_ns == seen[o.name].last_seen_ns for o in after.obstacles)
 
 
-def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():
+def test_perceived_contact_has_the_name_used_in_the_map():
     """Of a peg, unseen, at the left side of the middle link."""
     touch = contact(7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0))
     drive = Drive([])

@@ -77,7 +77,7 @@ def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
     assert abs(turn) < 0.15
 
 
-def test_behind_a_single_face_the_depth_is_a_guess_and_said_so():
+def test_shape_with_single_visible_face_marks_depth_as_guess():
     one = seen(box("it", 0.8, 0.0, (0.1, 0.16)))
     assert one.shape == "box" and one.position_sd_m > 0.015  # its back side is open
     face = one.center_w[0] - min(one.half_m)

@@ -36,7 +36,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_a_pause_of_the_driver_is_remembered_until_states_were_read(bench: Bench) -> None:
+def test_guard_driver_pause_counts_until_states_are_read(bench: Bench) -> None:
     bench.now_ns = 10_000 * MS  # bring-up may take long
     bench.guard.mark_active()
     bench.now_ns += GAP_NS
@@ -50,14 +50,14 @@ def test_a_pause_of_the_driver_is_remembered_until_states_were_read(bench: Bench
     assert not bench.guard.was_away
 
 
-def test_only_an_armed_robot_enables_drives_and_a_fault_goes_on_with_those_that_are_driven(bench: Bench) -> None:
+def test_guard_enables_only_armed_drives_and_keeps_damped_ones(bench: Bench) -> None:
     assert bench.in_fault() == NONE
     assert bench.armed() == BOTH and bench.in_fault() == BOTH
     assert bench.guard.drives_to_command(frozenset({0}), may_enable=False) == {0}
     assert bench.in_fault() == {0}, "the other one was let go"
 
 
-def test_a_driven_drive_with_a_finding_is_let_go_until_it_is_reset_alone(bench: Bench) -> None:
+def test_guard_faulty_drive_is_disabled_until_reset(bench: Bench) -> None:
     bench.armed()
     bench.finds(None)
     assert bench.armed() == BOTH, "a finding of the bus"
@@ -69,7 +69,7 @@ def test_a_driven_drive_with_a_finding_is_let_go_until_it_is_reset_alone(bench: 
     assert bench.armed() == BOTH
 
 
-def test_what_a_drive_still_reports_right_after_a_reset_costs_nothing(bench: Bench) -> None:
+def test_guard_stale_drive_report_right_after_reset_is_ignored(bench: Bench) -> None:
     bench.armed()
     bench.guard.reset(BOTH)
     bench.now_ns += GRACE_NS
@@ -80,7 +80,7 @@ def test_what_a_drive_still_reports_right_after_a_reset_costs_nothing(bench: Ben
     assert bench.armed() == {0}
 
 
-def test_drives_that_the_bus_let_go_by_itself_stay_off_until_a_reset(bench: Bench) -> None:
+def test_guard_drives_disabled_by_bus_stay_off_until_reset(bench: Bench) -> None:
     assert not bench.guard.release_drives(), "none was driven"
     assert bench.armed() == BOTH and bench.guard.release_drives()
     assert bench.armed() == NONE and bench.in_fault() == NONE
@@ -92,7 +92,7 @@ VELOCITIES = np.array([0.3, -0.3, 0.04])
 EVERYBODY = frozenset({0, 1, 2})
 
 
-def test_a_joint_brakes_until_it_is_at_rest_and_for_its_watchdogs_time_at_most() -> None:
+def test_guard_joint_brakes_until_rest_or_watchdog_time() -> None:
     braking, modes = Braking([100 * MS, 200 * MS, 100 * MS], holds=False), [Mode.VELOCITY] * 3
     for _ in range(2):  # a fault, and the next one
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
@@ -103,7 +103,7 @@ def test_a_joint_brakes_until_it_is_at_rest_and_for_its_watchdogs_time_at_most()
         braking.reset()
 
 
-def test_what_holds_holds_without_an_end_and_what_is_passive_is_let_go() -> None:
+def test_guard_hold_has_no_end_and_passive_disables_at_once() -> None:
     braking = Braking([100 * MS] * 3, holds=True)
     assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
     assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY

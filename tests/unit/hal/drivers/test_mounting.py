@@ -18,7 +18,7 @@ plain = Mounting(robot_file().joint_table)
 numbers = st.lists(st.floats(-10, 10), min_size=3, max_size=3).map(np.array)
 
 
-def test_the_drive_of_a_reversed_geared_joint_turns_against_it_and_further_with_less_torque() -> None:
+def test_mounting_reversed_geared_drive_turns_opposite_with_less_torque() -> None:
     assert mounting.to_drive_angle_rad(np.array([0.1, 0.1, 0.1])) == pytest.approx([3.0 - 0.9, 0.1, -0.1])
     assert mounting.to_drive_velocity_rad_s(np.ones(3)).tolist() == [-9.0, 1.0, 1.0]
     assert mounting.to_drive_torque_nm(np.full(3, 1.8)) == pytest.approx([-0.2, 1.8, 1.8])
@@ -26,7 +26,7 @@ def test_the_drive_of_a_reversed_geared_joint_turns_against_it_and_further_with_
 
 
 @given(angle=numbers, velocity=numbers, torque=numbers)
-def test_there_and_back_is_the_same_and_so_is_the_power(
+def test_mounting_conversion_is_invertible_and_preserves_power(
     angle: np.ndarray, velocity: np.ndarray, torque: np.ndarray
 ) -> None:
     assert mounting.to_joint_angle_rad(mounting.to_drive_angle_rad(angle)) == pytest.approx(angle, abs=1e-12)

@@ -87,14 +87,14 @@ def test_the_seed_decides() -> None:
 
 @pytest.mark.parametrize(("kind", "change"), [("drop", -1), ("duplicate", 1)])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5, 0.9, 1.0])
-def test_so_many_are_dropped_or_come_twice_one_right_after_the_other(kind: str, change: int, share: float) -> None:
+def test_disturbance_drops_and_duplicates_the_configured_fraction(kind: str, change: int, share: float) -> None:
     payloads = [payload for _, payload in sent(disturbed(on(kind, share)))]
     struck = change * (len(payloads) - len(MESSAGES))
     assert struck == pytest.approx(share * len(MESSAGES), abs=4 * (share * (1 - share) * len(MESSAGES)) ** 0.5)
     assert payloads == sorted(payloads)
 
 
-def test_a_reordered_message_comes_right_after_the_one_that_follows_it() -> None:
+def test_disturbance_reordered_message_follows_its_successor() -> None:
     payloads = [payload for _, payload in sent(disturbed(on("reorder")))]
     assert payloads == [payload for i in range(0, 400, 2) for payload in (MESSAGES[i + 1], MESSAGES[i])]
 
@@ -105,7 +105,7 @@ def test_a_held_message_goes_out_when_the_reordering_ends() -> None:
     assert way.end("reorder", 0.0) == [b"1"] and way.over
 
 
-def test_a_delay_is_as_long_as_it_says_and_what_follows_it_does_not_overtake() -> None:
+def test_disturbance_delay_has_configured_length_and_keeps_order() -> None:
     way = disturbed(on("delay", 0.05))
     out = sent(way)
     late_s = [when - int(payload) * STEP_S for when, payload in out]
@@ -137,7 +137,7 @@ def test_corrupt_bytes_are_other_bytes(payload: bytes, seed: int) -> None:
     assert corrupted(payload, random.Random(seed)) != payload
 
 
-def test_decoders_get_noise_cuts_and_numbers_that_are_none_and_refuse_them_in_order() -> None:
+def test_disturbance_corrupted_payloads_are_refused_by_decoders() -> None:
     payload, decoder, rng = encode(command(description(), 0.1)), Decoder(JointCommand), random.Random(5)
     lengths, refused, taken = set(), 0, 0
     for _ in range(20_000):

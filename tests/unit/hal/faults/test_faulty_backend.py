@@ -106,7 +106,7 @@ def test_slow_simulator_sample_takes_the_amount(bench: Bench, monkeypatch: pytes
     assert [seconds > 0.0 for seconds in slept_s] == [True, *[False] * (len(slept_s) - 1)] and slept_s[0] <= 0.05
 
 
-def test_the_backend_is_asked_first_and_what_nobody_can_do_is_refused(bench: Bench) -> None:
+def test_injection_is_offered_to_backend_first_else_refused(bench: Bench) -> None:
     leaky = Leaky(run_config())
     able = Bench(leaky)
     able.inject("leak:joint_1")

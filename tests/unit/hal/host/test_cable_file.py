@@ -64,7 +64,7 @@ def writers() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "cables"}
 
 
-def test_a_joint_that_was_turned_through_is_known_after_its_drive_has_forgotten_the_turn(tmp_path: Path) -> None:
+def test_cable_turns_are_known_after_drive_forgot_them(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     assert bench.host(0.1, 1.5, 3.0, 4.0) == []  # by hand; within its limits it comes back
     (refused,) = bench.host(4.0 - TURN, now_s=LATER_S)
@@ -81,7 +81,7 @@ def test_a_cable_that_bears_the_turn_is_no_reason(tmp_path: Path) -> None:
     assert "by 2 turns" in bench.host(10.0 - 2 * TURN, now_s=LATER_S)[0]
 
 
-def test_what_nobody_has_kept_is_unknown_until_it_is_declared_unwound(tmp_path: Path) -> None:
+def test_cable_turns_without_record_are_unknown_until_declared(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "cable_turns = 0.6")
     (refused,) = bench.host(0.0)
     assert "joint_2: how far its cable is wound is not known: no host before this one" in refused
@@ -92,7 +92,7 @@ def test_what_nobody_has_kept_is_unknown_until_it_is_declared_unwound(tmp_path: 
 
 
 @pytest.mark.parametrize("change", ["drive", "sign", "zero"])
-def test_what_is_kept_counts_for_that_drive_as_it_is_mounted(tmp_path: Path, change: str) -> None:
+def test_cable_record_counts_only_for_same_drive_and_mounting(tmp_path: Path, change: str) -> None:
     bench = Bench(tmp_path)
     assert bench.host(0.0) == []
     declared = f'cable_turns = 0.6\ncable_unwound = "{DECLARED}"'
@@ -101,7 +101,7 @@ def test_what_is_kept_counts_for_that_drive_as_it_is_mounted(tmp_path: Path, cha
     assert "of another drive, sign or zero" in bench.host(0.0, now_s=LATER_S)[0]
 
 
-def test_a_host_that_was_killed_has_kept_it_and_a_file_that_cannot_be_read_is_unknown(tmp_path: Path) -> None:
+def test_cable_record_survives_kill_and_unreadable_file_is_unknown(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     assert bench.host(*(0.05 * step for step in range(80)), ends=False) == []
     path = tmp_path / CABLES
@@ -111,7 +111,7 @@ def test_a_host_that_was_killed_has_kept_it_and_a_file_that_cannot_be_read_is_un
     assert "cannot be read" in bench.host(0.0, now_s=LATER_S)[0]
 
 
-def test_only_joints_that_say_so_and_only_real_ones_are_counted(tmp_path: Path) -> None:
+def test_cable_turns_are_counted_only_for_declared_real_joints(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     assert open_cable_file(tmp_path, bench.joints, msgspec.structs.replace(bench.robot, emulated=True)) is None
     bench.file("angle_max_rad = 3.1415\nangle_min_rad = -3.1415")
@@ -125,6 +125,6 @@ def test_only_joints_that_say_so_and_only_real_ones_are_counted(tmp_path: Path) 
     "joint_2",
     ["cable_turns = 0.4", "cable_turns = 0.6\ngear = 9.0"],
 )
-def test_a_cable_that_does_not_bear_the_limits_or_a_geared_drive_is_refused(tmp_path: Path, joint_2: str) -> None:
+def test_cable_shorter_than_limits_or_geared_is_refused(tmp_path: Path, joint_2: str) -> None:
     with raises_error(ConfigError, code="config/invalid-value"):
         file_of(tmp_path, joint_2)

@@ -27,7 +27,7 @@ def test_what_is_out_of_range_counts_at_its_end() -> None:
     assert durations.percentile_us(99) == pytest.approx(1e7, rel=0.01)
 
 
-def test_a_histogram_counts_each_once_from_the_shortest_to_the_longest() -> None:
+def test_histogram_counts_each_value_from_shortest_to_longest() -> None:
     durations = Durations(0.05)
     assert durations.timing() is None
     for took_us in [100.0] * 90 + [200.0] * 9 + [10_000.0]:

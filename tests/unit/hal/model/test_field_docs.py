@@ -54,12 +54,12 @@ def docs_of(struct: type[msgspec.Struct]) -> dict[str, FieldDoc]:
     return {doc.name: doc for doc in document_fields(struct)}
 
 
-def test_a_description_is_the_literal_behind_a_field_in_one_line() -> None:
+def test_field_description_is_its_literal_on_one_line() -> None:
     assert describe_fields(Wheel)["radius_m"] == "Radius of the wheel, without its tire."
     assert "spokes" not in describe_fields(Wheel)
 
 
-def test_a_field_without_a_literal_has_the_description_of_its_type() -> None:
+def test_field_without_literal_uses_description_of_its_type() -> None:
     assert describe_fields(Wheel)["slip_m_s"] == "speed at the ground"
 
 
@@ -68,7 +68,7 @@ def test_descriptions_are_inherited_and_overridden() -> None:
     assert describe_fields(SpareWheel)["radius_m"] == describe_fields(Wheel)["radius_m"]
 
 
-def test_exceptions_have_the_descriptions_of_the_section_for_all_but_for_none() -> None:
+def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
     assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
     exceptions: Any = JointExceptions
     described = describe_fields(exceptions)

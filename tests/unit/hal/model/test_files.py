@@ -69,7 +69,7 @@ def test_a_section_of_a_larger_file_names_its_place_there() -> None:
         decode(table, Part, "box")
 
 
-def test_the_error_names_the_file_in_which_the_field_should_stand() -> None:
+def test_missing_field_error_names_file_where_it_belongs() -> None:
     table = Table({}, "outer.toml")
     table.put("parts", [], "outer.toml")
     table.put("part", {"many": 2, "typo": {"x": 1}}, "inner.toml")
@@ -195,7 +195,7 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: byte
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_a_file_that_is_not_there_is_named_and_so_are_those_that_are(tmp_path: Path) -> None:
+def test_missing_file_error_names_it_and_existing_ones(tmp_path: Path) -> None:
     (tmp_path / "elsewhere.toml").touch()
     with raises_error(ConfigError, code="file/not-found", field="a.toml"):
         read_table(tmp_path / "a.toml")

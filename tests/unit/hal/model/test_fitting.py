@@ -18,7 +18,7 @@ def sine(config: RunConfig) -> SineRoute:
     return config.scene.route
 
 
-def test_the_robot_that_it_was_made_for_and_longer_ones_get_it_as_it_is() -> None:
+def test_fitting_scene_for_same_or_longer_robot_is_unchanged() -> None:
     as_it_is = clutter().scene
     for joints in (8, 13, 30):
         scene = clutter(f"robot.chain.modules={joints}").scene
@@ -29,7 +29,7 @@ def test_the_robot_that_it_was_made_for_and_longer_ones_get_it_as_it_is() -> Non
         )
 
 
-def test_a_robot_of_other_joints_and_another_radius_gets_it_in_proportion() -> None:
+def test_fitting_scene_for_other_joints_and_radius_scales_it() -> None:
     before, config = clutter(), clutter("robot=mamba")
     share = 0.2 / 0.11  # its yaw joints are every second one
     assert spacing_m(config.robot) == pytest.approx(0.2)
@@ -45,7 +45,7 @@ def test_a_robot_of_other_joints_and_another_radius_gets_it_in_proportion() -> N
     assert len(place_obstacles(config)) > 40  # and it lies clear of them
 
 
-def test_what_a_flag_sets_is_not_fitted_and_the_rest_is_marked() -> None:
+def test_fitting_keeps_values_set_by_flags_and_marks_others() -> None:
     loaded = load("surveyed_clutter", [parse_set("robot=mamba"), parse_set("scene.route.wavelength_m=0.7")])
     assert sine(loaded.config).wavelength_m == 0.7
     origin = {key: source for key, _, source in loaded.explain()}
@@ -54,7 +54,7 @@ def test_what_a_flag_sets_is_not_fitted_and_the_rest_is_marked() -> None:
     assert "clutter.toml" in origin["scene.ground.friction"]
 
 
-def test_a_fitted_scene_that_is_run_again_is_not_fitted_again(tmp_path: Path) -> None:
+def test_fitting_an_already_fitted_scene_changes_nothing(tmp_path: Path) -> None:
     config = clutter("robot=mamba")
     write_config(config, tmp_path / "run.json")
     assert load(str(tmp_path / "run.json")).config == config

@@ -5,7 +5,7 @@ import pytest
 from snakesim_hal.model.measured_force import MeasuredForce
 
 
-def test_a_short_hard_blow_is_felt_as_a_long_soft_push_of_the_same_impulse() -> None:
+def test_measured_force_of_blow_equals_push_of_same_impulse() -> None:
     blow, push = MeasuredForce(0.002), MeasuredForce(0.002)
     for step in range(25):
         blow.add({"peg": 100.0} if step == 3 else {})
@@ -13,7 +13,7 @@ def test_a_short_hard_blow_is_felt_as_a_long_soft_push_of_the_same_impulse() -> 
     assert blow.max_n == pytest.approx(4.0) and push.max_n == pytest.approx(4.0)
 
 
-def test_contacts_are_felt_each_by_itself_and_forgotten_after_50_ms() -> None:
+def test_measured_force_of_each_contact_expires_after_50_ms() -> None:
     felt = MeasuredForce(0.01)
     for _ in range(5):
         felt.add({("peg_0", 1): 6.0, ("peg_1", 1): 9.0, ("peg_1", 2): 5.0})

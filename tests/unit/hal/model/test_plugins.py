@@ -40,7 +40,7 @@ def test_everything_installed_loads_and_backends_declare_their_settings(group: s
             assert issubclass(vars(plugin)["Settings"], msgspec.Struct), name
 
 
-def test_an_unknown_name_says_what_is_installed_and_how_one_is_added() -> None:
+def test_plugin_unknown_name_lists_installed_ones_and_how_to_add() -> None:
     with raises_error(
         ConfigError, code="plugin/not-found", field=("wiggle", "snakesim.controllers"), stored=False
     ) as caught:
@@ -119,7 +119,7 @@ class Plugin:
         gain: float = 1.0
 
 
-def test_settings_are_checked_by_the_plugins_own_struct_and_name_file_or_flag() -> None:
+def test_plugin_settings_are_checked_by_its_struct_naming_the_source() -> None:
     assert plugin_settings(Plugin, {}, "a.toml", "controllers.p").gain == 1.0
     with raises_error(ConfigError, code="config/unknown-key", field="a.toml"):
         plugin_settings(Plugin, {"gian": 1}, "a.toml", "controllers.p")
@@ -134,9 +134,7 @@ def test_a_plugin_without_settings_is_told_to_state_them() -> None:
             plugin_settings(bad, {}, "a.toml", "x")
 
 
-def test_two_packages_with_a_plugin_of_one_name_are_refused_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plugin_name_in_two_packages_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("waves", "gaits"):
         metadata = tmp_path / f"{package}-1.0.dist-info"
         metadata.mkdir()

@@ -59,7 +59,7 @@ def test_the_description_says_what_the_file_says() -> None:
     assert (described.stop_mode, described.max_step_rad) == ("damp", 0.3)
 
 
-def test_one_joint_may_differ_in_every_field_that_the_sections_give_to_all() -> None:
+def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
     own = {
         "id": 17, "sign": -1, "zero_rad": 0.3, "gear": 2.0, "port": "can1", "driver": "odrive",
         "angle_min_rad": -0.4, "angle_max_rad": 1.2, "speed_rad_s": 2.0, "torque_nm": 3.0, "derate_from_c": 60.0,
@@ -91,12 +91,12 @@ def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
     assert description().joints[0].measures == ["torque", "temperature", "voltage"]
 
 
-def test_every_field_of_the_sections_may_be_said_for_one_joint() -> None:
+def test_robot_every_section_field_has_a_joint_field() -> None:
     said = {field for section in (Limits, Motor, Drive, Heat, Supply) for field in section.__struct_fields__}
     assert said - set(JointExceptions.__struct_fields__) == {"ambient_c"}, "the water is the same for all"
 
 
-def test_only_the_sensors_that_a_robot_has_are_described_and_none_is_faster_than_the_loop() -> None:
+def test_robot_description_lists_only_its_sensors_within_loop_rate() -> None:
     assert [sensor.key for sensor in description().sensors] == [keys.JOINTS]
     rich = description(sensors={"contacts": {"rate_hz": 1000.0}, "imu": {"rate_hz": 20.0, "delay_s": 0.1}, "pose": {}})
     rates = {sensor.key: sensor.rate_hz for sensor in rich.sensors}
@@ -104,7 +104,7 @@ def test_only_the_sensors_that_a_robot_has_are_described_and_none_is_faster_than
     assert {sensor.key: sensor.delay_s for sensor in rich.sensors}[keys.IMU] == 0.1
 
 
-def test_cameras_and_lidars_are_described_by_their_names_and_arrive_a_period_late_at_least() -> None:
+def test_robot_cameras_and_lidars_are_named_and_one_period_late() -> None:
     depth = [
         {"name": "head", "delay_s": 0.0, "color": True},
         {"name": "back", "link": 2, "position_m": [0.0, 0.0, 0.1]},

@@ -34,7 +34,7 @@ def test_arc_length_of_known_curves() -> None:
     assert Route(sine_points(0.1, 0.8, 4.0)).length_m == pytest.approx(exact, rel=1e-3)
 
 
-def test_positions_run_through_the_points_and_go_straight_on_at_both_ends() -> None:
+def test_route_passes_through_points_and_extends_straight_at_ends() -> None:
     route = Route([(0, 0), (3, 4), (3, 5)])
     wanted = {-5.0: (-3, -4), 0.0: (0, 0), 2.5: (1.5, 2), 5.0: (3, 4), 5.5: (3, 4.5), 6.0: (3, 5), 8.0: (3, 7)}
     assert route.position_w(np.array(list(wanted))) == pytest.approx(np.array(list(wanted.values())))
@@ -46,9 +46,7 @@ def test_the_fast_lookup_is_the_slow_one(route: Route, s_m: float) -> None:
 
 
 @given(route=gentle(), s_m=st.floats(-0.5, 7), step_m=st.floats(1e-4, 0.05))
-def test_no_chord_is_longer_than_its_arc_and_short_ones_are_nearly_as_long(
-    route: Route, s_m: float, step_m: float
-) -> None:
+def test_route_chord_is_at_most_and_nearly_its_arc(route: Route, s_m: float, step_m: float) -> None:
     chord = math.dist(route.point_at(s_m), route.point_at(s_m + step_m))
     assert 0.9 * step_m <= chord <= step_m * (1 + 1e-9)
 
@@ -70,6 +68,43 @@ def test_projection_is_the_nearest_point(route: Route, x: float, y: float) -> No
     found = math.dist(route.point_at(s), (x, y))
     tried = route.position_w(np.arange(-1.0, route.length_m + 1.0, 0.004))
     assert found <= float(np.hypot(*(tried - [x, y]).T).min()) + 1e-9
+
+
+def project_by_measuring_all(route: Route, point_w: Floats, first: int, last: int) -> float:
+    """Measure every segment from `first` to before `last`. Returns what `Route.project` must return, bit for bit."""
+    lengths = np.hypot(*np.diff(route.points_w, axis=0).T)
+    s_m = np.concatenate(([0.0], np.cumsum(lengths)))
+    starts = route.points_w[first:last]
+    directions = np.diff(route.points_w, axis=0)[first:last] / lengths[first:last, None]
+    along = np.einsum("ij,ij->i", point_w - starts, directions)
+    low = np.zeros(last - first)
+    high = np.diff(s_m[first : last + 1])
+    if first == 0:
+        low[0] = -np.inf
+    if last == len(lengths):
+        high[-1] = np.inf
+    along = np.clip(along, low, high)
+    gaps = starts + along[:, None] * directions - point_w
+    nearest = int(np.argmin(np.einsum("ij,ij->i", gaps, gaps)))
+    return float(s_m[first + nearest] + along[nearest])
+
+
+@given(
+    seed=st.integers(0, 2**31), count=st.sampled_from([1, 2, 5, 17, 300]), spread_m=st.sampled_from([0.02, 1.0, 50.0])
+)
+def test_projection_has_the_bits_of_measuring_every_segment(seed: int, count: int, spread_m: float) -> None:
+    """Random walks that cross themselves, points on them and far away, with and without a window."""
+    random = np.random.default_rng(seed)
+    headings_rad = np.cumsum(random.normal(0.0, random.choice([0.05, 1.0]), count))
+    steps = random.uniform(0.002, 0.05, count)[:, None] * np.column_stack([np.cos(headings_rad), np.sin(headings_rad)])
+    route = Route(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
+    for _ in range(8):
+        place_w = route.points_w[random.integers(len(route.points_w))]
+        point_w = place_w + random.normal(0.0, spread_m, 2) * random.integers(2)
+        assert route.project(point_w) == project_by_measuring_all(route, point_w, 0, count)
+        near_s_m = float(random.uniform(-1.0, route.length_m + 1.0))
+        first, last = route._segments_near(near_s_m, 0.3)
+        assert route.project(point_w, near_s_m, 0.3) == project_by_measuring_all(route, point_w, first, last)
 
 
 def test_projection_near_a_place_stays_on_its_branch() -> None:
@@ -98,7 +133,7 @@ def test_a_sine_bends_the_other_way_at_every_half_wave() -> None:
     assert np.abs(spots[:, 1]).max() < 0.01
 
 
-def test_inflections_are_found_across_a_straight_piece_and_not_where_there_is_none() -> None:
+def test_route_inflections_are_detected_across_straight_pieces_only() -> None:
     turn = np.linspace(0, 1, 50)
     first = np.column_stack([np.sin(turn), 1 - np.cos(turn)])
     forward = np.array([math.cos(1.0), math.sin(1.0)])
@@ -140,9 +175,7 @@ def nodes(tail_w: tuple[float, float], heading_rad: float, angles_rad: Floats, l
     tail_s_m=st.floats(-0.5, 2.0),
     lengths_m=st.lists(st.floats(0.04, 0.15), min_size=2, max_size=15),
 )
-def test_a_laid_chain_has_every_joint_on_the_route_at_its_right_distance(
-    route: Route, tail_s_m: float, lengths_m: list[float]
-) -> None:
+def test_route_laid_chain_has_joints_at_their_distances(route: Route, tail_s_m: float, lengths_m: list[float]) -> None:
     lay = lay_chain(route, tail_s_m, lengths_m)
     points = nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, lengths_m)
     assert lay.tail_w == pytest.approx(route.point_at(tail_s_m))

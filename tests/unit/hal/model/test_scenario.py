@@ -61,7 +61,7 @@ def test_a_flag_makes_another_field_or_another_goal() -> None:
         with_flags("clutter", "mission.map=guessed")
 
 
-def test_a_survey_is_off_by_its_error_and_by_the_same_for_everybody() -> None:
+def test_scenario_survey_error_is_the_same_for_all_services() -> None:
     exact, off = (with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005))
     truth = np.array([placed.obstacle.position_w for placed in place_obstacles(off)])
     assert np.array_equal([one.position_w for one in survey_obstacles(exact)], truth)
@@ -72,7 +72,7 @@ def test_a_survey_is_off_by_its_error_and_by_the_same_for_everybody() -> None:
         with_flags("clutter", "mission.map_error_m=0.005")
 
 
-def test_parts_stand_beside_the_scenario_or_are_shipped_and_flags_name_them_from_here(tmp_path: Path) -> None:
+def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     path = write_files(tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"'))
     assert load(path).config.robot.name == "planar13"
@@ -127,7 +127,7 @@ def test_an_external_service_is_waited_for_and_not_started() -> None:
 
 
 @given(rate_hz=st.floats(20, 5000))
-def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(rate_hz: float) -> None:
+def test_scenario_lease_is_five_periods_between_50_and_100_ms(rate_hz: float) -> None:
     config = run_config(rate_hz=rate_hz)
     assert 50_000_000 <= config.lease_ns <= 100_000_000
     if 50_000_000 < config.lease_ns < 100_000_000:
@@ -135,7 +135,7 @@ def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(r
 
 
 @given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
-def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, lag: int) -> None:
+def test_scenario_samples_at_a_tick_are_due_and_aged(tick: int, every: int, lag: int) -> None:
     service = ServiceSchedule(decimation=every, latency_ticks=lag)
     counting = service.used_output_tick(tick)
     assert counting % every == 0 and counting >= 0
@@ -202,7 +202,7 @@ def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:
     return [(at, value)]
 
 
-def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_flags(tmp_path: Path) -> None:
+def test_scenario_control_alias_means_chosen_controller_in_any_flag_order(tmp_path: Path) -> None:
     path = write_files(tmp_path)
     assert with_flags(path, "control.gain=3").config.controllers == {"hold": {"gain": 3}}
     for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):

@@ -70,7 +70,7 @@ def test_every_kind_of_obstacle_is_placed_as_described() -> None:
     assert step.walkable and not any(item.walkable for item in placed[:4])
 
 
-def test_what_obstacles_are_made_of_holds_for_all_of_a_row_or_field_and_leaves_their_places() -> None:
+def test_scene_row_material_applies_to_all_and_keeps_places() -> None:
     made = {"friction": 0.1, "mass_kg": 2.0, "base_friction": 0.5}
     row = {"corridor_m": 0.06, "radius_m": 0.05, "count": 3}
     plain = place_scene(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
@@ -86,7 +86,7 @@ def test_what_obstacles_are_made_of_holds_for_all_of_a_row_or_field_and_leaves_t
     assert leans[:, 1].min() < -1.0 and leans[:, 1].max() > 1.0
 
 
-def test_a_peg_that_leans_into_the_snake_at_its_start_is_refused() -> None:
+def test_scene_leaning_peg_that_overlaps_snake_start_is_refused() -> None:
     beside = {"position_m": [0.3, 0.095], "radius_m": 0.05}
     for towards_rad, overlaps in ((-math.pi / 2, True), (math.pi / 2, False)):
         made = scene(cylinder=[{**beside, "lean_rad": 0.4, "lean_towards_rad": towards_rad}])
@@ -103,7 +103,7 @@ def test_a_peg_that_leans_into_the_snake_at_its_start_is_refused() -> None:
     first=st.integers(0, 2),
     amplitude_m=st.floats(0.02, 0.12),
 )
-def test_pegs_stand_at_their_distance_on_the_side_that_pushes_forward(
+def test_scene_pegs_stand_at_distance_on_the_forward_pushing_side(
     corridor_m: float, radius_m: float, count: int, first: int, amplitude_m: float
 ) -> None:
     row = {"corridor_m": corridor_m, "radius_m": radius_m, "count": count, "first": first}
@@ -179,7 +179,7 @@ def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
             assert LINKS.distance_m(point).min() >= 0.1 - 1e-9
 
 
-def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
+def test_scene_random_pegs_depend_only_on_their_seed() -> None:
     first, again = (place_scene(scene(random_field=[FIELD])) for _ in range(2))
     assert first == again
     assert place_scene(scene(random_field=[{**FIELD, "seed": 8}])) != first
@@ -200,7 +200,7 @@ def test_two_obstacles_with_one_name_are_refused() -> None:
         place_scene(scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}]))
 
 
-def test_a_wall_of_no_length_and_a_route_of_equal_points_are_refused() -> None:
+def test_scene_zero_length_wall_and_equal_route_points_are_refused() -> None:
     with raises_error(ConfigError, code="scene/invalid", field="wall.0"):
         place_scene(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
     with raises_error(ConfigError, code="scene/invalid", field="route.points_m"):

@@ -74,7 +74,7 @@ def test_a_deep_json_file_is_refused(depth: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_large_file_with_as_much_as_is_allowed_takes_bounded_time(tmp_path: Path) -> None:
+def test_text_file_of_maximum_size_is_read_in_bounded_time(tmp_path: Path) -> None:
     key = ".".join("k" * (MAX_DEPTH - 1))
     text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MAX_TOML - 10]
     (tmp_path / "large.toml").write_text(text[: text.rindex("\n")])
@@ -145,7 +145,7 @@ def test_what_is_no_file_is_not_written_to(taken: str, tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere").read_text() == "precious"
 
 
-def test_a_link_where_the_partial_file_would_be_is_not_followed(tmp_path: Path) -> None:
+def test_text_file_link_at_partial_name_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("precious")
     (tmp_path / "out.html.partial").symlink_to(tmp_path / "elsewhere")
     write_text(tmp_path / "out.html", "page")

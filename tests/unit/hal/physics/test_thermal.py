@@ -16,7 +16,7 @@ def windings(count: int = 1, **exceptions: Any) -> Thermal:
     return Thermal(robot.joint_table)
 
 
-def test_half_of_rated_torque_is_held_for_ever_at_80_degrees() -> None:
+def test_thermal_half_rated_torque_settles_at_80_degrees() -> None:
     heat = windings()
     heat.pass_time(3600.0, np.array([2.0**2]))
     assert heat.winding_c[0] == pytest.approx(80.0)
@@ -32,7 +32,7 @@ def test_it_is_exact_whatever_the_step() -> None:
     assert coarse.winding_c[0] == pytest.approx(20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60)))
 
 
-def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cooled() -> None:
+def test_thermal_share_is_reported_while_hot_and_once_after_cooling() -> None:
     heat = windings(2)
     for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
         heat.winding_c[1] = celsius

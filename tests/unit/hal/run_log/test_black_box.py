@@ -68,7 +68,7 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
     assert columns["contact_count"][:8].tolist() == [0, 0, 0, 2, 2, 2, 0, 0]
 
 
-def test_the_digest_stands_for_tick_mode_target_and_torque_limit_and_nothing_else() -> None:
+def test_black_box_digest_depends_only_on_commands() -> None:
     same = digest((0, decision()), (1, decision()))
     assert digest((0, decision()), (1, decision()), angle=0.5) == same
     others = [
@@ -167,7 +167,7 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
     assert torn == []
 
 
-def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
+def test_black_box_tick_has_constant_cost_and_memory() -> None:
     robot = description(chain__modules=100)
     box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
     reported = TickDecision(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
@@ -185,7 +185,7 @@ def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
     assert max(peaks) < 20_000 and kept < 2_000
 
 
-def test_the_force_over_50_ms_is_kept_where_the_sensor_tells_it() -> None:
+def test_black_box_keeps_mean_force_where_sensor_measures_it() -> None:
     box = BlackBox(ROBOT)
     touches = Contacts(tick=0, timestamp_ns=0, contacts=[contact(force_l=(3.0, 4.0, 0.0))], measured_force_n=1.5)
     box.record(0, 0, Samples(state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())

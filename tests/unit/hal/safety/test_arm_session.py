@@ -12,7 +12,7 @@ NONE = np.zeros(len(ROBOT.joints), dtype=np.bool_)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_target_may_be_a_whole_step_away_and_no_further(side: float) -> None:
+def test_arming_target_may_be_one_step_away_at_most(side: float) -> None:
     here = np.zeros(len(ROBOT.joints))
     assert find_far_targets(command(ROBOT, side * MAX), here, ROBOT, NONE) == []
     further = np.nextafter(MAX, np.inf)

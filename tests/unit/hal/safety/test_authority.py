@@ -10,7 +10,19 @@ from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, Mode, SensorDescription
-from snakesim_testing.hal.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, commanded, modes, receive
+from snakesim_testing.hal.authority_rig import (
+    ARM,
+    CLEAR,
+    DISARM,
+    ESTOP,
+    FINISH,
+    JOINTS,
+    Rig,
+    armed,
+    commanded,
+    modes,
+    receive,
+)
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, state
 
 MAX_REASON_LENGTH = 500  # characters that the reason of an answer may have on the wire
@@ -261,6 +273,31 @@ def test_fault_after_the_first_does_not_replace_the_reason() -> None:
     assert rig.authority.reason == "because of bus_off"
     assert rig.authority.faults[0].cause == "because of bus_off"
     assert rig.authority.faults[1].cause == "because of watchdog"
+
+
+@pytest.mark.parametrize("stop", ["fault", "estop"])
+def test_faults_of_a_full_log_include_the_first_stop(stop: str) -> None:
+    rig = armed()
+    for tick in range(16):
+        rig.authority.record_fault(Fault(tick=tick, what="late", cause="late"))
+    match stop:
+        case "fault":
+            rig.authority.fault(Fault(tick=16, what="hot", cause="hot"))
+        case _:
+            rig.authority.on_estop(ESTOP, 16)
+            rig.authority.on_estop(ESTOP, 17)
+    rig.authority.fault(Fault(tick=18, what="hot", cause="hot"))
+    for tick in range(19, 100):
+        rig.authority.fault(Fault(tick=tick, what="late", cause="late", reach="none"))
+    assert [fault.tick for fault in rig.authority.faults][:17] == [*range(17)]
+
+
+def test_finish_while_armed_disarms() -> None:
+    rig = armed()
+    answer = rig.authority.on_lifecycle(FINISH, rig.now_ns)
+    assert answer.ok
+    assert answer.lifecycle == "disarmed"
+    assert answer.reason.startswith("finished by")
 
 
 def test_faults_since_start_survive_a_reset() -> None:

@@ -53,7 +53,7 @@ def test_nothing_is_derated_before_anything_is_known() -> None:
     assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated_joints() == {}
 
 
-def test_a_joint_that_measures_neither_heat_nor_voltage_is_stopped_by_neither() -> None:
+def test_derating_joint_without_heat_or_voltage_sensor_never_stops() -> None:
     bench = Bench(joints={"joint_2": {"measures": ["torque"]}, "joint_3": {"measures": ["voltage"]}})
     assert bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 24.0]) == []
     assert bench.look(100 * MS) == [] and bench.shares == [1.0] * JOINTS and bench.against_arming == []
@@ -78,7 +78,7 @@ def test_the_robot_file_says_from_where_to_where() -> None:
     assert len(bench.receive(60.0)) == JOINTS
 
 
-def test_a_winding_that_is_too_hot_stops_the_robot_until_it_has_cooled() -> None:
+def test_derating_overheated_winding_stops_robot_until_it_has_cooled() -> None:
     bench = Bench()
     assert bench.receive([20.0, 104.9, 20.0]) == []
     (fault,) = bench.receive([20.0, 105.0, 20.0])
@@ -189,7 +189,7 @@ def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
 
 
 @pytest.mark.parametrize("reported", [{"leak": True}, {"voltage_v": 12.0}])
-def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(reported: dict[str, Any]) -> None:
+def test_derating_leak_and_voltage_of_silent_module_are_ignored(reported: dict[str, Any]) -> None:
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
@@ -198,7 +198,7 @@ def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(reported:
     assert bench.derating.present_faults == []
 
 
-def test_a_sensor_that_never_says_anything_is_told_where_there_should_be_one() -> None:
+def test_derating_missing_reports_are_recorded_where_sensor_is_described() -> None:
     silent, absent = Bench(expected=True), Bench()
     for bench in (silent, absent):
         bench.look(0)

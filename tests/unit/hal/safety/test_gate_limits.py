@@ -116,7 +116,7 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[Joi
 
 
 @given(situations())
-def test_what_needs_no_change_is_not_changed_and_what_was_changed_is_named(
+def test_gate_names_exactly_the_targets_it_changes(
     case: tuple[JointCommand, Measured, Applied],
 ) -> None:
     asked, measured, last = case
@@ -128,7 +128,7 @@ def test_what_needs_no_change_is_not_changed_and_what_was_changed_is_named(
 
 
 @given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
-def test_a_stream_of_wild_targets_never_moves_faster_than_the_limit(stream: list[list[float]]) -> None:
+def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]]) -> None:
     """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
     zero, last = np.zeros(JOINTS), before(Mode.POSITION)
     for target in stream:
@@ -152,7 +152,7 @@ def test_a_target_that_waits_is_reached() -> None:
 
 @pytest.mark.parametrize("angle", [1.6, 1.8, 2.5, 1e4])
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_joint_beyond_its_end_is_only_ever_sent_back_inside(angle: float, side: int) -> None:
+def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: int) -> None:
     for wanted in (-1e4, -1.5, 0.0, 1.5, 1e4):
         target = applied_for(command(ROBOT, wanted), angle=side * angle).target
         assert (np.abs(target) <= 1.5).all()
@@ -203,7 +203,7 @@ def motor_torque(target: float, angle: float, velocity: float) -> float:
     wanted=st.floats(-10, 10),
     mode=st.sampled_from([Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE]),
 )
-def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
+def test_gate_switch_to_position_mode_keeps_present_torque(
     angle: float, velocity: float, torque: float, wanted: float, mode: Mode
 ) -> None:
     applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, mode)
@@ -216,15 +216,13 @@ def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
     wanted=st.floats(-10, 10),
     mode=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
 )
-def test_a_switch_to_torque_mode_goes_on_with_the_torque_that_is_there(
-    torque: float, wanted: float, mode: Mode
-) -> None:
+def test_gate_switch_to_torque_mode_keeps_present_torque(torque: float, wanted: float, mode: Mode) -> None:
     applied = applied_for(command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, mode)
     assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
 
 
 @given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
-def test_a_switch_to_velocity_mode_goes_on_with_the_torque_that_is_there(velocity: float, wanted: float) -> None:
+def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, wanted: float) -> None:
     applied = applied_for(command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
     joint = ROBOT.joints[0]
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
@@ -277,7 +275,7 @@ def test_a_joint_can_stop_before_its_end() -> None:
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("delay", [1, 2])
-def test_a_joint_that_is_driven_at_its_end_by_velocity_stops_before_it(side: int, delay: int) -> None:
+def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) -> None:
     """A joint that turns as it is told, one or two periods later."""
     angle, reported = 0.0, [0.0] * delay
     last = before(Mode.VELOCITY)
@@ -304,7 +302,7 @@ def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_joint_that_comes_too_fast_is_braked_in_torque_mode(side: int) -> None:
+def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
     measured, asked = every(side * 1.4, side * 5.0), command(ROBOT, side * 4.0, Mode.TORQUE)
     applied = limited(asked, measured, before(Mode.TORQUE, side * 4.0))
     allowed = stoppable_speed(0.1, 100.0, 0.01)
@@ -324,14 +322,14 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     assert high == -low > 4.0
 
 
-def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
+def test_gate_joint_near_its_end_is_named_angle_limited() -> None:
     asked = command(ROBOT, 5.0, Mode.VELOCITY)
     applied = limited(asked, every(1.45), before(Mode.VELOCITY, 5.0))
     assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
     assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
 
 
-def test_a_torque_far_from_the_ends_is_not_named_by_them() -> None:
+def test_gate_torque_far_from_ends_is_not_named_angle_limited() -> None:
     asked = command(ROBOT, 5.0, Mode.TORQUE)
     measured = every(0.0, 1.45)
     applied = limited(asked, measured, before(Mode.TORQUE, 4.0))
@@ -364,7 +362,7 @@ def test_the_tightest_limit_is_the_one_that_is_named(
 
 
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])
-def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float) -> None:
+def test_gate_joint_at_its_end_needs_no_torque(velocity: float) -> None:
     """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
     joint = ROBOT.joints[0]
     _, most = torque_bounds_at_ends(joint, joint.angle_max_rad, velocity, 0.01)

@@ -33,7 +33,7 @@ def test_by_default_one_joint_stops_the_robot() -> None:
     assert fault.joint == "joint_2" and fault.reach == "robot"
 
 
-def test_a_joint_that_fails_is_passive_and_the_others_go_on() -> None:
+def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
     rig = lame()
     (fault,) = rig.authority.faults
     assert (fault.what, fault.joint, fault.reach) == ("state_invalid", "joint_2", "joint")
@@ -126,7 +126,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
     assert rig.tick_with(0.1).setpoints.isolated == {1}
 
 
-def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
+def test_isolation_ends_after_reset_and_a_new_state() -> None:
     rig = lame()
     answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)  # not while it moves
     assert answer.refusal == "wrong_state"
@@ -160,7 +160,7 @@ def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
 
 
-def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
+def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     rig = armed(safety__max_isolated_joints=1)
     receive(rig, [20.0, 110.0, 20.0])
     assert rig.tick_with(0.1).setpoints.isolated == {1} and rig.authority.state == "armed"
@@ -174,7 +174,7 @@ def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
     assert rig.authority.state == "fault" and rig.authority.faults[-1].what == "undervoltage"
 
 
-def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
+def test_isolation_silent_health_of_lost_joint_is_not_recorded() -> None:
     rig = lame()
     receive(rig, [20.0] * JOINTS)
     rig.authority.on_lifecycle(DISARM, rig.now_ns)

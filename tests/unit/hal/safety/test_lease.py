@@ -92,7 +92,7 @@ REQUESTS = st.tuples(
 
 
 @given(st.lists(REQUESTS, max_size=30))
-def test_over_any_history_every_holder_has_an_epoch_of_its_own(history: list[tuple[str, str, int, int, int]]) -> None:
+def test_lease_every_holder_in_any_history_has_unique_epoch(history: list[tuple[str, str, int, int, int]]) -> None:
     lease, now, holders = Lease(), 0, {}
     for action, holder, epoch, priority, passes in history:
         now += passes

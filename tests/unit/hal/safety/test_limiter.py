@@ -169,6 +169,6 @@ def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: 
     assert JointLimits.from_description(robot).oldest_state_ns == oldest_ms * 1_000_000
 
 
-def test_a_robot_that_lists_no_joint_sensor_has_none_that_is_late() -> None:
+def test_limiter_without_joint_sensor_assumes_oldest_allowed_state() -> None:
     robot = msgspec.structs.replace(ROBOT, sensors=[])
     assert JointLimits.from_description(robot).oldest_state_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns

@@ -97,12 +97,12 @@ def test_age_counts_as_time() -> None:
     assert bench.see(0.4, age_ns=[0] * JOINTS) is None
 
 
-def test_a_host_that_was_held_up_knows_that_more_time_has_passed() -> None:
+def test_plausibility_host_pause_extends_the_reachable_angle() -> None:
     assert Bench().see(0.5) is not None
     assert Bench().see(0.5, late_ns=4 * PERIOD_NS) is None
 
 
-def test_what_stays_at_a_new_place_is_believed_again_but_not_while_armed() -> None:
+def test_plausibility_new_place_is_accepted_after_repeats_unless_armed() -> None:
     """A joint that was bent by hand between two samples; slowly, so that time alone does not make it good."""
     for applied, seen in ((None, 5), (targets(), 6)):
         bench = Bench()
@@ -132,13 +132,13 @@ def test_a_sample_that_is_repeated_does_not_count_again() -> None:
     assert bench.see(1.4) is None
 
 
-def test_a_sample_that_comes_again_and_again_does_not_count_however_late() -> None:
+def test_plausibility_repeated_sample_never_counts_twice() -> None:
     bench = Bench()
     for k in range(12):
         assert bench.see(1.4, periods=0.0 if k else 1.0, late_ns=k) is not None
 
 
-def test_a_stamp_that_goes_back_leaves_no_less_room_than_none() -> None:
+def test_plausibility_earlier_timestamp_leaves_at_least_the_slack() -> None:
     assert Bench().see(0.04, periods=-0.5) is None
 
 
@@ -163,7 +163,7 @@ def test_joints_are_judged_each_by_itself() -> None:
 @pytest.mark.parametrize(
     "bad", [{"valid": [True, False, True]}, {"age_ns": [0, LEASE_NS + 1, 0]}, {"angle": [0.1, float("nan"), 0.1]}]
 )
-def test_what_is_not_known_changes_nothing_else(bad: dict[str, Any]) -> None:
+def test_plausibility_unknown_joint_leaves_others_unchanged(bad: dict[str, Any]) -> None:
     bench = Bench()
     values: dict[str, Any] = {"angle": 0.1, **bad}
     fault = bench.see(**values)
@@ -192,7 +192,7 @@ def test_who_is_set_aside_is_not_looked_at(at: int) -> None:
     assert (bench.see(jumped, aside=aside) is None) == (at == 1) and bench.doubted == [2] * (at == 2)
 
 
-def test_what_is_wrong_concerns_joints_and_a_state_of_no_joints_the_robot() -> None:
+def test_plausibility_fault_reaches_joints_or_the_whole_robot() -> None:
     bench = Bench()
     fault = bench.see(valid=[True, False, False])
     assert fault is not None and fault.reach == "joint" and bench.doubted == [1, 2]
@@ -201,7 +201,7 @@ def test_what_is_wrong_concerns_joints_and_a_state_of_no_joints_the_robot() -> N
     assert (fault.tick, fault.what, fault.cause, fault.joint) == (7, WORD, "no joint state of 3 joints", None)
 
 
-def test_as_far_as_a_joint_may_turn_is_not_too_far() -> None:
+def test_plausibility_angle_exactly_at_reach_is_accepted() -> None:
     assert Bench(angle=0.0).see(0.05, periods=0) is None
     assert Bench(angle=0.0).see(float(np.nextafter(0.05, 1.0)), periods=0) is not None
 
@@ -227,7 +227,7 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
 
 
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm", "valid"])
-def test_a_state_of_another_number_of_joints_is_published_as_it_is(column: str) -> None:
+def test_plausibility_state_of_wrong_length_is_published_unchanged(column: str) -> None:
     odd = msgspec.structs.replace(state(ROBOT, float("nan")), **{column: [float("nan")]})
     assert replace_unreadable(odd, Bench().watch.measured) is odd
 
@@ -246,7 +246,7 @@ def stuck(
     return [bench.see(0.0, 0.0, torque, applied=targets(step * k, mode)) for k in range(periods)][-1]
 
 
-def test_a_joint_that_repeats_itself_while_its_target_moves_is_frozen() -> None:
+def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 1) is None  # for a lease, and no longer
     fault = bench.see(0.0, 0.0, 0.5, applied=targets(0.2))
@@ -264,14 +264,14 @@ def test_a_target_that_hardly_moves_proves_nothing() -> None:
     assert stuck(Bench(torque=0.5), 70, 0.0014) is not None
 
 
-def test_a_joint_that_rested_for_long_has_a_lease_to_follow_a_target_that_jumps() -> None:
+def test_plausibility_rested_joint_has_one_lease_to_follow_a_jump() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, 100, 0.0) is None
     seen = [bench.see(0.0, 0.0, 0.5, applied=targets(0.3)) for _ in range(LEASE_PERIODS + 2)]
     assert seen[:LEASE_PERIODS] == [None] * LEASE_PERIODS and seen[-1] is not None
 
 
-def test_a_motor_at_its_limit_may_say_the_same_for_ever() -> None:
+def test_plausibility_saturated_motor_may_repeat_its_state() -> None:
     assert stuck(Bench(torque=4.0), 50, torque=3.9) is None
     assert stuck(Bench(torque=-4.0), 50, torque=-3.9) is None
     bench = Bench()
@@ -279,7 +279,7 @@ def test_a_motor_at_its_limit_may_say_the_same_for_ever() -> None:
         assert bench.see(applied=targets(0.02 * k, torque_limit=0.0)) is None
 
 
-def test_only_joints_with_a_position_target_of_an_armed_robot_can_be_frozen() -> None:
+def test_plausibility_frozen_needs_position_target_of_armed_robot() -> None:
     for mode in (Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE):
         assert stuck(Bench(torque=0.5), 50, mode=mode) is None
     bench = Bench(torque=0.5)
@@ -297,7 +297,7 @@ def test_a_mode_between_begins_anew() -> None:
         assert bench.see(0.0, 0.0, 0.5, applied=targets(9.0, Mode.VELOCITY)) is None
 
 
-def test_a_joint_that_came_to_life_again_has_a_whole_lease_before_it_is_frozen() -> None:
+def test_plausibility_revived_joint_has_a_full_lease_until_frozen() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None  # far for nearly a lease
     assert bench.see(1e-9, 0.0, 0.5, applied=targets(0.2)) is None  # every joint moves

@@ -44,7 +44,7 @@ def test_the_target_goes_on_from_where_it_was() -> None:
     assert way[:6] == pytest.approx([0.2, 0.15, 0.1, 0.05, 0.0, 0.0])
 
 
-def test_after_another_mode_it_begins_with_the_torque_that_is_there() -> None:
+def test_stop_ramp_after_another_mode_starts_from_present_torque() -> None:
     halt = beginning(0.1, 1.0, 2.0, Mode.VELOCITY, 1.0)
     assert halt.target_rad == pytest.approx(np.full(JOINTS, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
 
@@ -61,7 +61,7 @@ def test_it_begins_near_the_joint() -> None:
     mode=st.sampled_from(list(Mode)),
     target=st.floats(-1.5, 1.5),
 )
-def test_whatever_it_begins_with_no_target_jumps_or_leaves_its_range(
+def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
     angle: float, velocity: float, torque: float, mode: Mode, target: float
 ) -> None:
     way = np.array(targets(beginning(angle, velocity, torque, mode, target), 60))

@@ -81,7 +81,7 @@ def test_lists_longer_than_allowed_are_refused(message: type[Message]) -> None:
 
 
 @each_message
-def test_a_missing_required_field_is_refused_and_a_new_one_ignored(message: type[Message]) -> None:
+def test_codec_missing_required_field_is_refused_and_new_one_ignored(message: type[Message]) -> None:
     example = plain_example(message)
     info = inspect.type_info(message)
     assert isinstance(info, inspect.StructType)
@@ -145,7 +145,7 @@ def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
         DECODERS[JointState].decode(too_large, format_encoding(JointState))
 
 
-def test_the_largest_images_are_taken_and_nothing_else_of_their_size() -> None:
+def test_codec_accepts_largest_images_and_no_other_large_message() -> None:
     for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColorImage, "rgb", b"\1\2\3")):
         largest = {**plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
         taken = take(message, encode(largest))

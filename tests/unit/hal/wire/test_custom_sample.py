@@ -14,7 +14,7 @@ from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
 from snakesim_testing.messages import raises_error
 
 
-def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_reads_where_and_when() -> None:
+def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     kind, sample = parse_custom_message(make_message_schema(Skin, "skin")), Skin(**PLACE, **GOOD)
     decoded = Decoder(kind.message).decode(encode(sample), format_encoding(Skin))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
@@ -76,7 +76,7 @@ class Empty(CustomSample, frozen=True, kw_only=True):
         None,
     ],
 )
-def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message: Any) -> None:
+def test_custom_sample_without_checkable_schema_is_refused_before_start(message: Any) -> None:
     with raises_error(ConfigError, code="plugin/not-loadable", field="skin"):
         make_message_schema(message, "sensor 'skin': model x")
 

@@ -23,7 +23,7 @@ def test_every_key_of_the_space_parses_back(row: keys.KeyRow) -> None:
     assert row.kind in ("stream", "latched", "query", "liveliness") and row.writer and row.about
 
 
-def test_no_key_stands_twice_and_none_begins_or_ends_with_a_slash() -> None:
+def test_keys_are_unique_without_outer_slashes() -> None:
     found = [row.key for row in keys.SPACE]
     assert len(set(found)) == len(found)
     assert not any(key.startswith("/") or key.endswith("/") or "//" in key for key in found)
@@ -35,7 +35,7 @@ def test_every_key_constant_is_in_the_space() -> None:
 
 
 @given(name=CHUNK)
-def test_services_are_found_in_their_keys_and_cameras_and_lidars_have_keys_of_their_own(name: str) -> None:
+def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
     assert keys.parse_service(keys.done_key(name)) == keys.parse_service(keys.alive_key(name)) == name
     assert keys.find_message(keys.done_key(name)) is Done
     assert keys.find_message(keys.depth_key(name)) is DepthImage
@@ -71,6 +71,6 @@ def test_keys_outside_the_space_parse_to_nothing(key: str) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["**", "*", "hal/done/*", "alive/**"])
-def test_a_pattern_put_by_a_stranger_names_no_service_and_breaks_nothing(pattern: str) -> None:
+def test_keys_with_pattern_from_a_stranger_name_no_service(pattern: str) -> None:
     """Zenoh lets anybody put on a pattern; the host then sees the pattern as the key."""
     assert keys.parse_service(pattern) in ("**", "*")

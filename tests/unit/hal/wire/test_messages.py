@@ -37,7 +37,7 @@ def test_every_declared_message_stands_alone_or_inside_one_that_does() -> None:
     assert declared() == set(VERSIONS) | inner
 
 
-def test_every_message_has_its_place_in_the_key_space_and_the_other_way_round() -> None:
+def test_messages_and_key_space_cover_each_other() -> None:
     at_a_key = {row.message for row in keys.SPACE if row.message is not None}
     assert at_a_key | {messages.Answer} == set(VERSIONS)
 
@@ -64,7 +64,7 @@ def test_modes_keep_their_numbers() -> None:
     assert {mode.name: mode.value for mode in Mode} == {"PASSIVE": 0, "POSITION": 1, "VELOCITY": 2, "TORQUE": 3}
 
 
-def test_everything_that_a_sensor_tells_has_a_tick_and_a_stamp() -> None:
+def test_messages_of_sensors_have_tick_and_timestamp() -> None:
     for row in keys.SPACE:
         if row.kind == "stream" and row.message is not None and row.key.startswith("sensor/"):
             assert {"tick", "timestamp_ns"} <= set(row.message.__struct_fields__), row.key

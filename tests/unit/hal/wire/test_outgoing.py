@@ -30,7 +30,7 @@ def test_what_readers_accept_is_sent_as_it_is(message: type[Message], data: st.D
 
 
 @each_message
-def test_whatever_is_out_of_its_bounds_is_named_by_its_field(message: type[Message]) -> None:
+def test_outgoing_value_out_of_bounds_is_named_by_field(message: type[Message]) -> None:
     example = plain_example(message)
     for at, info in places(example, inspect.type_info(message)):
         for poison in poisons(info) if at else ():

@@ -34,7 +34,7 @@ def turns(*parts: Iterator[Floats]) -> list[HandTurn]:
     return found
 
 
-def test_a_slow_turn_is_one_turn_of_one_joint_and_as_large_as_it_was() -> None:
+def test_capture_slow_turn_is_one_turn_with_its_size() -> None:
     (turn,) = turns(samples(1, 0, 0), samples(3, 0, 0.6), samples(2, 0.6, 0.6))
     assert turn.joint == 1 and turn.alone and abs(turn.by_rad - 0.6) < 1e-6
 

@@ -20,7 +20,7 @@ def held(jog: JogTarget, key: str, seconds: float, *, blocked_rad: float | None 
     return jog.target_rad
 
 
-def test_it_goes_at_its_speed_while_the_key_repeats_and_no_longer() -> None:
+def test_jog_moves_at_its_speed_only_while_key_repeats() -> None:
     jog = JogTarget(JogRequest(joint="joint_1", speed_rad_s=0.1), JOINT, 0.0)
     assert held(jog, "up", 1.0) == pytest.approx(0.1)
     for _ in range(100):
@@ -32,7 +32,7 @@ def test_it_goes_at_its_speed_while_the_key_repeats_and_no_longer() -> None:
     assert jog.advance(PERIOD_S, at) == at
 
 
-def test_it_stays_within_travel_limits_and_near_a_joint_that_is_blocked() -> None:
+def test_jog_stays_within_travel_and_near_a_blocked_joint() -> None:
     assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(-0.2)
     ends = JogTarget(JogRequest(joint="joint_1", travel_rad=3.0), JOINT, 0.0)
     assert (ends.lower_rad, ends.upper_rad) == (JOINT.angle_min_rad, JOINT.angle_max_rad)

@@ -87,7 +87,7 @@ def test_a_sound_robot_is_as_its_file_says() -> None:
     assert verdicts(measurements()) == [AS_IN_FILE] * JOINTS
 
 
-def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_wrong() -> None:
+def test_judge_without_imus_confirms_only_encoders_and_detects_wrong_zero() -> None:
     run = without_imus(measurements(), *range(JOINTS + 1))
     run = replace(run, angle_rad=run.angle_rad + np.array((0.15, 0.0, 0.0)))
     rows = [row.confirmed_by_hand(["order", "sign"]) for row in judge_joints(run, straight=True)]
@@ -100,7 +100,7 @@ def test_without_imus_only_what_encoders_tell_is_confirmed_and_a_wrong_zero_is_w
     assert "`snakesim robot calibrate gear`" in lines[JOINTS + 1]
 
 
-def test_zeros_are_unknown_until_the_robot_lies_straight_or_gravity_tells_them() -> None:
+def test_judge_zeros_are_unknown_until_straight_or_measured_by_gravity() -> None:
     first, second, third = judge_joints(measurements())
     assert states(first) == states(third) == {"zero": "unknown"} and "--straight" in first.findings["zero"].reason
     assert second.all_confirmed  # a pitch joint
@@ -126,13 +126,13 @@ def test_a_gear_of_another_ratio_is_no_backlash() -> None:
     ]
 
 
-def test_gravity_tells_the_zero_of_a_pitch_joint_that_is_not_straight() -> None:
+def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
     run = measurements(pitched_rad=0.2)  # the encoder says 0
     assert verdicts(run) == [AS_IN_FILE, "its zero is off by -0.200 rad: zero_rad = 0.500", AS_IN_FILE]
     assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [AS_IN_FILE] * JOINTS
 
 
-def test_a_torque_against_the_motion_that_it_drives_has_the_wrong_sign() -> None:
+def test_judge_torque_against_its_motion_has_wrong_sign() -> None:
     run = measurements()
     wrong = replace(run, torque_nm=run.torque_nm * np.array((-1.0, 1.0, 1.0)))
     assert verdicts(wrong)[0].startswith("its torque has the wrong sign")
@@ -146,13 +146,13 @@ def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
     assert states(row) == {"sign": "unknown", "gear": "unknown"}
 
 
-def test_two_imus_do_not_tell_a_joint_from_others_that_would_turn_the_same_links() -> None:
+def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:
     run = replace(measurements(), axes=["yaw", "yaw", "yaw"])
     row = judge_joints(without_imus(run, 2, 3), straight=True)[0]
     assert states(row) == {"order": "unknown"} and "joint_2, joint_3" in row.findings["order"].reason
 
 
-def test_a_joint_whose_motion_did_not_come_or_that_did_not_move_is_not_confirmed() -> None:
+def test_judge_joint_without_its_motion_is_not_confirmed() -> None:
     run = measurements()
     ended = replace(run, target_rad=run.target_rad * np.array((1.0, 1.0, 0.0)))
     unmoved = judge_joints(ended, straight=True)[2]
@@ -165,7 +165,7 @@ def test_a_joint_whose_motion_did_not_come_or_that_did_not_move_is_not_confirmed
     )
 
 
-def test_a_dead_joint_that_others_swing_and_whose_target_the_limiter_moves_along_spoils_nothing() -> None:
+def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
     run = measurements()
     angle_rad = run.angle_rad.copy()
     angle_rad[:, 2] = np.linspace(0.0, 0.6, TICKS)

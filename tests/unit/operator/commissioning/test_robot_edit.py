@@ -14,9 +14,7 @@ from snakesim_testing.messages import raises_error
 
 
 @pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])
-def test_drives_without_a_mode_that_the_file_names_are_of_the_same_robot(
-    tmp_path: Path, changed: str, same: bool
-) -> None:
+def test_robot_edit_drives_of_running_robot_match_the_edited_file(tmp_path: Path, changed: str, same: bool) -> None:
     path = tmp_path / "snake.toml"
     path.write_text((SHIPPED / "robots" / "planar13.toml").read_text())
     running = with_modes(decode(read_part(str(path), "robots"), RobotFile), ("position", "torque")).joint_table
@@ -24,7 +22,7 @@ def test_drives_without_a_mode_that_the_file_names_are_of_the_same_robot(
     assert ([joint.drive for joint in joints_on_drives(path, running)] == [joint.drive for joint in running]) is same
 
 
-def test_a_change_follows_a_symbolic_link_and_keeps_link_permissions_and_text(tmp_path: Path) -> None:
+def test_robot_edit_follows_symbolic_link_and_keeps_permissions_and_text(tmp_path: Path) -> None:
     (tmp_path / "robots.git").mkdir()
     real, link = tmp_path / "robots.git" / "snake.toml", tmp_path / "snake.toml"
     real.write_text('extends = "planar13" # ours\nname = "snake"\n')
@@ -36,7 +34,7 @@ def test_a_change_follows_a_symbolic_link_and_keeps_link_permissions_and_text(tm
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["robots.git", "snake.toml", "snake.toml"]
 
 
-def test_a_change_that_is_not_valid_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+def test_robot_edit_invalid_change_leaves_file_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "snake.toml"
     path.write_text('extends = "planar13"\nname = "snake"\n')
     before = path.read_bytes()
@@ -45,7 +43,7 @@ def test_a_change_that_is_not_valid_leaves_the_file_as_it_was(tmp_path: Path) ->
     assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
 
 
-def test_what_was_checked_is_read_as_it_was_written_also_what_was_confirmed_by_hand(tmp_path: Path) -> None:
+def test_robot_edit_checks_are_read_back_as_written(tmp_path: Path) -> None:
     path = tmp_path / "snake.toml"
     path.write_text('extends = "planar13"\nname = "snake"\n')
     checked = StartCheckRecord(

@@ -46,7 +46,7 @@ def test_forces_and_their_resultant():
     assert spans[2][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
 
 
-def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
+def test_drawing_requested_force_without_contact_is_no_contact_force():
     points = [contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))]
     control = pushing(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
@@ -63,7 +63,7 @@ def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
     assert push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
 
 
-def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
+def test_drawing_strong_force_has_arrow_of_limited_length():
     point = contact((0.0, 500.0, 0.0))
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([point], [])), None)
     assert drawing is not None

@@ -102,7 +102,7 @@ def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> N
         searched(tmp_path / "search.db", scenario=str(scenario))
 
 
-def test_a_file_that_does_not_say_of_which_search_it_is_stays_as_it_is(tmp_path: Path) -> None:
+def test_search_file_of_unknown_search_stays_unchanged(tmp_path: Path) -> None:
     storage = tmp_path / "search.db"
     study = optuna.create_study(storage=f"sqlite:///{storage}", study_name="triplet path_distance_m")
     study.add_trial(optuna.trial.create_trial(value=1.0))
@@ -128,7 +128,7 @@ def test_what_is_no_search_is_named(tmp_path: Path, what: str) -> None:
         searched(storage)
 
 
-def test_trials_are_counted_from_1_to_as_many_as_were_asked_for(
+def test_search_trials_are_numbered_from_one_to_requested_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Also after a kill, which leaves trials without a result."""
@@ -145,9 +145,7 @@ def test_trials_are_counted_from_1_to_as_many_as_were_asked_for(
     assert any(line.startswith(f"trial {number}:") and line.endswith(f": {value}") for line in lines)
 
 
-def test_what_is_printed_for_several_seeds_has_the_number_of_the_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_search_printout_for_several_seeds_names_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     searched(tmp_path / "search.db", seeds=3, seed=5)
     *_, best, about, command = printed(capsys)
     words = shlex.split(command)

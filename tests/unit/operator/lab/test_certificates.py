@@ -32,7 +32,7 @@ def test_private_keys_are_their_owners_and_never_printed(tmp_path: Path, capsys:
     assert not list(tmp_path.glob("*/tls/authority.key"))
 
 
-def test_a_certificate_is_kept_until_a_third_of_its_life_is_left(tmp_path: Path) -> None:
+def test_certificate_is_renewed_in_last_third_of_its_life(tmp_path: Path) -> None:
     assert set(states(tmp_path).values()) == {"made"}
     assert set(states(tmp_path).values()) == {"kept"}
     old = next(identity for identity in identities(LAB) if identity.role == "gnc")

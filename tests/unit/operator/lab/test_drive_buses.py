@@ -92,7 +92,7 @@ def test_the_host_is_given_its_buses(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_units_bring_up_its_interfaces_and_let_the_host_open_its_devices(tmp_path: Path, name: str) -> None:
+def test_units_bring_interfaces_up_and_grant_device_access(tmp_path: Path, name: str) -> None:
     files = files_of(ROBOTS[name], tmp_path)
     interfaces = {path: text for path, text in files.items() if re.search(r"snakesim-v?can\d+\.service$", path)}
     wanted = BRING_UP.get(name, {})
@@ -145,7 +145,7 @@ def test_a_bus_is_of_one_robot(tmp_path: Path) -> None:
         load_lab(path)
 
 
-def test_a_backend_that_is_not_ours_is_given_its_bus_by_a_setting(tmp_path: Path) -> None:
+def test_bus_of_an_external_backend_is_passed_as_setting(tmp_path: Path) -> None:
     robot = 'backend = "ethercat"\nset = ["backends.ethercat.ports=[\'eth 1\']"]\ndevices = ["/dev/cpu_dma_latency"]'
     host = files_of(robot, tmp_path)["robot1/systemd/snakesim-robot.planar13.service"]
     assert "backends.ethercat.ports=['eth 1']" in command_of(host)
@@ -166,7 +166,7 @@ def test_a_backend_that_is_not_ours_is_given_its_bus_by_a_setting(tmp_path: Path
         ("sim", None, "UNKNOWN whether motors move"),
     ],
 )
-def test_a_check_marks_a_robot_that_is_emulated_against_the_lab_file(
+def test_check_marks_robot_that_contradicts_lab_file(
     tmp_path: Path, name: str, emulated: bool | None, wrong: str
 ) -> None:
     path = tmp_path / "lab.toml"

@@ -13,7 +13,7 @@ from snakesim_testing.messages import raises_error
 TEXT = EXAMPLE.read_text()
 
 
-def test_the_example_is_a_lab_in_which_every_role_is_held() -> None:
+def test_lab_example_assigns_every_role() -> None:
     held = list(identities(load_lab(EXAMPLE)))
     assert {identity.role for identity in held} == {*Role, None}
     assert len({identity.common_name for identity in held}) == len(held)
@@ -52,7 +52,7 @@ def test_every_key_has_a_role_that_writes_it() -> None:
     assert set(ROLE_DESCRIPTIONS) == set(Role)
 
 
-def test_only_the_robot_speaks_for_itself_and_only_its_gnc_commands_it() -> None:
+def test_lab_rights_only_gnc_commands_and_only_robot_publishes() -> None:
     """What the rules are for; the rest is in the table."""
     for role in Role:
         granted = list(list_permissions(role, ["control"], faults=True))

@@ -105,7 +105,7 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     assert [joint.name for joint in states.joints] == [joint.name for joint in record.description.joints]
 
 
-def test_joint_states_are_to_the_byte_what_the_library_of_their_schema_writes() -> None:
+def test_foxglove_joint_states_equal_reference_encoder_to_the_byte() -> None:
     robot, time_ns = description(), 1_234_567_890_123
     names, frames = [joint.name for joint in robot.joints], BodyMessages(robot)
     for angle, speed, torque in (([0.1, -0.2, 3.0], 0.5, -1e-300), ([1.0, 2.0, 3.0], 4.0, 0.0)):
@@ -120,7 +120,7 @@ def test_joint_states_are_to_the_byte_what_the_library_of_their_schema_writes() 
         assert frames.encode_references(angle, time_ns) == references.SerializeToString()
 
 
-def test_joints_forces_and_state_come_as_often_as_the_robot_tells_them(run: Path) -> None:
+def test_foxglove_joints_forces_and_state_keep_robot_rates(run: Path) -> None:
     raw = list(RecordingReader(run / RECORDING).read_messages())
     wire = Counter(one.key for one in raw)
     with (run / RECORDING).open("rb") as file:
@@ -218,7 +218,7 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
         assert isinstance(at, (str, float)), path
 
 
-def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
+def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
     """As one that was killed: test_recording.py kills one."""
     torn = tmp_path / "torn.mcap"
     recording = RecordingWriter(torn, "planar13_camera")
@@ -240,7 +240,7 @@ def test_what_a_recorder_that_never_ended_leaves_has_transforms_joints_and_image
     assert len(alone.time_s) > 20 and alone.missing == [f"recording: before it was copied: {lacks[0]}"]
 
 
-def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
+def test_foxglove_reason_with_changing_number_is_logged_once() -> None:
     reported, logged = StateMessages(), []
     for k in range(20):
         control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
@@ -248,7 +248,7 @@ def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
     assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]
 
 
-def test_the_state_of_a_controller_that_fell_silent_is_not_shown_as_current() -> None:
+def test_foxglove_state_of_silent_controller_is_not_shown_current() -> None:
     channels, robot = FoxgloveChannels("snake"), description()
     control = ControlState(tick=0, timestamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
     seen: list[tuple[str, list[str]]] = []

@@ -94,7 +94,7 @@ def test_the_work_of_torque_joints_is_told_apart() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_may_end_at_its_goal_with_the_same_numbers() -> None:
+def test_advance_of_run_ending_at_goal_keeps_its_numbers() -> None:
     whole = ran("path_following", goal="heading")
     short = simulate(whole.record.config, until_goal=True)
     assert short.summary.ended == "complete" and len(short.record.time_s) < len(whole.record.time_s)
@@ -102,7 +102,7 @@ def test_a_run_may_end_at_its_goal_with_the_same_numbers() -> None:
         assert getattr(short.summary, name) == getattr(whole.summary, name), name
 
 
-def test_a_body_that_travels_sideways_has_its_metrics_along_both_directions() -> None:
+def test_advance_of_sideways_travel_has_metrics_along_both_directions() -> None:
     """Along its first heading it hardly advances, and per metre of that its energy says nothing."""
     straight = ran("path_following")
     record = straight.record

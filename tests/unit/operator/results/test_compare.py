@@ -98,19 +98,19 @@ def shown(difference: Difference) -> tuple[str, str]:
 
 def test_the_same_run_twice_differs_in_nothing() -> None:
     difference = differ(made_up(), made_up())
-    assert difference.identical and difference.parted is None and difference.settings == []
+    assert difference.identical and difference.divergence is None and difference.settings == []
     assert [gap.rms for gap in difference.gaps] == [0.0] * 4  # angle, speed, torque, angle target
     assert difference.torque.correlation == pytest.approx(1)
     assert difference.advance is not None and difference.advance.percent == 0
     assert difference.hand_overs.same_order and difference.hand_overs.later_s == [0, 0, 0]
     text, html = shown(difference)
     assert "The runs are the same, joint by joint, for all of their 200 common ticks." in text
-    assert "No difference: every angle is the same at every instant." in html
+    assert "No difference: every angle is the same at every time." in html
 
 
 @pytest.mark.parametrize("name", ["angle_rad", "velocity_rad_s", "torque_nm", "target"])
 @pytest.mark.parametrize(("where", "wrong"), [(np.s_[:], np.nan), (np.s_[50:60, 3], np.nan), (np.s_[:], np.inf)])
-def test_what_is_not_a_number_in_both_runs_is_not_called_the_same(name: str, where: Any, wrong: float) -> None:
+def test_compare_nan_in_both_runs_is_not_equal(name: str, where: Any, wrong: float) -> None:
     record = made_up()
     hurt = getattr(record, name).copy()
     hurt[where] = wrong
@@ -146,12 +146,12 @@ def test_one_joint_that_is_off_is_named_with_its_time() -> None:
     angle[120:, 4] += 0.2
     angle[150, 4] += 0.1
     difference = differ(a, dataclasses.replace(a, angle_rad=angle))
-    worst, parted = difference.angle.worst, difference.parted
+    worst, divergence = difference.angle.worst, difference.divergence
     assert worst is not None and (worst.joint, worst.time_s) == (4, pytest.approx(1.5))
     assert worst.difference == pytest.approx(0.3)
     assert difference.angle.joint_rms[4] == pytest.approx(math.sqrt((79 * 0.2**2 + 0.3**2) / 200))
     assert difference.angle.joint_rms[[0, 3, 5, 12]].tolist() == [0, 0, 0, 0]
-    assert parted is not None and parted.joint == 4 and parted.time_s == pytest.approx(1.2)
+    assert divergence is not None and divergence.joint == 4 and divergence.time_s == pytest.approx(1.2)
     assert difference.torque.rms == 0 and not difference.identical
     text, html = shown(difference)
     assert "The runs diverge at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
@@ -193,7 +193,7 @@ def test_scaled_torques_correlate_fully() -> None:
     shown(difference)
 
 
-def test_rates_that_differ_are_compared_at_the_coarser_and_it_says_so() -> None:
+def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
     difference = differ(made_up(rate_hz=100), made_up(rate_hz=30, seconds=1.5))
     assert len(difference.aligned.time_s) == 45
     assert difference.aligned.how == "A at 100 Hz, B at 30 Hz: A is interpolated at the ticks of B"
@@ -297,7 +297,7 @@ def test_hand_overs_agree_up_to_where_they_do_not() -> None:
     difference = differ(made_up(), b)
     both = difference.hand_overs
     assert both.agreed == 2 and both.later_s == pytest.approx([0, 0.1]) and not both.same_order
-    said = "agrees for the first 2; then A goes on with joint_8 at 1.20 s, B goes on with joint_7 at 1.10 s"
+    said = "agrees for the first 2; then A continues with joint_8 at 1.20 s, B continues with joint_7 at 1.10 s"
     text, html = shown(difference)
     assert said in text and said in html
 

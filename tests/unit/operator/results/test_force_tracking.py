@@ -30,14 +30,14 @@ def state(
     )  # fmt: skip
 
 
-def test_forces_that_come_a_moment_after_they_were_solved_for_have_come_true():
+def test_force_tracking_accepts_forces_slightly_after_solution():
     solved = np.random.default_rng(1).uniform(2.0, 20.0, (60, 3)).tolist()
     found = force_tracking([state(k, solved[k], solved[k - 2] if k > 1 else [0.0] * 3) for k in range(60)])
     assert found is not None and found.correlation == pytest.approx(1.0)
     assert found.median_error == pytest.approx(0.0) and found.empty == 0.0
 
 
-def test_empty_push_points_count_and_what_nobody_can_judge_does_not():
+def test_force_tracking_counts_empty_push_points_but_not_unjudged_ones():
     moving = [state(k, [4.0, 10.0, 0.2], [3.0, 0.0, 9.0]) for k in range(20)]
     found = force_tracking(moving)
     assert found is not None and found.empty == 0.5 and found.median_error == pytest.approx((0.25 + 1.0) / 2)
@@ -49,7 +49,7 @@ def test_empty_push_points_count_and_what_nobody_can_judge_does_not():
 
 
 @pytest.mark.slow
-def test_the_summary_of_a_run_tells_how_well_its_forces_came_true(record: RunRecord):
+def test_force_tracking_summary_states_how_well_forces_matched(record: RunRecord):
     assert any(one.measured_force_n and max(n or 0.0 for n in one.measured_force_n) > 1.0 for one in record.control)
     summary = summarise(record, "complete")
     assert summary.desired_force_correlation is not None and -1.0 <= summary.desired_force_correlation <= 1.0

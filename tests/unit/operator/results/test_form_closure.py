@@ -18,7 +18,7 @@ def margin(contacts: object, length_m: float) -> float:
 TURNS = ((0.1, 0.05, -1, 0), (-0.1, -0.05, 1, 0), (0.05, -0.1, 0, 1), (-0.05, 0.1, 0, -1))
 
 
-def test_a_square_that_cannot_turn_is_held_until_one_contact_is_gone() -> None:
+def test_form_closure_of_square_is_lost_without_one_contact() -> None:
     wound = [*TURNS[:2], (-0.05, -0.1, 0, 1), (0.05, 0.1, 0, -1)]  # two contacts turn it one way, two the other way
     assert margin(wound, 0.1) > 0.05
     assert margin(TURNS, 0.1) <= 0.0  # all four turn it the same way
@@ -30,7 +30,7 @@ def test_a_body_between_two_walls_may_slide_along_them() -> None:
     assert margin([(x, y, 0, -10 * y) for x in (-0.4, 0.0, 0.4) for y in (-0.1, 0.1)], 0.5) <= 0
 
 
-def test_pegs_on_both_sides_of_a_wave_hold_it_wherever_it_lies() -> None:
+def test_form_closure_by_pegs_on_both_sides_of_a_wave() -> None:
     normals = np.repeat([[-0.6, 0.8], [0.6, 0.8], [-0.6, 0.8]], 2, axis=0) * np.resize([[1.0], [-1.0]], (6, 1))
     places = np.repeat([[0.0, 0.0], [0.3, 0.0], [0.6, 0.0]], 2, axis=0) - 0.04 * normals
     held = form_closure_margin(places, normals, 0.5)
@@ -39,7 +39,7 @@ def test_pegs_on_both_sides_of_a_wave_hold_it_wherever_it_lies() -> None:
     assert form_closure_margin(places @ turn.T + (3.0, -2.0), normals @ turn.T, 0.5) == pytest.approx(held)
 
 
-def test_an_obstacle_counts_once_where_it_is_nearest_to_the_body() -> None:
+def test_form_closure_counts_an_obstacle_once_at_nearest_link() -> None:
     pegs = [
         Obstacle(name=f"{x} {y}", shape="cylinder", position_w=(x, y, 0.1), radius_m=0.05)
         for x, y in ((0.3, 0.105), (0.55, -0.1), (0.8, 0.2))

@@ -49,7 +49,7 @@ def test_what_is_hidden_behind_or_far_is_no_miss():
     assert score([], truth, HEAD, math.pi).misses == 1  # the one behind, after turning around
 
 
-def test_a_wall_of_which_a_part_was_seen_is_no_ghost():
+def test_map_score_partly_seen_wall_is_no_ghost():
     found = score([block("seen_1", 0.6, 0.2, (0.025, 0.3))], [block("wall", 0.6, 0.0, (0.025, 2.0))], HEAD, 0.0)
     assert not found.ghosts and not found.misses and max(found.surface_m) < 1e-9
 

@@ -22,7 +22,7 @@ def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
     return changed(record, position_w=position, **still)
 
 
-def test_a_stop_in_between_and_a_rest_at_the_end_are_found_where_they_are(record: RunRecord) -> None:
+def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> None:
     time_s = record.time_s - record.time_s[0]
     goes = moved_as(record, 0.1 * np.interp(time_s, [0, 2, 4.5, 7, 10], [0, 2, 2, 4.5, 4.5]))
     motion = measure_motion(goes)
@@ -49,7 +49,7 @@ def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
     assert reported.reported_state == "NotLocomoting"
 
 
-def test_a_pose_that_a_service_measures_counts_and_one_that_is_reckoned_does_not(record: RunRecord) -> None:
+def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> None:
     """The black box has no pose then; guidance's world model has."""
     blind = changed(record, position_w=record.position_w * np.nan)
     for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):

@@ -204,9 +204,7 @@ def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
     compared(record, base)
 
 
-def test_a_pose_that_is_not_known_yet_or_never_is_lacking_only_where_there_is_a_sensor(
-    base: RunRecord, tmp_path: Path
-) -> None:
+def test_unknown_pose_is_a_gap_only_with_a_pose_sensor(base: RunRecord, tmp_path: Path) -> None:
     def lacks(sensors: Any, unknown: slice) -> list[str]:
         position = base.position_w.copy()
         position[unknown] = np.nan

@@ -38,7 +38,7 @@ def test_every_obstacle_that_was_pushed_has_a_row(record: RunRecord) -> None:
     assert set(reported.obstacles["data"][0]["y"]) == pushed and len(pushed) >= 3
 
 
-def test_a_stop_is_measured_and_has_the_reason_that_was_reported_longest(record: RunRecord) -> None:
+def test_pushing_stop_has_the_longest_reported_reason(record: RunRecord) -> None:
     control = [
         msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost" if k < 4 else "jam")
         for k, one in enumerate(record.control)

@@ -16,10 +16,10 @@ from snakesim_operator.results.metrics.propulsion import find_propulsion_interva
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report.events import drawn_instants, find_events
-from snakesim_operator.results.report.instants import balanced_instants
+from snakesim_operator.results.report.events import drawn_snapshots, find_events
 from snakesim_operator.results.report.page import ELSEWHERE
 from snakesim_operator.results.report.reasons import why_empty
+from snakesim_operator.results.report.snapshots import balanced_snapshots
 from snakesim_operator.results.report.timeline import reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.run_log import RunRecord
@@ -104,7 +104,7 @@ def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page
     assert [one.joint for one in found if one.joint is not None] == list(INTERVALS_S)
     assert found[0].words == "Start" and found[-1].words == "Stop"
     assert sum(one.words.startswith("Largest contact force") for one in found) == 1
-    drawn = drawn_instants(record, found)
+    drawn = drawn_snapshots(record, found)
     bodies = [nodes_xy_w(record, instant.row) for _, instant in drawn]
     assert all(np.abs(a - b).max() > 0.004 for a, b in itertools.combinations(bodies, 2))
     said = "; ".join(event.words for event, _ in drawn)
@@ -114,7 +114,7 @@ def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page
 
 
 def test_forces_balance_and_add_up_to_the_commanded_one(record: RunRecord) -> None:
-    found = balanced_instants(record)
+    found = balanced_snapshots(record)
     assert len(found) > 50
     for one in found:
         assert one.balance is not None and one.balance.gap_n < 1e-9
@@ -127,7 +127,7 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     figure = r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>'
     polygons = re.findall(figure, page.html)
     lengths = [math.dist(*edge) for svg in polygons for edge in drawn_edges(svg, "commanded")]
-    drawn = drawn_instants(record, find_events(record, summarise(record, "complete")))
+    drawn = drawn_snapshots(record, find_events(record, summarise(record, "complete")))
     forces_n = [one.state.propulsion_n for _, one in drawn if one.balance is not None and one.state is not None]
     assert len(lengths) == len(polygons) == len(forces_n) > 2
     assert lengths == pytest.approx([lengths[0] / (forces_n[0] or 0) * (force_n or 0) for force_n in forces_n], abs=0.5)
@@ -135,20 +135,20 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     assert math.dist(ring[0][0], ring[-1][1]) == pytest.approx(lengths[0], abs=0.5)
 
 
-def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(page: Reader, record: RunRecord) -> None:
+def test_report_force_without_contact_is_drawn_as_requested(page: Reader, record: RunRecord) -> None:
     clear = changed(record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds])
     pages = page, read(clear)
     kinds = [{kind for frame in one.film["frames"] for kind in frame[8]} for one in pages]
-    assert {"solved", "resultant", "solved asked", "resultant asked"} == kinds[0]
-    assert {"solved asked", "resultant asked"} == kinds[1]
+    assert {"solved", "resultant", "solved unmeasured", "resultant unmeasured"} == kinds[0]
+    assert {"solved unmeasured", "resultant unmeasured"} == kinds[1]
     drawings = re.findall(DRAWING, pages[1].html)
     classes = {found for svg in drawings for found in re.findall(r'class="((?:solved|resultant)[^"]*)"', svg)}
-    assert {"solved asked shaft", "solved asked head", "resultant asked shaft"} <= classes
+    assert {"solved unmeasured shaft", "solved unmeasured head", "resultant unmeasured shaft"} <= classes
     assert not {"solved shaft", "solved head", "resultant shaft", "resultant head"} & classes
     assert "desired, but no contact was measured there" in pages[1].text
 
 
-def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(page: Reader) -> None:
+def test_report_drawing_texts_do_not_overlap_or_cut_obstacles(page: Reader) -> None:
     drawings = [ET.fromstring(found) for found in re.findall(DRAWING, page.html)]
     assert len(drawings) > 8
     for drawing in drawings:
@@ -180,10 +180,10 @@ def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
         msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n]) for one in record.control
     ]
     wrong = changed(record, control=more)
-    assert balanced_instants(wrong) == [] and "whose forces balance" in read(wrong).text
+    assert balanced_snapshots(wrong) == [] and "whose forces balance" in read(wrong).text
 
 
-def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: RunRecord, page: Reader) -> None:
+def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page: Reader) -> None:
     for field in msgspec.structs.fields(RunSummary):
         if field.name not in ELSEWHERE:
             assert field.name in page.words, field.name
@@ -209,7 +209,7 @@ def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
     assert state_bands(record)[-1].end_s == pytest.approx(SECONDS)
 
 
-def test_the_reference_is_the_target_in_position_mode_and_the_controllers_word_in_torque_mode(
+def test_report_reference_depends_on_mode_of_joint(
     record: RunRecord,
 ) -> None:
     reference = reference_rad(record, 6)
@@ -235,7 +235,7 @@ def test_the_plotting_library_is_the_one_that_its_note_names() -> None:
     assert (LIBRARY.parent / "LICENSE-plotly.txt").is_file()
 
 
-def test_an_obstacle_that_yields_is_drawn_dashed_and_says_what_it_does(page: Reader, record: RunRecord) -> None:
+def test_report_yielding_obstacle_is_dashed_and_described(page: Reader, record: RunRecord) -> None:
     row = record.config.scene.pegs_along_route[0]
     made = msgspec.structs.replace(row, lean_rad=0.2, stiffness_n_per_m=800.0, mass_kg=2.0, base_friction=0.5)
     scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])

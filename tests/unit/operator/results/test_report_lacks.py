@@ -109,7 +109,7 @@ def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
 
 
 @pytest.mark.parametrize("joint", [None, "joint_3"])
-def test_a_run_that_went_on_with_a_fault_that_stopped_nothing(record: RunRecord, joint: str | None) -> None:
+def test_report_of_harmless_fault_says_run_continued(record: RunRecord, joint: str | None) -> None:
     """The host noted it before the first arming; the run was complete."""
     noting = Authority(record.description)
     noting.record_fault(
@@ -167,7 +167,7 @@ def judged(record: RunRecord) -> Verdict:
     return verdict(record, summarise(record, "complete"))
 
 
-def test_a_run_that_stood_still_for_most_of_its_time_is_no_good_one(record: RunRecord) -> None:
+def test_report_of_mostly_standing_run_is_not_good(record: RunRecord) -> None:
     assert judged(record).kind == "good"
     lost = judged(stopped_at(record, 4.0, state="NotLocomoting", reason=LOST))
     assert lost.kind == "poor"
@@ -176,7 +176,7 @@ def test_a_run_that_stood_still_for_most_of_its_time_is_no_good_one(record: RunR
     assert late.kind == "good" and f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.words
 
 
-def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -> None:
+def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
     """A controller that tries again and again, and each time says for a moment that it moves."""
     stuck = stopped_at(record, 6.0, state="NotLocomoting", reason="jammed: wedged", jammed=True)
     trying = [*stuck.control[:-1], msgspec.structs.replace(stuck.control[-1], state="Locomoting", reason="pushing")]
@@ -188,7 +188,7 @@ def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -
     assert "reported" not in claims.words, "`pushing` is what control measured, not a report of the controller"
 
 
-def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecord) -> None:
+def test_report_of_rest_at_path_end_is_no_failure(record: RunRecord) -> None:
     rests = judged(stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished"))
     assert rests.kind == "good" and "Locomotion ended at 4.0 s" in rests.words
 

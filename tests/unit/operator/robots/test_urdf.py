@@ -19,7 +19,7 @@ from snakesim_operator.features.robots.importing import import_urdf
 from snakesim_operator.features.robots.meshes import read_vertices
 from snakesim_operator.features.robots.toml_text import format_toml
 from snakesim_operator.run.in_process import simulate
-from snakesim_sim_backend.model import build
+from snakesim_sim_backend.model.build import build
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
 
@@ -73,7 +73,7 @@ def test_every_shipped_robot_comes_back_as_it_was(name: str, tmp_path: Path) -> 
     assert robot_at(back) == robot_at(name)
 
 
-def test_each_joint_keeps_its_own_limits_and_friction_on_the_way_there_and_back(tmp_path: Path) -> None:
+def test_urdf_round_trip_keeps_limits_and_friction_of_each_joint(tmp_path: Path) -> None:
     own, back, edited = tmp_path / "own.toml", tmp_path / "back.toml", tmp_path / "edited.urdf"
     own.write_text(
         'extends = "planar13"\nname = "own"\n[drive]\ngear = 1.5\n'
@@ -96,7 +96,7 @@ def test_each_joint_keeps_its_own_limits_and_friction_on_the_way_there_and_back(
     assert "angle_min_rad differs from that of the others: joint_2 (joint_2) -0.7 rad" in found.changed
 
 
-def test_a_robot_from_elsewhere_has_exceptions_only_where_its_joints_differ() -> None:
+def test_urdf_import_has_exceptions_only_for_differing_joints() -> None:
     slider, hexa = import_urdf(SLIDER, ImportOptions()).robot, import_urdf(HEXA, HEXA_ORDER).robot
     assert slider.limits.torque_nm == 4.1 and len(slider.joints) == 1
     assert [joint.limits.torque_nm for joint in slider.joint_table].count(3.8) == 1
@@ -125,7 +125,7 @@ def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str)
         assert joint.range == pytest.approx([limits.lower_rad, limits.upper_rad])
 
 
-def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
+def test_urdf_import_planar_snake_has_inertia_of_mujoco(tmp_path: Path) -> None:
     found = import_urdf(SLIDER, ImportOptions())
     theirs = by_mujoco(SLIDER.read_text(), HERE / "meshes")
     sign = np.array([-1.0 if "hinge0" in name and "negated" in name else 1.0 for name in found.names[9:]])
@@ -135,7 +135,7 @@ def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_pat
     assert found.robot.module.radius_m == pytest.approx(np.hypot(0.015, 0.03)), "of the covers' boxes"
 
 
-def test_an_alternating_snake_in_millimetres_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
+def test_urdf_import_alternating_millimeter_snake_has_inertia_of_mujoco(tmp_path: Path) -> None:
     whole = HEXA.read_text().replace('ixx="0" iyy="0" izz="0"', 'ixx="110" iyy="120" izz="50"')
     (tmp_path / "whole.urdf").write_text(whole)
     found = import_urdf(tmp_path / "whole.urdf", HEXA_ORDER)
@@ -216,7 +216,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_urdf_that_is_no_snake_is_refused_with_the_place(case: str, tmp_path: Path) -> None:
+def test_urdf_import_of_other_robot_is_refused_with_place(case: str, tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
     file.write_text(BAD[case])
     with raises_error(ConfigError, code="urdf/invalid"):
@@ -238,7 +238,7 @@ def test_an_existing_robot_file_is_not_overwritten(tmp_path: Path) -> None:
         import_robot(SLIDER, ImportOptions(), tmp_path / "worm.toml")
 
 
-def test_a_mesh_may_be_text_or_binary_and_one_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_urdf_mesh_is_text_or_binary_and_missing_one_reported(tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_text(
         "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 2 0\n"
     )

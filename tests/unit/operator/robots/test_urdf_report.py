@@ -334,7 +334,7 @@ def _edited(tmp_path: Path, *edits: tuple[str, str]) -> Imported:
     return import_urdf(file, ImportOptions())
 
 
-def test_each_joint_has_its_own_friction_and_one_without_has_none(tmp_path: Path) -> None:
+def test_urdf_report_joint_friction_is_individual_or_absent(tmp_path: Path) -> None:
     found = _edited(tmp_path, ('<dynamics damping="0.04" friction="0.07"/>', ""))
     assert [joint.motor.friction_nm for joint in found.robot.joint_table] == [0.06, 0.06, 0.0]
     assert [joint.motor.viscous_nm_s_per_rad for joint in found.robot.joint_table] == [0.03, 0.03, 0.0]
@@ -343,7 +343,7 @@ def test_each_joint_has_its_own_friction_and_one_without_has_none(tmp_path: Path
     assert said in found.assumed, "the line of the joint, which has no <dynamics>"
 
 
-def test_a_joint_without_a_motor_does_not_get_that_of_its_neighbors(tmp_path: Path) -> None:
+def test_urdf_report_joint_without_motor_gets_none_from_neighbors(tmp_path: Path) -> None:
     line = _line('effort="4.7"')
     with raises_error(ConfigError, code="urdf/invalid", field="j3", value=0):
         _edited(tmp_path, ('effort="4.7"', 'effort="0"'))
@@ -353,10 +353,10 @@ def test_a_joint_without_a_motor_does_not_get_that_of_its_neighbors(tmp_path: Pa
     assert f"{said}: j3 (line {line})" in absent.assumed
 
 
-def test_an_exporter_that_leaves_all_limits_zero_gets_a_report_of_what_is_assumed(tmp_path: Path) -> None:
+def test_urdf_report_lists_assumptions_for_all_zero_limits(tmp_path: Path) -> None:
     found = _edited(tmp_path, *[(f'effort="{effort}"', 'effort="0"') for effort in ("4.5", "4.6", "4.7")])
     assert {joint.limits.torque_nm for joint in found.robot.joint_table} == {7.0}, "as planar13"
-    said = "<limit effort> has 0: 7 N·m, from the robot given by --like, because no joint has a value"
+    said = "<limit effort> has 0: 7 N·m, from the robot of --like, because no joint has a value"
     places = [f"j{i + 1} (line {_line(f'4.{5 + i}')})" for i in range(3)]
     assert f"{said}: {', '.join(places)}" in found.assumed
 
@@ -367,7 +367,7 @@ def test_limits_in_degrees_are_refused(old: str, new: str, tmp_path: Path) -> No
         _edited(tmp_path, (old, new))
 
 
-def test_two_turns_are_cut_to_one_with_a_line_in_the_report(tmp_path: Path) -> None:
+def test_urdf_report_two_turns_are_cut_to_one(tmp_path: Path) -> None:
     found = _edited(tmp_path, ('lower="-1.2" upper="1.1"', 'lower="-6.28319" upper="6.28319"'))
     assert found.robot.joint_table[0].limits.upper_rad == pytest.approx(math.pi, abs=1e-5)
     cuts = [line for line in found.changed if "half a turn" in line]
@@ -399,7 +399,7 @@ def test_bounds_are_those_of_a_robot_file() -> None:
             msgspec.convert({**values, number.key: number.maximum * 1.001}, struct)
 
 
-def test_what_is_edited_in_an_export_of_ours_counts_or_is_reported(tmp_path: Path) -> None:
+def test_urdf_report_edit_of_our_export_counts_or_is_listed(tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
     text = export_urdf(decode(read_part("planar13_camera", "robots"), RobotFile))
     file.write_text(text)
@@ -418,7 +418,7 @@ def test_what_is_edited_in_an_export_of_ours_counts_or_is_reported(tmp_path: Pat
         import_urdf(file, ImportOptions())
 
 
-def test_a_check_of_another_robot_is_no_check_of_this_one(tmp_path: Path) -> None:
+def test_urdf_report_check_of_another_robot_does_not_count(tmp_path: Path) -> None:
     like = tmp_path / "like.toml"
     like.write_text('extends = "planar13"\n[checked]\nby = "me"\non = "today"\njoints = "abc"\nbackend = "can"\n')
     (tmp_path / "robot.urdf").write_text(SNAKE)

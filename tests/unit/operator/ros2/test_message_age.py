@@ -29,7 +29,7 @@ class Sender:
 
 
 @pytest.mark.parametrize("off_s", [0.0, -3600.0, 5.0])
-def test_what_a_network_held_back_is_as_old_as_it_is(off_s: float) -> None:
+def test_message_age_includes_network_delay(off_s: float) -> None:
     sender = Sender(SenderClocks(), off_s)
     for number in range(50):
         sent_s = 100.0 + 0.05 * number
@@ -40,14 +40,14 @@ def test_what_a_network_held_back_is_as_old_as_it_is(off_s: float) -> None:
     assert sender.age_s(117.1, 117.12, 117.12) == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_clock_that_was_set_back_is_known_again_after_two_minutes() -> None:
+def test_message_age_recovers_two_minutes_after_clock_set_back() -> None:
     clocks = SenderClocks()
     assert Sender(clocks, 0.0).age_s(1.0, 1.0, 1.0) == 0.0
     set_back = Sender(clocks, -3600.0)
     assert set_back.age_s(2.0, 2.0, 2.0) == 3600.0 and set_back.age_s(130.0, 130.0, 130.0) == 0.0
 
 
-def test_what_waited_in_the_bridge_is_as_old_as_it_waited() -> None:
+def test_message_age_includes_wait_in_bridge() -> None:
     clocks = SenderClocks()
     without = RawSample(b"", b"", SECOND)
     assert clocks.measure_age(without, 0, 4 * SECOND) == 3 * SECOND, "a plain Zenoh client attaches nothing"
@@ -61,7 +61,7 @@ def test_each_sender_has_a_clock_of_its_own() -> None:
     assert first.age_s(3.0, 3.52, 3.52) == pytest.approx(0.5) and second.age_s(4.0, 4.02, 4.02) == 0.0
 
 
-def test_a_request_to_arm_that_was_held_back_is_refused_with_the_way_out() -> None:
+def test_message_age_of_late_arm_request_refuses_with_advice() -> None:
     def request(sent_s: float) -> bytes:
         return make_attachment(1, round(sent_s * SECOND), GID)
 

@@ -185,7 +185,7 @@ def test_scans(sent: m.Ranges) -> None:
     assert (seen.range_min, seen.range_max) == (np.float32(sent.range_min_m), np.float32(sent.range_max_m))
 
 
-def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
+def test_custom_sensor_numbers_have_field_and_unit() -> None:
     kind = parse_custom_message(make_message_schema(Skin, "skin"))
     sample: Any = kind.message(**PLACE, **GOOD)
     seen = read(ros.NUMBERS, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
@@ -239,7 +239,7 @@ class TestSteering:
         stop = CmdVelSteering().make_intent(self.twist(), 1, None)
         assert stop is not None and not stop.go and stop.heading_w_rad is None
 
-    def test_a_twist_counts_from_when_it_was_sent_on_and_a_stop_whenever_it_comes(self) -> None:
+    def test_twist_counts_from_forwarding_and_stop_always_counts(self) -> None:
         steering = CmdVelSteering()
         fresh = steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
         assert fresh is not None and (fresh.timestamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)

@@ -17,13 +17,13 @@ def status(
     )
 
 
-def test_robot_time_is_counted_where_it_passes_however_slowly_the_computer_shows_it() -> None:
+def test_patience_counts_robot_time_on_a_slow_computer() -> None:
     patience = StartupTimeout(ALL, 60.0)
     assert not any(patience.ends(status(tick), now_s=100.0 * tick) for tick in range(1, 6001, 100))
     assert patience.ends(status(6102), now_s=0.0)
 
 
-def test_where_time_stands_still_only_that_counts_in_which_the_host_is_heard() -> None:
+def test_patience_in_paused_time_counts_only_while_host_answers() -> None:
     patience = StartupTimeout(ALL, 60.0)
     assert not any(patience.ends(status(), now_s=3600.0 * hour) for hour in range(60))
     same = status()

@@ -27,12 +27,12 @@ def waits(*rows: tuple[float, float]) -> list[tuple[float, Usage]]:
     return [(at_s, Usage(0.01 * at_s, waited_s, True)) for at_s, waited_s in rows]
 
 
-def test_a_process_that_waits_for_most_of_a_lease_is_named() -> None:
+def test_processor_wait_of_most_of_a_lease_is_named() -> None:
     found = seen(waits((0.0, 5.0), (0.1, 5.09), (0.2, 5.09))).find_longest()
     assert found is not None and found[0] == "control" and found[1:] == pytest.approx((0.09, 0.1))
 
 
-def test_a_wait_that_goes_on_counts_before_the_kernel_counts_it() -> None:
+def test_processor_wait_in_progress_counts_before_kernel_reports_it() -> None:
     found = seen((0.1 * i, Usage(1.0, 2.0, True)) for i in range(4)).find_longest()
     assert found is not None and found[0] == "control" and found[1] == pytest.approx(found[2])
 

@@ -47,7 +47,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     return Disk(monkeypatch)
 
 
-def test_everything_is_there_after_settling_in_the_order_in_which_it_was_asked_for(tmp_path: Path) -> None:
+def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     warned: list[str] = []
     files = RunFiles(tmp_path, warned.append)
     for i in range(1000):
@@ -81,7 +81,7 @@ def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: D
     assert files.close() == "" and warned == [f"{tmp_path}: No space left on device"]
 
 
-def test_a_disk_that_stays_full_gets_no_empty_file_and_the_loss_is_told(tmp_path: Path, disk: Disk) -> None:
+def test_run_files_on_full_disk_are_absent_and_reported(tmp_path: Path, disk: Disk) -> None:
     warned: list[str] = []
     files = RunFiles(tmp_path, warned.append)
     disk.space = 0
@@ -93,7 +93,7 @@ def test_a_disk_that_stays_full_gets_no_empty_file_and_the_loss_is_told(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nobody_waits_for_a_disk_that_hangs_and_memory_is_bounded(
+def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
     tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(under_test, "MEMORY_BYTES", 10_000)
@@ -133,7 +133,7 @@ def test_without_a_folder_nothing_is_kept() -> None:
     assert files.close() == ""
 
 
-def test_a_log_that_floods_is_cut_and_the_record_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_log_that_floods_is_cut_and_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(under_test, "FILE_BYTES", 2 * 2**20)
     files = RunFiles(tmp_path, lambda _: None)
     for _ in range(300):

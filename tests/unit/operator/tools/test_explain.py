@@ -109,7 +109,7 @@ def test_keys_that_the_scenario_does_not_give_are_explained(key: str, capsys: py
     assert explain(load("triplet"), key, capsys).startswith(key)
 
 
-def test_values_for_a_plugin_in_a_file_are_listed_but_its_code_is_not_run(
+def test_explain_lists_plugin_values_without_running_its_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wave.py").write_text("class Wave: ...\nraise SystemExit")

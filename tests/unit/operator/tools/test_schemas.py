@@ -2,15 +2,15 @@
 
 import json
 import math
+import sys
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jsonschema import Draft202012Validator
 from msgspec import inspect
 
 from snakesim_hal.base.errors import WireError
@@ -20,6 +20,9 @@ from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, Message
 from snakesim_operator.this_computer.schemas import contract, write_schemas
 from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
+
+if TYPE_CHECKING:
+    from jsonschema.protocols import Validator
 
 REPOSITORY = Path(__file__).parents[4]
 PUBLISHED = REPOSITORY / "schemas"
@@ -42,7 +45,7 @@ def test_the_published_files_are_what_the_code_says() -> None:
         assert published[name] == text, f"schemas/{name} is out of date; run `make schemas` and commit what it changes"
 
 
-def test_writing_removes_what_is_not_part_of_the_contract_any_more(tmp_path: Path) -> None:
+def test_writing_schemas_removes_files_outside_the_contract(tmp_path: Path) -> None:
     write_schemas(tmp_path)
     (tmp_path / "messages" / "Gone.json").write_text("{}")
     (tmp_path / "README.md").write_text("by hand")
@@ -53,7 +56,7 @@ def test_writing_removes_what_is_not_part_of_the_contract_any_more(tmp_path: Pat
     assert {str(path.relative_to(tmp_path)) for path in written} == set(found)
 
 
-def test_writing_into_a_folder_of_somebody_else_removes_nothing_of_it(tmp_path: Path) -> None:
+def test_writing_schemas_into_foreign_folder_removes_nothing(tmp_path: Path) -> None:
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "thesis.json").write_text("{}")
     write_schemas(tmp_path)
@@ -63,12 +66,18 @@ def test_writing_into_a_folder_of_somebody_else_removes_nothing_of_it(tmp_path: 
 # --- schema against messages -----------------------------------------------------------------------------------
 
 
-CONTRACT = dict(contract())
+@cache
+def published_contract() -> dict[str, str]:
+    return dict(contract())
 
 
 @cache
-def validator(name: str) -> Draft202012Validator:
-    return Draft202012Validator(json.loads(CONTRACT[name]))
+def validator(name: str) -> "Validator":
+    # Imported here, and without its check of addresses, which takes 2 s: each worker imports this file.
+    sys.modules.setdefault("rfc3987_syntax", None)  # pyright: ignore[reportArgumentType]
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(json.loads(published_contract()[name]))
 
 
 def fits(value: Any, name: str) -> bool:
@@ -89,7 +98,7 @@ def test_every_message_fits_its_schema(message: type[Message], data: st.DataObje
 
 @each_message
 def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> None:
-    assert json.loads(CONTRACT[of(message)])["encoding"] == format_encoding(message)
+    assert json.loads(published_contract()[of(message)])["encoding"] == format_encoding(message)
     example = plain_example(message)
     assert fits(example, of(message))
     for field in example:
@@ -124,7 +133,7 @@ def test_every_shipped_file_fits_its_schema_and_names_itself(kind: str, schema: 
 
 
 @pytest.mark.parametrize("name", list_shipped("scenarios"))
-def test_every_shipped_scenario_loads_and_fits_the_schema_of_a_run(name: str) -> None:
+def test_every_shipped_scenario_loads_and_fits_run_schema(name: str) -> None:
     config = load(name).config
     assert config.name == name
     assert fits(config, "files/run.json")

@@ -52,7 +52,7 @@ class Line:
 
 
 @given(id_=st.integers(0, 252), address=st.integers(0, 600), data=near_header.filter(bool))
-def test_what_we_write_is_stuffed_and_sealed_as_by_the_sdk(id_: int, address: int, data: bytes) -> None:
+def test_packet_written_is_stuffed_and_checksummed_as_by_sdk(id_: int, address: int, data: bytes) -> None:
     inside = [Instruction.WRITE, *address.to_bytes(2, "little"), *data]
     plain = [0xFF, 0xFF, 0xFD, 0, id_, len(inside) + 2, 0, *inside, 0, 0]
     # Its `txPacket` sends unstuffed what stuffing would make longer; so `addStuffing` itself is asked.
@@ -76,9 +76,7 @@ def test_questions_and_goals_of_several_are_those_of_the_sdk(ids: list[int], fas
 
 
 @given(id_=st.integers(0, 252), data=near_header, noise=st.binary(max_size=8), cut=st.integers(1, 30))
-def test_the_sdk_reads_what_we_answer_and_so_do_we_piece_by_piece(
-    id_: int, data: bytes, noise: bytes, cut: int
-) -> None:
+def test_packet_answers_are_read_by_sdk_and_by_us(id_: int, data: bytes, noise: bytes, cut: int) -> None:
     status = encoded(id_, Instruction.STATUS, bytes([ALERT]) + data)
     said, result = SDK.rxPacket(Line(status), False)
     assert result == COMM_SUCCESS and bytes(said[9 : 9 + len(data)]) == data and said[8] == ALERT
@@ -88,7 +86,7 @@ def test_the_sdk_reads_what_we_answer_and_so_do_we_piece_by_piece(
 
 
 @given(parts=st.lists(st.tuples(st.just(0), st.integers(1, 200), near_header), min_size=1, max_size=8))
-def test_a_fast_answer_is_read_by_the_sdk_and_to_where_it_ends_by_us(parts: list[Any]) -> None:
+def test_fast_answer_is_read_by_sdk_and_to_its_end(parts: list[Any]) -> None:
     size = min(len(data) for _, _, data in parts)
     ids = list(dict.fromkeys(id_ for _, id_, _ in parts))
     parts = [(0, id_, bytes([id_, *data[:size]])) for id_, (_, _, data) in zip(ids, parts, strict=False)]

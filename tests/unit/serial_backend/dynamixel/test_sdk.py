@@ -100,7 +100,7 @@ def test_ping_and_broadcast_ping(bench: Bench) -> None:
     assert result == COMM_SUCCESS and found == {servo: [MODEL, FIRMWARE] for servo in (1, 2, 3)}
 
 
-def test_goals_of_all_move_all_and_sync_reads_say_where_they_are(bench: Bench) -> None:
+def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench) -> None:
     bench.enable()
     before = [bench.position(servo) for servo in (1, 2, 3)]
     goals = GroupSyncWrite(bench.port, SDK, at.GOAL_POSITION, 4)
@@ -154,7 +154,7 @@ def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
     assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (COMM_SUCCESS, 0)
 
 
-def test_an_alert_is_in_every_answer_until_a_restart_which_is_silent_for_a_while(bench: Bench) -> None:
+def test_sdk_alert_stays_in_answers_until_a_restart(bench: Bench) -> None:
     bench.enable()
     port = bench.port
     bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=True)

@@ -45,7 +45,7 @@ def robot() -> Iterator[Robot]:
     one.backend.close()
 
 
-def test_servos_stop_by_their_own_watchdog_when_the_driver_is_gone(robot: Robot) -> None:
+def test_servos_stop_by_watchdog_when_driver_is_gone(robot: Robot) -> None:
     robot.run(40, "armed")
     robot.mode, robot.target = Mode.TORQUE, 0.5
     robot.run(2, "armed")
@@ -59,7 +59,7 @@ def test_servos_stop_by_their_own_watchdog_when_the_driver_is_gone(robot: Robot)
     assert robot.run(10, "disarmed") == [] and robot.run(60, "armed") == []
 
 
-def test_torque_mode_pushes_and_a_servo_that_is_left_alone_comes_to_a_stop_just_beyond_its_travel(
+def test_servo_in_torque_mode_stops_just_beyond_its_travel(
     robot: Robot,
 ) -> None:
     robot.run(40, "armed")
@@ -72,7 +72,7 @@ def test_torque_mode_pushes_and_a_servo_that_is_left_alone_comes_to_a_stop_just_
     assert servo.lower_rad - 0.5 < goal_rad < servo.lower_rad
 
 
-def test_wherever_in_its_turn_a_servo_wakes_up_its_angle_is_the_joints(robot: Robot) -> None:
+def test_servo_angle_after_start_in_any_turn_is_joint_angle(robot: Robot) -> None:
     robot.run(1, "disarmed")
     assert robot.joints is not None
     here = robot.joints.angle_rad
@@ -85,7 +85,7 @@ def test_wherever_in_its_turn_a_servo_wakes_up_its_angle_is_the_joints(robot: Ro
     assert here == pytest.approx([0.0] * JOINTS, abs=0.002)
 
 
-def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_start(
+def test_servo_id_model_and_setting_mismatches_are_named_at_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = EmulatedDynamixel.__init__
@@ -121,7 +121,7 @@ def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_sta
         (at.STARTUP, 3),
     ],
 )
-def test_a_servo_that_would_move_by_what_is_not_its_own_is_refused(robot: Robot, register: int, value: int) -> None:
+def test_servo_with_settings_that_would_move_it_is_refused(robot: Robot, register: int, value: int) -> None:
     robot.emulator.servos[2].table[register] = value
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         drives_of(robot.backend).bring_up()
@@ -181,7 +181,7 @@ def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int)
     ],
     ids=["one after the other", "at the same time"],
 )
-def test_a_second_servo_with_the_id_of_one_stops_the_robot(robot: Robot, delay: int, what: str, words: str) -> None:
+def test_servo_with_duplicate_id_stops_the_robot(robot: Robot, delay: int, what: str, words: str) -> None:
     robot.run(20, "armed")
     robot.emulator.servos[1].table[at.DELAY] = delay
     robot.go_wrong("duplicate:joint_2@0-9")

@@ -48,7 +48,7 @@ def device() -> Iterator[Device]:
     made.stick.close()
 
 
-def test_the_stick_is_a_share_of_its_own_range_with_a_dead_zone(device: Device) -> None:
+def test_joystick_value_is_share_of_its_range_with_dead_zone(device: Device) -> None:
     device.sends(EV_ABS, ABS_Y, 0)
     assert device.stick.forward == pytest.approx(1.0), "away from the operator"
     device.sends(EV_ABS, ABS_Y, 140)
@@ -59,13 +59,13 @@ def test_the_stick_is_a_share_of_its_own_range_with_a_dead_zone(device: Device) 
     assert -0.6 < device.stick.right < -0.5
 
 
-def test_every_button_is_the_emergency_stop_when_it_is_pressed_only(device: Device) -> None:
+def test_joystick_any_button_press_is_emergency_stop(device: Device) -> None:
     assert device.sends(EV_KEY, 0x130, 1)
     assert not device.sends(EV_KEY, 0x130, 0)
     assert not device.sends(EV_KEY, 30, 1), "a key of a keyboard"
 
 
-def test_lost_events_and_a_lost_device_let_go_of_the_stick(device: Device) -> None:
+def test_joystick_lost_events_or_device_release_the_stick(device: Device) -> None:
     device.sends(EV_ABS, ABS_Y, 0)
     device.sends(EV_SYN, SYN_DROPPED, 0)
     assert device.stick.forward == 0.0
@@ -75,7 +75,7 @@ def test_lost_events_and_a_lost_device_let_go_of_the_stick(device: Device) -> No
     assert device.stick.lost and device.stick.forward == 0.0
 
 
-def test_a_stick_is_silent_once_its_newest_event_is_old_however_late_it_is_read(device: Device) -> None:
+def test_joystick_is_released_when_newest_event_is_old(device: Device) -> None:
     assert device.stick.is_silent(0.0), "nothing has come yet"
     device.sends(EV_ABS, ABS_Y, 0, at_s=10.5)
     assert device.stick.forward == pytest.approx(1.0) and not device.stick.is_silent(10.5 + STICK_AGE_S)

@@ -1,0 +1,67 @@
+"""What the path search costs, in C and in Python: paths through random fields of obstacles."""
+
+import statistics
+import time
+
+from snakesim_gnc.geometry.body_on_path import chain_nodes
+from snakesim_gnc.geometry.planar import space_evenly
+from snakesim_gnc.navigation.beam import BeamSearch
+from snakesim_gnc.navigation.native_growth import NativeGrowth, is_native_available
+from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
+from snakesim_gnc.navigation.path_growth import SpecifiedGrowth
+from snakesim_gnc.navigation.plan import HORIZON_M
+from snakesim_gnc.navigation.search_arcs import STEP_M
+from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.route import yaw_segments_m
+from snakesim_hal.model.scenario import find_start_pose, load, parse_set, place_obstacles
+
+SEEDS = (1, 2, 3, 4, 5)  # of the fields
+SEARCH = SearchParameters(body_length_m=1.54, radius_m=0.04, segment_m=0.11)  # planar13
+
+
+class PlanningCosts:
+    """Searches the same paths in C and in Python."""
+
+    def __init__(self) -> None:
+        """Lay out the fields."""
+        self._scenes = [_make_scene(seed) for seed in SEEDS]
+
+    def measure_kilonode_us(self) -> tuple[list[float], list[float]]:
+        """Return the CPU time for 1000 nodes in µs, in C and in Python, one for each field.
+
+        Raises:
+            RuntimeError: the C library cannot be loaded here.
+        """
+        if not is_native_available():
+            raise RuntimeError("the C library of the planner cannot be loaded: run `python -m snakesim_native.compile`")
+        native_us: list[float] = []
+        python_us: list[float] = []
+        for grid, body_w in self._scenes:
+            native_us.append(_measure_search_us(BeamSearch(grid, SEARCH, NativeGrowth), body_w))
+            python_us.append(_measure_search_us(BeamSearch(grid, SEARCH, SpecifiedGrowth), body_w))
+        return native_us, python_us
+
+
+def format_rates(native_us: list[float], python_us: list[float]) -> str:
+    """Return a sentence with the nodes per second, from times for 1000 nodes."""
+    native_per_s = 1e9 / statistics.median(native_us)
+    python_per_s = 1e9 / statistics.median(python_us)
+    return f"The path search expands {native_per_s:,.0f} nodes/s on one core, and {python_per_s:,.0f} without C."
+
+
+def _make_scene(seed: int) -> tuple[ObstacleGrid, Floats]:
+    """Return the map of a random field, and the body (n, 2) before it."""
+    config = load("surveyed_clutter", [parse_set(f"scene.random_field.0.seed={seed}")]).config
+    start = find_start_pose(config)
+    segments_m = yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
+    nodes_w = chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments_m)
+    obstacles = [placed.obstacle for placed in place_obstacles(config)]
+    return ObstacleGrid(obstacles), space_evenly(nodes_w.T)
+
+
+def _measure_search_us(beam: BeamSearch, body_w: Floats) -> float:
+    """Return the CPU time of a whole search for 1000 of its nodes."""
+    began_s = time.thread_time()
+    node_count = sum(beam.search_ahead(body_w, 0.0, round(HORIZON_M / STEP_M)))
+    return (time.thread_time() - began_s) / node_count * 1e9

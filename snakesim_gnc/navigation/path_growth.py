@@ -1,0 +1,323 @@
+"""How a beam search makes its paths longer by one layer of arcs: the specification. Pure.
+
+`native_growth` computes the same numbers in C, about ten times as fast. This module is what a reader should trust: it
+explains the search, the tests compare the two bit for bit, and it plans where the C library is not installed. A change
+here needs the same change in `snakesim_native/planner/`.
+
+In shapes, n is the number of nodes and c the number of curvatures. Points and headings are in the world frame.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.geometry.planar import wrenches
+from snakesim_gnc.navigation.margin import compute_margins_n
+from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
+from snakesim_gnc.navigation.search_arcs import STEP_M, ArcTable, SearchArcs
+from snakesim_gnc.navigation.search_nodes import NodeLayer, count_earlier_in_cell, number_cells
+from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_hal.base.arrays import Floats
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+MAX_HEADING_ERROR_RAD = 1.75  # a path heads no farther away from the goal
+
+# Of the nodes in one narrow cell only the cheapest is kept: they are the same for the robot.
+CELL_M = 0.02
+CELL_RAD = np.pi / 18
+# A wide cell keeps a limited number of nodes, so that other ways round an obstacle stay in the search.
+WIDE_CELL_M = 0.1
+WIDE_CELL_RAD = 0.6
+CANDIDATES_PER_KEPT_NODE = 3  # nodes whose contacts are computed, for each one that is kept
+
+MIN_PUSH = -0.1  # n.g of a contact that counts for the margin: `path_fit` moves the body off those that brake more
+MAX_FRONTAL = 0.35  # |n.t| of a contact with the side of the body; beyond, the head bumps
+FAILED_PATH_M = 0.025  # a path farther than this from a failed one is another path
+
+
+@dataclass(frozen=True)
+class SearchedPath:
+    """A path that the search found."""
+
+    points_w: Floats  # (n + 1, 2) one for every STEP_M
+    margins_n: Floats  # (n + 1,) propulsion margin of the body with its head there
+    cost_m: float
+
+
+@dataclass(frozen=True)
+class SearchTask:
+    """The goal of one search, and the body from which it starts."""
+
+    origin_w: Floats  # (2,) the head of the measured body; moments are about it
+    goal_rad: float
+    goal_w: Floats  # (2,) unit vector
+    lying_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
+    # For a search of the whole body.
+    lying_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
+    max_sideways_m: float = np.inf  # how far the path may be from where the body lies
+    failed_w: Floats | None = None  # (k, 2) points of paths on which the body got stuck here
+
+
+class PathGrowth(Protocol):
+    """The paths of one search, which grow by one arc at a time."""
+
+    @property
+    def node_count(self) -> int:
+        """Return the number of nodes in the newest layer."""
+        ...
+
+    def grow(self) -> bool:
+        """Expand the newest layer into the next one. Return False, and change nothing, if no arc is free."""
+        ...
+
+    def trace_cheapest(self) -> SearchedPath | None:
+        """Return the path to the cheapest node of the newest layer; None if nothing has grown."""
+        ...
+
+
+class SpecifiedGrowth:
+    """Grows paths with NumPy, in the words of the cost's equation in `beam`."""
+
+    def __init__(
+        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
+    ) -> None:
+        """Begin with the start nodes as the first layer.
+
+        Args:
+            obstacles: the map.
+            parameters: the robot, and the costs.
+            task: the search.
+            start: the nodes from which the paths grow.
+            steps: the largest number of arcs; not used here.
+        """
+        del steps
+        self._obstacles = obstacles
+        self._parameters = parameters
+        self._task = task
+        self._arc_table = ArcTable(parameters)
+        self._body_arcs = count_body_arcs(parameters)
+        self._layers = [start]
+
+    @property
+    def node_count(self) -> int:
+        """Return the number of nodes in the newest layer."""
+        return len(self._layers[-1].x_m)
+
+    def grow(self) -> bool:
+        """Add the best children of the newest layer. Return False if none is free."""
+        parents = self._layers[-1]
+        arcs = self._arc_table.steer(parents)
+        sideways_m = self._distance_from_lying(arcs, parents.s_m)
+        is_allowed = self._find_allowed(arcs, sideways_m)
+        if not is_allowed.any():
+            return False
+        cost_m = self._path_cost_m(parents, arcs, sideways_m)
+        candidates = self._pick_candidates(arcs, is_allowed, cost_m)
+        nodes = self._make_nodes(parents, arcs, cost_m, candidates)
+        self._add_contact_terms(nodes, arcs, candidates)
+        self._layers.append(self._thin_out(nodes))
+        return True
+
+    def trace_cheapest(self) -> SearchedPath | None:
+        """Follow the parents of the cheapest node of the newest layer back to the start."""
+        if len(self._layers) == 1:
+            return None
+        newest = self._layers[-1]
+        row = int(np.argmin(newest.cost_m))
+        cost_m = float(newest.cost_m[row])
+        points: list[tuple[float, float]] = []
+        margins: list[float] = []
+        for layer in reversed(self._layers):
+            points.append((layer.x_m[row], layer.y_m[row]))
+            margins.append(layer.margin_n[row])
+            row = int(layer.parent[row])
+        return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
+
+    def _distance_from_lying(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
+        """Return how far the ends of the arcs are from where the body lies at the same arc length, (n, c).
+
+        None if the body is not laid again, or if the arcs are ahead of its head.
+        """
+        lying_w = self._task.lying_w
+        if lying_w is None:
+            return None
+        end = round(parent_s_m / STEP_M) + 1
+        if end >= len(lying_w):
+            return None
+        return np.hypot(arcs.x_m - lying_w[end, 0], arcs.y_m - lying_w[end, 1])
+
+    def _find_allowed(self, arcs: SearchArcs, sideways_m: Floats | None) -> Bools:
+        """Return which arcs clear all obstacles and lead about the right way, (n, c)."""
+        is_allowed = self._arc_table.clears_obstacles(
+            self._obstacles, arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad
+        )
+        is_allowed &= self._arc_table.clears_obstacles(self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad)
+        from_goal_rad = arcs.heading_rad - self._task.goal_rad
+        heading_error_rad = np.abs(np.remainder(from_goal_rad + np.pi, 2 * np.pi) - np.pi)
+        is_allowed &= heading_error_rad < MAX_HEADING_ERROR_RAD
+        if sideways_m is not None:
+            is_allowed &= sideways_m < self._task.max_sideways_m
+        return is_allowed
+
+    def _path_cost_m(self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None) -> Floats:
+        """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts, (n, c)."""
+        parameters = self._parameters
+        task = self._task
+        curvature_change = np.abs(self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None])
+        step_x = arcs.x_m - parents.x_m[:, None]
+        step_y = arcs.y_m - parents.y_m[:, None]
+        progress_m = step_x * task.goal_w[0] + step_y * task.goal_w[1]
+        cost_m = (
+            parents.cost_m[:, None]
+            + STEP_M
+            + parameters.curvature_change_cost_m * STEP_M * curvature_change
+            - parameters.progress_reward * progress_m
+        )
+        if sideways_m is None:
+            return cost_m
+        if task.failed_w is not None:
+            to_failed_x = arcs.x_m[..., None] - task.failed_w[:, 0]
+            to_failed_y = arcs.y_m[..., None] - task.failed_w[:, 1]
+            to_failed_m = np.hypot(to_failed_x, to_failed_y).min(axis=-1)
+            closeness = np.maximum(1.0 - to_failed_m / FAILED_PATH_M, 0.0)
+            cost_m = cost_m + STEP_M * parameters.failed_path_cost * closeness
+        return cost_m + STEP_M * parameters.sideways_cost * (sideways_m / task.max_sideways_m) ** 2
+
+    def _pick_candidates(self, arcs: SearchArcs, is_allowed: Bools, cost_m: Floats) -> Ints:
+        """Return the indices into the raveled arcs of the cheapest allowed one in each cell, the cheapest first."""
+        allowed = np.flatnonzero(is_allowed.ravel())
+        cheapest_first = allowed[np.argsort(cost_m.ravel()[allowed], kind="stable")]
+        cells = number_cells(
+            arcs.x_m.ravel()[cheapest_first],
+            arcs.y_m.ravel()[cheapest_first],
+            arcs.heading_rad.ravel()[cheapest_first],
+            CELL_M,
+            CELL_RAD,
+        )
+        _, first_of_cell = np.unique(cells, return_index=True)
+        first_of_cell = np.sort(first_of_cell)
+        return cheapest_first[first_of_cell[: CANDIDATES_PER_KEPT_NODE * self._parameters.kept_nodes]]
+
+    def _make_nodes(self, parents: NodeLayer, arcs: SearchArcs, cost_m: Floats, candidates: Ints) -> NodeLayer:
+        """Return nodes at the ends of some arcs, with the contacts and the drag of their parents."""
+        curvature_count = len(self._arc_table.curvatures_per_m)
+        parent_rows = candidates // curvature_count
+        nodes = parents.select_rows(parent_rows)
+        nodes.parent = parent_rows
+        nodes.x_m = arcs.x_m.ravel()[candidates]
+        nodes.y_m = arcs.y_m.ravel()[candidates]
+        nodes.heading_rad = arcs.heading_rad.ravel()[candidates]
+        nodes.curvature_per_m = self._arc_table.curvatures_per_m[candidates % curvature_count]
+        nodes.cost_m = cost_m.ravel()[candidates]
+        nodes.s_m = parents.s_m + STEP_M
+        return nodes
+
+    def _add_contact_terms(self, nodes: NodeLayer, arcs: SearchArcs, candidates: Ints) -> None:
+        """Add the contacts and the drag of the newest arc to nodes, and what they cost."""
+        parameters = self._parameters
+        task = self._task
+        middles_w = np.stack([arcs.middle_x_m.ravel()[candidates], arcs.middle_y_m.ravel()[candidates]], axis=-1)
+        headings_rad = arcs.middle_heading_rad.ravel()[candidates]
+        tangents = np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=-1)
+
+        # While the search is still within the body, the margin has no meaning yet.
+        is_relaid = task.lying_w is not None
+        is_within_body = is_relaid and nodes.s_m < parameters.body_length_m - 0.5 * STEP_M
+        push_reward = parameters.push_reward_of_body if is_within_body else parameters.push_reward
+        touched = find_touched(self._obstacles, middles_w, tangents, parameters, task)
+        nodes.add_contacts(touched.counts, touched.obstacle, touched.gap_m, touched.wrench, nodes.s_m - 0.5 * STEP_M)
+        push = touched.push
+        nodes.cost_m += STEP_M * np.where(push > 0, -push_reward * push, -parameters.brake_cost * push)
+
+        nodes.arc_drag_m = STEP_M * wrenches(middles_w - task.origin_w, tangents)
+        nodes.drag_m += nodes.arc_drag_m - self._drag_left_behind_m(nodes.parent)
+        nodes.margin_n = compute_node_margins_n(nodes, parameters)
+        if is_within_body:
+            return
+        is_near = is_relaid and nodes.s_m < parameters.body_length_m + parameters.near_m
+        weak_margin_cost = parameters.weak_margin_cost_near if is_near else parameters.weak_margin_cost
+        weakness = np.clip(1.0 - nodes.margin_n / parameters.wanted_margin_n, 0.0, 1.0)
+        nodes.cost_m += STEP_M * weak_margin_cost * weakness
+
+    def _drag_left_behind_m(self, parent_rows: Ints) -> Floats:
+        """Return the drag of the arc that the tail leaves when the head enters the next arc, (n, 3) or (3,).
+
+        The tail is one body length behind the head: on the body as it lay at first, and then on the path.
+        """
+        layers = self._layers
+        if len(layers) <= self._body_arcs:
+            return self._task.lying_drag_m[len(layers) - 1]
+        rows = parent_rows
+        for older in reversed(layers[len(layers) - self._body_arcs + 1 :]):
+            rows = older.parent[rows]
+        return layers[-self._body_arcs].arc_drag_m[rows]
+
+    def _thin_out(self, nodes: NodeLayer) -> NodeLayer:
+        """Return the cheapest nodes, with a limited number in each wide cell."""
+        order = np.argsort(nodes.cost_m, kind="stable")
+        cells = number_cells(nodes.x_m[order], nodes.y_m[order], nodes.heading_rad[order], WIDE_CELL_M, WIDE_CELL_RAD)
+        is_kept = count_earlier_in_cell(cells) < self._parameters.kept_per_wide_cell
+        return nodes.select_rows(order[is_kept][: self._parameters.kept_nodes])
+
+
+def count_body_arcs(parameters: SearchParameters) -> int:
+    """Return the length of the body as a number of arcs."""
+    return round(parameters.body_length_m / STEP_M)
+
+
+@dataclass(frozen=True)
+class TouchedObstacles:
+    """What bodies touch at one arc length each. All arrays have one row for each of n points on their axes."""
+
+    push: Floats  # (n,) towards the goal, n.g; 0 without a contact
+    counts: Bools  # (n,) whether there is a contact that counts for the margin; the other arrays are valid only there
+    obstacle: Ints  # (n,) index
+    gap_m: Floats  # (n,) between skin and obstacle
+    wrench: Floats  # (n, 3) of a unit push
+
+
+def find_touched(
+    obstacles: ObstacleGrid, points_w: Floats, tangents: Floats, parameters: SearchParameters, task: SearchTask
+) -> TouchedObstacles:
+    """Find what bodies touch at points on their axes.
+
+    Args:
+        obstacles: the map.
+        points_w: (n, 2) the points.
+        tangents: (n, 2) unit vectors along the axes.
+        parameters: the robot.
+        task: the search.
+    """
+    nearest = obstacles.find_nearest(points_w[:, 0], points_w[:, 1])
+    normals = nearest.normal_w
+    gap_m = nearest.distance_m - parameters.radius_m
+    frontal = np.abs(_dot(normals, tangents))
+    is_contact = (nearest.obstacle != NO_OBSTACLE) & (gap_m < parameters.contact_distance_m) & (frontal < MAX_FRONTAL)
+    push = _dot(normals, task.goal_w)
+    skin_from_origin = points_w - normals * parameters.radius_m - task.origin_w
+    unit_push = normals - parameters.assumed_obstacle_friction * tangents
+    return TouchedObstacles(
+        push=np.where(is_contact, push, 0.0),
+        counts=is_contact & (push > MIN_PUSH),
+        obstacle=nearest.obstacle,
+        gap_m=gap_m,
+        wrench=wrenches(skin_from_origin, unit_push),
+    )
+
+
+def compute_node_margins_n(nodes: NodeLayer, parameters: SearchParameters) -> Floats:
+    """Return the propulsion margin of each node's body, (n,), with the contacts that are not near its ends."""
+    first_s_m = nodes.s_m - parameters.body_length_m + parameters.unused_tail_m
+    last_s_m = nodes.s_m - parameters.unused_head_m
+    counts = (nodes.contact_s_m >= first_s_m) & (nodes.contact_s_m <= last_s_m)
+    contacts = np.where(counts[..., None], nodes.contact_wrench, 0.0)
+    return compute_margins_n(contacts, nodes.drag_m / parameters.body_length_m)
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    """Return a . b of vectors (n, 2), or (2,) that counts for all. BLAS would round differently on other processors."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]

@@ -1,0 +1,178 @@
+"""Compiles the C libraries: `python -m snakesim_native.compile`, which `make setup` runs.
+
+It uses the first C compiler that works: `$CC`, else `cc`, `gcc` or `clang`, else the compiler in the package `ziglang`
+of the Python package index. Without one it prints what the Python versions cost, and succeeds.
+
+A library is written under a temporary name and renamed, so several processes may compile it at the same time.
+"""
+
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from snakesim_native.libraries import (
+    FLAGS,
+    LIBRARIES,
+    PACKAGE,
+    MujocoFiles,
+    NativeLibrary,
+    compute_build_key,
+    find_mujoco,
+    make_file_name,
+)
+
+COMPILERS = ("cc", "gcc", "clang")
+COMPILE_TIMEOUT_S = 300
+SHIPPED_FOLDER = PACKAGE / "compiled"  # in a wheel, and in a repository
+NO_COMPILER = "no C compiler was found (install gcc, or `pip install ziglang`)"
+
+
+class CannotCompileError(Exception):
+    """A library cannot be compiled here; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a library is compiled for."""
+
+    machine: str  # as `uname -m` prints it
+    libc: str  # "gnu" or "musl"
+
+    @property
+    def zig_name(self) -> str:
+        """Return the target's name for zig, such as "x86_64-linux-gnu"."""
+        return f"{self.machine}-linux-{self.libc}"
+
+
+def find_this_target() -> Target:
+    """Return the target for this computer's Python."""
+    host = sysconfig.get_config_var("HOST_GNU_TYPE") or ""
+    return Target(platform.machine(), "musl" if "musl" in host else "gnu")
+
+
+def list_compilers(target: Target | None = None) -> list[list[str]]:
+    """Return the commands of the C compilers of this computer, the first choice first.
+
+    Args:
+        target: what to compile for; only zig compiles for other computers. None: this computer.
+    """
+    commands: list[list[str]] = []
+    if target is None:
+        if os.environ.get("CC"):
+            return [shlex.split(os.environ["CC"])]
+        commands += [[name] for name in COMPILERS if shutil.which(name)]
+    if importlib.util.find_spec("ziglang") is not None:
+        zig_target = target or find_this_target()
+        # Without a target, zig would use all instructions of this computer's processor.
+        commands.append([sys.executable, "-m", "ziglang", "cc", "-target", zig_target.zig_name, "-mcpu=baseline"])
+    return commands
+
+
+def compile_library(
+    library: NativeLibrary, folder: Path, target: Target | None = None, extra_flags: tuple[str, ...] = ()
+) -> Path:
+    """Compile a library into a folder, and remove older builds of it from there.
+
+    Args:
+        library: the library.
+        folder: where to write it.
+        target: what to compile for; None: this computer.
+        extra_flags: further options of the compiler.
+
+    Returns:
+        The compiled file.
+
+    Raises:
+        CannotCompileError: there is no compiler, no MuJoCo, or no compiler accepts the sources.
+    """
+    mujoco = find_mujoco()
+    if library.uses_mujoco and mujoco is None:
+        raise CannotCompileError("MuJoCo is not installed (install the extra [sim])")
+    compilers = list_compilers(target)
+    if not compilers:
+        raise CannotCompileError(NO_COMPILER)
+    machine = (target or find_this_target()).machine
+    key = compute_build_key(library, mujoco.version if mujoco else "")
+    file = folder / make_file_name(library, key, machine)
+    problems: list[str] = []
+    for compiler in compilers:
+        problem = _run_compiler([*compiler, *extra_flags], library, key, mujoco, file)
+        if not problem:
+            _remove_older_builds(library, machine, file)
+            return file
+        problems.append(f"{shlex.join(compiler)}: {problem}")
+    raise CannotCompileError("; ".join(problems))
+
+
+def _run_compiler(command: list[str], library: NativeLibrary, key: str, mujoco: MujocoFiles | None, file: Path) -> str:
+    """Compile a library. Returns what is wrong; empty: nothing."""
+    words = [*command, *FLAGS, f'-DSNAKESIM_BUILD_KEY="{key}"']
+    words += [str(source) for source in library.list_sources()]
+    if library.uses_mujoco and mujoco is not None:
+        words += ["-isystem", str(mujoco.include_folder), str(mujoco.library)]
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=file.parent, prefix=".") as temporary:
+            compiled = Path(temporary, file.name)
+            finished = subprocess.run(
+                [*words, "-lm", "-o", str(compiled)],
+                capture_output=True,
+                text=True,
+                errors="replace",
+                check=False,
+                timeout=COMPILE_TIMEOUT_S,
+            )
+            if finished.returncode == 0:
+                compiled.replace(file)
+                return ""
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    return _pick_error(finished.stderr) or f"exit code {finished.returncode}"
+
+
+def _pick_error(printed: str) -> str:
+    """Return the first error that a compiler printed, in one line."""
+    lines = [line.strip() for line in printed.splitlines() if line.strip()]
+    errors = [line for line in lines if "error" in line]
+    return next(iter(errors + lines), "")
+
+
+def _remove_older_builds(library: NativeLibrary, machine: str, newest: Path) -> None:
+    """Remove builds of other sources for the same processor. A process that has loaded one keeps it."""
+    for file in newest.parent.glob(f"{library.name}-{machine}-*.so"):
+        if file != newest:
+            file.unlink(missing_ok=True)
+
+
+def compile_all(folder: Path) -> list[str]:
+    """Compile the libraries whose sources have changed. Returns a sentence for each that cannot be compiled here."""
+    sentences: list[str] = []
+    mujoco = find_mujoco()
+    for library in LIBRARIES:
+        key = compute_build_key(library, mujoco.version if mujoco else "")
+        if (folder / make_file_name(library, key)).is_file():
+            continue
+        try:
+            compile_library(library, folder)
+        except CannotCompileError as error:
+            sentences.append(f"{library.name} runs in Python: {library.python_cost}. Reason: {error}")
+    return sentences
+
+
+def main() -> int:
+    """Compile all libraries into this package. Returns the exit code: 0 also without a compiler."""
+    for sentence in compile_all(SHIPPED_FOLDER):
+        print(f"setup: {sentence}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,7 @@
+"""The forces that MuJoCo does not compute: dry friction, flat ground, and obstacles that yield.
+
+`flat_ground`       the ground's forces on the feet
+`contact_friction`  friction of the contacts that MuJoCo finds
+`yielding`          obstacles on springs, and obstacles that slide on the ground
+`chain`             adds forces on the links to MuJoCo's generalized forces
+"""

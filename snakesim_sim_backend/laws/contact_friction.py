@@ -1,0 +1,278 @@
+"""Dry friction wherever a link touches something: obstacles, steps, hills, other links.
+
+MuJoCo only pushes along normals here. Its own friction is relaxed to a convex problem, which has a side effect: a
+contact that slides at speed v is also pushed apart, with an acceleration of friction * 2 v / (time in which slip
+decays). A body that slides along a rough peg then hops off it and back, and the measured forces depend on that time and
+on the length of the physics step.
+
+So friction is computed here, by the same law as under the feet (flat_ground.py): a contact sticks by a tangential
+spring to the point where it stuck, and slips when the spring would pull harder than mu N. N is the normal force of the
+previous step. The spring is as stiff as the masses of both bodies allow at this time step.
+
+The state of the contacts is in MuJoCo's `userdata`, so that a saved MuJoCo state is complete. A snake has few contacts,
+and for a few of them plain floats take less time than NumPy.
+
+Source: P. A. Cundall and O. D. L. Strack, "A discrete numerical model for granular assemblies", Géotechnique 29, 1979.
+"""
+
+import math
+from collections.abc import Collection
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.quantities import Vector
+from snakesim_sim_backend.laws.chain import Chain
+
+# Numbers per contact in `userdata`: its key, the link's body, the other body, the mass that the spring has to follow in
+# kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, and the contact point in the frame of the
+# link (3) and of the other body (3).
+NUMBERS_PER_CONTACT = 17
+CONTACTS_PER_LINK = 16  # on average; the contacts beyond that number have no friction
+CONTACTS_PER_PAIR = 64  # of two geoms: more than MuJoCo makes, so that keys are unique
+END_MOBILITY = 4.0  # how many times as easily a rod moves at its end as in its middle
+PHASE_RAD = 0.5  # by which the springs vibrate in one physics step
+DAMPING_RATIO = 0.5  # of critical damping
+WORLD_BODY = 0  # MuJoCo's number of the body that does not move
+NO_TORQUE = np.zeros(3)
+NO_STRETCH = (0.0, 0.0, 0.0)
+
+
+def count_numbers(links: int) -> int:
+    """Return how many numbers in `userdata` the contacts of a snake need."""
+    return 1 + NUMBERS_PER_CONTACT * CONTACTS_PER_LINK * links
+
+
+class _RoughContact(NamedTuple):
+    """A contact of the last step that has friction."""
+
+    number: int  # in MuJoCo's contacts
+    link_geom: int
+    other_geom: int
+    sign: float  # makes MuJoCo's normal point from the other body into the link
+
+
+class ContactFriction:
+    """Friction of one simulation. Call `apply` between `mj_step1` and `mj_step2`, `update_contacts` after them.
+
+    Equations of one contact, in the world frame, with the time step dt and the mass m that the spring has to follow:
+
+        k = m (PHASE / dt)^2                     stiffness, N/m
+        d = 2 DAMPING_RATIO m PHASE / dt^2       damping, N per m of slip in one step
+        ds = motion of the link's point relative to the other body's point, without its part along the normal n
+        s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the spring, tangential to the surface
+        F  = -(k s + d ds), limited to |F| <= mu N   friction force on the link
+
+    Attributes:
+        min_friction: lowest coefficient that is used; above 0 only while a robot settles.
+        geom_pairs: geoms of all contacts of the last step, in MuJoCo's order.
+        normal_force_n: normal force of each of these contacts.
+        friction_force_w: index of a contact -> friction force on the link, in N; only contacts that have friction.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        chain: Chain,
+        link_geoms: Collection[int],
+        memory: Floats,
+    ) -> None:
+        """Prepare the law for a compiled model.
+
+        Args:
+            model: the compiled model.
+            data: its state.
+            chain: collects the forces on the links.
+            link_geoms: numbers of the links' geoms.
+            memory: (count_numbers(n_links),), a view of `userdata`: the number of contacts, then those.
+        """
+        step_s = float(model.opt.timestep)
+        self._model = model
+        self._data = data
+        self._chain = chain
+        self._memory = memory
+        self._stretch_and_force: dict[float, tuple[Vector, Vector]] = {}  # of each contact in this step, by its key
+        self.min_friction = 0.0
+
+        # Properties of geoms and bodies.
+        self._friction: list[float] = model.geom_friction[:, 0].tolist()  # Coulomb coefficient with a link
+        self._link_geoms = frozenset(link_geoms)
+        self._body_of_geom: list[int] = model.geom_bodyid.tolist()
+        self._mobility = [_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]  # 1/kg
+        self._stiffness_per_kg = (PHASE_RAD / step_s) * (PHASE_RAD / step_s)  # N/m for each kg
+        self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / (step_s * step_s)  # N per m in one step, for each kg
+
+        # Views of MuJoCo's arrays.
+        self._contact = data.contact
+        self._body_positions = data.xpos
+        self._body_rotations = data.xmat  # world_from_body, row by row
+
+        # The contacts of the last step.
+        self.geom_pairs: list[list[int]] = []
+        self.normal_force_n: list[float] = []
+        self.friction_force_w: dict[int, Vector] = {}
+
+    def begin(self) -> None:
+        """Forget all contacts."""
+        self._memory[0] = 0.0
+        self._stretch_and_force = {}
+
+    def apply(self) -> None:
+        """Add the friction forces to MuJoCo's passive forces, which it computes in each step."""
+        self._stretch_and_force = {}
+        count = int(self._memory[0])
+        if count == 0:
+            return
+        numbers = self._memory[1 : 1 + NUMBERS_PER_CONTACT * count].tolist()
+        forces_w: list[Vector] = []
+        points_w: list[Vector] = []
+        link_bodies: list[int] = []
+        for start in range(0, NUMBERS_PER_CONTACT * count, NUMBERS_PER_CONTACT):
+            key, link_body, other_body, m, mu_n, nx, ny, nz, sx, sy, sz, *points = numbers[
+                start : start + NUMBERS_PER_CONTACT
+            ]
+            link_body = int(link_body)
+            other_body = int(other_body)
+            point_w = self._to_world(link_body, *points[:3])
+            x, y, z = point_w
+            ox, oy, oz = self._to_world(other_body, *points[3:])
+
+            # ds, and s + ds
+            dx, dy, dz = _project_to_tangent(x - ox, y - oy, z - oz, nx, ny, nz)
+            sx, sy, sz = _project_to_tangent(sx + dx, sy + dy, sz + dz, nx, ny, nz)
+
+            # s = (s + ds) min(1, mu N / (k |s + ds|))
+            k = self._stiffness_per_kg * m
+            d = self._damping_per_kg * m
+            scale = _limit_scale(mu_n, k * math.sqrt(sx * sx + sy * sy + sz * sz))
+            sx, sy, sz = scale * sx, scale * sy, scale * sz
+
+            # F = -(k s + d ds), limited to mu N
+            fx = k * sx + d * dx
+            fy = k * sy + d * dy
+            fz = k * sz + d * dz
+            scale = -_limit_scale(mu_n, math.sqrt(fx * fx + fy * fy + fz * fz))
+            force_w = (scale * fx, scale * fy, scale * fz)
+
+            self._stretch_and_force[key] = (sx, sy, sz), force_w
+            forces_w.append(force_w)
+            points_w.append(point_w)
+            link_bodies.append(link_body)
+            if other_body != WORLD_BODY:
+                self._push_other_body(other_body, force_w, point_w)
+        self._chain.push(forces_w, points_w, link_bodies)
+
+    def _push_other_body(self, body: int, force_w: Vector, point_w: Vector) -> None:
+        """Apply the opposite of a link's friction force to the body that it touches."""
+        passive = self._data.qfrc_passive
+        mujoco.mj_applyFT(self._model, self._data, -np.array(force_w), NO_TORQUE, np.array(point_w), body, passive)
+
+    def update_contacts(self) -> None:
+        """Store the contacts of the step that was just made. `apply` uses them in the next step."""
+        if not self._data.ncon:
+            if self.geom_pairs or self._memory[0]:
+                self._memory[0] = 0.0
+                self.geom_pairs = []
+                self.normal_force_n = []
+                self.friction_force_w = {}
+            return
+        self._memory[0] = 0.0
+        self.friction_force_w = {}
+        self.geom_pairs = self._contact.geom.tolist()
+        solver_forces = self._data.efc_force.tolist()
+        self.normal_force_n = [
+            solver_forces[row] if row >= 0 else 0.0  # a contact without a row has no force
+            for row in self._contact.efc_address.tolist()
+        ]
+        rough = self._find_rough_contacts()
+        if rough:
+            self._store_contacts(rough)
+
+    def _find_rough_contacts(self) -> list[_RoughContact]:
+        """Return the contacts of links that press and have friction, as many as there is memory for."""
+        link_geoms = self._link_geoms
+        friction = self._friction
+        rough: list[_RoughContact] = []
+        for i, (first, second) in enumerate(self.geom_pairs):
+            if first in link_geoms:
+                link, other, sign = first, second, -1.0
+            else:
+                link, other, sign = second, first, 1.0
+            presses = self.normal_force_n[i] > 0.0 and link in link_geoms
+            if presses and (friction[other] > 0.0 or self.min_friction > 0.0):
+                rough.append(_RoughContact(i, link, other, sign))
+        capacity = (len(self._memory) - 1) // NUMBERS_PER_CONTACT
+        del rough[capacity:]
+        return rough
+
+    def _store_contacts(self, rough: list[_RoughContact]) -> None:
+        """Write contacts into the memory. A contact that was there before keeps its stretch."""
+        frames = self._contact.frame.tolist()
+        points_w = self._contact.pos.tolist()
+        bodies = self._body_of_geom
+        mobility = self._mobility
+        link_bodies = [bodies[contact.link_geom] for contact in rough]
+        contacts_of_pair: dict[int, int] = {}
+        numbers: list[float] = []
+        for i, link_geom, other_geom, sign in rough:
+            link_body = bodies[link_geom]
+            other_body = bodies[other_geom]
+
+            # Contacts of one pair of geoms are distinguished by their order.
+            pair = link_geom * len(bodies) + other_geom
+            nth = contacts_of_pair.get(pair, -1) + 1
+            contacts_of_pair[pair] = nth
+            key = float(CONTACTS_PER_PAIR * pair + nth)
+            stretch = NO_STRETCH
+            before = self._stretch_and_force.get(key)
+            if before is not None:
+                stretch, self.friction_force_w[i] = before
+
+            normal_w = [sign * along for along in frames[i][:3]]  # MuJoCo's is from the first geom to the second
+            mass_kg = 1.0 / (link_bodies.count(link_body) * (mobility[link_body] + mobility[other_body]))
+            mu_n = max(self._friction[other_geom], self.min_friction) * self.normal_force_n[i]
+            numbers += (key, link_body, other_body, mass_kg, mu_n, *normal_w, *stretch)
+            numbers += self._to_body(link_body, *points_w[i])
+            numbers += self._to_body(other_body, *points_w[i])
+        self._memory[1 : 1 + len(numbers)] = numbers
+        self._memory[0] = len(rough)
+
+    def _to_world(self, body: int, x: float, y: float, z: float) -> Vector:
+        """Return the world coordinates of a point that is given in a body's frame, in m."""
+        if body == WORLD_BODY:
+            return x, y, z
+        a, b, c, d, e, f, g, h, i = self._body_rotations[body].tolist()
+        px, py, pz = self._body_positions[body].tolist()
+        return px + a * x + b * y + c * z, py + d * x + e * y + f * z, pz + g * x + h * y + i * z
+
+    def _to_body(self, body: int, x: float, y: float, z: float) -> Vector:
+        """Return the coordinates in a body's frame of a point that is given in the world frame, in m."""
+        if body == WORLD_BODY:
+            return x, y, z
+        a, b, c, d, e, f, g, h, i = self._body_rotations[body].tolist()
+        px, py, pz = self._body_positions[body].tolist()
+        x, y, z = x - px, y - py, z - pz
+        return a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
+
+
+def _end_mobility(mass_kg: float) -> float:
+    """Return by how much a force of 1 N accelerates the end of a rod of this mass, in 1/kg; 0 for the world."""
+    if mass_kg > 0.0:
+        return END_MOBILITY / mass_kg
+    return 0.0
+
+
+def _project_to_tangent(x: float, y: float, z: float, nx: float, ny: float, nz: float) -> Vector:
+    """Return a vector without its part along the unit normal n."""
+    along = x * nx + y * ny + z * nz
+    return x - along * nx, y - along * ny, z - along * nz
+
+
+def _limit_scale(limit: float, size: float) -> float:
+    """Return the factor that brings a vector of this size down to the limit; 1 if it is within."""
+    if size > limit:
+        return limit / size
+    return 1.0

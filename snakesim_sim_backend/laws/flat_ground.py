@@ -1,0 +1,199 @@
+"""Flat ground under the feet: normal forces and dry friction, computed here in every physics step.
+
+MuJoCo solves normal forces and friction of all contacts in one relaxed problem. That is stable, but slip decays with a
+time constant instead of being opposed by mu N, and loads that statics does not determine end up where the solver puts
+them. A symmetric robot whose wave is mirrored then drifts to the same side twice, by centimeters per second. Here:
+
+- Every foot stands on a spring. Its stiffness is proportional to the weight that the foot carries (half of each link
+  that it ends). A body that lies straight therefore sinks in evenly, and every foot carries its share.
+- A foot sticks to the ground by a tangential spring from the point where it stuck, which slips when it would pull
+  harder than mu N. Slip is measured by how far the foot has moved since the last step. The velocities of the integrator
+  belong to a moment half a step away, which would act like an extra force on a foot that moves along a curve.
+
+The state of the law is in MuJoCo's `userdata`, so that a saved MuJoCo state is complete.
+
+Source: P. A. Cundall and O. D. L. Strack, "A discrete numerical model for granular assemblies", Géotechnique 29, 1979.
+"""
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_sim_backend.laws.chain import Chain
+
+SINK_M = 2e-4  # how deep a foot sinks in under its share of the weight
+MAX_PHASE_RAD = 0.7  # the normal spring vibrates by at most this in one step; long steps get softer ground
+DAMPING_RATIO = 0.5  # of critical damping
+NUMBERS_PER_FOOT = 5  # in `userdata`: two of its slip, three of its position
+FOOT = 1.0  # first number of a geom's user data, if the geom is a foot that flat ground carries
+MIN_DIVISOR = 1e-12  # keeps 0 / 0 out of the friction of a foot without load
+
+
+@dataclass(frozen=True)
+class Feet:
+    """The feet of a model on flat ground: one at the tail end of each link, and one at the head."""
+
+    geoms: NDArray[np.int64]  # (n_feet,), tail to head
+    first_body: int  # MuJoCo's number of the tail link's body
+    carried_kg: Floats  # (n_feet,), mass that each foot carries when the robot lies straight
+    radius_m: float
+    friction: float  # Coulomb coefficient
+
+
+def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float) -> Feet:
+    """Return the feet of a compiled model, whose geoms are called `foot_0` onwards."""
+    masses_kg = model.body_mass[first_body : first_body + links]
+    geoms = np.array([model.geom(f"foot_{i}").id for i in range(links + 1)])
+    carried_kg = 0.5 * (np.append(masses_kg, 0.0) + np.append(0.0, masses_kg))
+    friction = float(model.geom_friction[geoms[0], 0])
+    return Feet(geoms, first_body, carried_kg, radius_m, friction)
+
+
+class FlatGround:
+    """The ground at height 0 of one simulation. Call `apply` between `mj_step1` and `mj_step2`.
+
+    Equations of one foot, all in the world frame, with the height h of its center, its radius r, the time step dt, and
+    m g, the weight that it carries:
+
+        k = m g / sink                               stiffness of the normal and of the tangential spring, N/m
+        d = 2 DAMPING_RATIO m sqrt(g / sink) / dt    damping, N per m of motion in one step
+        N = max(0, k (r - h) - d dh)                 normal force; dh: rise since the last step
+        ds = dx + dt r (-w_y, w_x)                   slip of the lowest point since the last step, from the motion dx of
+                                                     the center and the angular velocity w of the link
+        s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the tangential spring, limited by friction
+        F  = -(k s + d ds), limited to |F| <= mu N   friction force
+
+    A call of NumPy costs more than what it computes for so few feet, and a physics step runs each millisecond or two.
+    So `apply` makes few calls, on arrays and views that were allocated before. An array `..._xy` holds x and y of the
+    first foot, then of the next: viewed as complex numbers, each foot has one number, whose absolute value is a length.
+
+    Attributes:
+        min_friction: lowest coefficient that is used; above 0 only while a robot settles.
+        normal_force_n: (n_feet,), normal force on each foot in the last step.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, feet: Feet) -> None:
+        count = len(feet.geoms)
+        gravity = -float(model.opt.gravity[2])
+        step_s = float(model.opt.timestep)
+        slow = step_s / MAX_PHASE_RAD
+        sink_m = max(SINK_M, gravity * (slow * slow))
+        stiffness = feet.carried_kg * gravity / sink_m  # N/m
+        damping = 2.0 * DAMPING_RATIO * feet.carried_kg * math.sqrt(gravity / sink_m) / step_s  # N per m in one step
+        self._chain = chain
+        self.min_friction = 0.0
+        self.normal_force_n = np.zeros(count)
+
+        # Parameters of the law.
+        self._friction = feet.friction
+        self._stiffness = stiffness
+        self._minus_stiffness = -stiffness
+        self._minus_damping = -damping
+        self._minus_stiffness_xy = -stiffness.repeat(2)
+        self._minus_damping_xy = -damping.repeat(2)
+        self._roll_per_rad_s_xy = np.tile([-feet.radius_m * step_s, feet.radius_m * step_s], count)  # m for 1 rad/s
+        self._radius_m = np.full(count, feet.radius_m)
+        self._zeros = np.full(count, 0.0)
+        self._min_divisor = np.full(count, MIN_DIVISOR)
+
+        self._find_inputs(data, feet)
+        self._allocate(count)
+
+    def _find_inputs(self, data: mujoco.MjData, feet: Feet) -> None:
+        """Make the views of MuJoCo's arrays that a step reads, and the indices of the feet in them."""
+        first = feet.first_body
+        count = len(feet.geoms)
+        both = 2 * count
+        bodies = np.minimum(np.arange(count) + first, first + count - 2)  # the head's link has two feet
+        xy = np.add.outer(3 * feet.geoms, [0, 1]).ravel()
+        z = 3 * feet.geoms + 2
+        self._positions = data.geom_xpos.reshape(-1)
+        self._position_indices = np.concatenate((xy, z))
+        self._twists = data.cvel.reshape(-1)  # per body: angular velocity, then linear velocity
+        self._angular_yx_indices = np.add.outer(6 * bodies, [1, 0]).ravel()
+        self._reference_xy = data.subtree_com[first, :2, None]  # the point about which MuJoCo takes moments
+        self._reference_z = data.subtree_com[first, 2:]
+        self._stretch_xy = data.userdata[:both]
+        self._stretch = self._stretch_xy.view(np.complex128)
+        self._last_position = data.userdata[both : NUMBERS_PER_FOOT * count]
+
+    def _allocate(self, count: int) -> None:
+        """Allocate the arrays that every step reuses. Positions are x and y of all feet, then z of all feet."""
+        both = 2 * count
+        self._position = np.empty(3 * count)
+        self._height = self._position[both:]
+        self._position_by_axis = self._position[:both].reshape(count, 2).T
+        self._motion = np.empty(3 * count)
+        self._motion_xy = self._motion[:both]
+        self._rise = self._motion[both:]
+        self._slip_xy = np.empty(both)
+        self._pull_xy = np.empty(both)
+        self._pull = self._pull_xy.view(np.complex128)
+        self._pull_by_axis = self._pull_xy.reshape(count, 2).T
+        # The cyclic order x, y, z, x, y makes each cross product two multiplications of whole blocks of rows.
+        self._arms = np.empty((5, count))
+        rows = np.zeros((8, count))
+        self._moments = rows[:3]
+        self._forces = rows[3:]
+        self._wrenches = rows[:6]
+
+    def begin(self) -> None:
+        """Take the feet as sticking where they are now, without stretch."""
+        self._stretch_xy[:] = 0.0
+        self._last_position[:] = self._positions[self._position_indices]
+
+    def apply(self) -> None:
+        """Add the forces on the feet where they are now to MuJoCo's passive forces, which it computes in each step."""
+        height = self._height
+        slip_xy = self._slip_xy
+
+        # dx and dh: motion of the feet since the last step.
+        self._positions.take(self._position_indices, None, self._position, "clip")
+        np.subtract(self._position, self._last_position, self._motion)
+        self._last_position[:] = self._position
+
+        # ds = dx + dt r (-w_y, w_x)
+        self._twists.take(self._angular_yx_indices, None, slip_xy, "clip")
+        slip_xy *= self._roll_per_rad_s_xy
+        slip_xy += self._motion_xy
+
+        # N = max(0, k (r - h) - d dh), computed in the memory of dh.
+        height -= self._radius_m
+        normal_force_n = self._rise
+        normal_force_n *= self._minus_damping
+        normal_force_n += self._minus_stiffness * height
+        self.normal_force_n = np.maximum(normal_force_n, self._zeros)
+        max_friction_n = max(self._friction, self.min_friction) * self.normal_force_n
+        divisor = np.maximum(max_friction_n, self._min_divisor)
+
+        # s = (s + ds) min(1, mu N / (k |s + ds|))
+        self._stretch_xy += slip_xy
+        self._stretch_xy *= (max_friction_n / np.maximum(self._stiffness * np.abs(self._stretch), divisor)).repeat(2)
+
+        # F = -(k s + d ds), limited to mu N
+        np.multiply(self._minus_stiffness_xy, self._stretch_xy, self._pull_xy)
+        slip_xy *= self._minus_damping_xy
+        self._pull_xy += slip_xy
+        forces = self._forces
+        np.multiply(self._pull_by_axis, max_friction_n / np.maximum(np.abs(self._pull), divisor), forces[:2])
+        forces[2] = self.normal_force_n
+        forces[3:] = forces[:2]
+        self._push_links()
+
+    def _push_links(self) -> None:
+        """Add the forces, and their moments about MuJoCo's reference point, to the links of the chain."""
+        arms = self._arms
+        moments = self._moments
+        # `_height` is the height of each foot's lowest point by now, where the force acts.
+        np.subtract(self._position_by_axis, self._reference_xy, arms[:2])
+        np.subtract(self._height, self._reference_z, arms[2])
+        arms[3:] = arms[:2]
+        # moment = arm x force
+        np.multiply(arms[1:4], self._forces[2:], moments)
+        moments -= arms[2:] * self._forces[1:4]
+        self._wrenches[:, -2] += self._wrenches[:, -1]  # both feet of the head's link
+        self._chain.push_links(self._wrenches[:, :-1])

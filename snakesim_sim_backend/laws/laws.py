@@ -1,0 +1,63 @@
+"""What a version of the laws does, and what can be read of it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.quantities import Vector
+
+
+class ContactForces(Protocol):
+    """The contacts of the last physics step, in MuJoCo's order."""
+
+    @property
+    def geom_pairs(self) -> Sequence[Sequence[int]]:
+        """Return the two geoms of each contact."""
+        ...
+
+    @property
+    def normal_force_n(self) -> Sequence[float]:
+        """Return the normal force of each contact."""
+        ...
+
+    @property
+    def friction_force_w(self) -> Mapping[int, Vector]:
+        """Return the friction force on the link, in N, by the contact's number; only contacts that have friction."""
+        ...
+
+
+class Laws(ABC):
+    """Computes ground, friction and yielding obstacles of one simulation.
+
+    Attributes:
+        contacts: forces of the contacts that MuJoCo finds.
+    """
+
+    contacts: ContactForces
+
+    @property
+    @abstractmethod
+    def foot_forces_n(self) -> Floats | None:
+        """Return the normal force on each foot in the last step, (n_feet,); None if the ground is not flat."""
+
+    @abstractmethod
+    def set_min_friction(self, min_friction: float) -> None:
+        """Use at least this friction coefficient in every contact."""
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Take the feet as sticking where they are in the next `forward`, and forget all contacts."""
+
+    @abstractmethod
+    def forward(self) -> None:
+        """Compute all quantities of the present state, and remember the contacts."""
+
+    @abstractmethod
+    def step(self, count: int, after_step: Callable[[], None] | None) -> None:
+        """Make physics steps.
+
+        Args:
+            count: how many.
+            after_step: called after each of them; None: nothing is to be called.
+        """

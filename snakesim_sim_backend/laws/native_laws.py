@@ -1,0 +1,134 @@
+"""The C version of the laws, which MuJoCo's engine calls by itself in `mj_step`.
+
+Everything that the C version remembers is in `plugin_state`, a part of MuJoCo's state. So it is saved, restored and
+copied with the state, and `mujoco.batch.Batch` may step many simulations with it, on any number of threads: the library
+has no memory of its own. A row of the batch's state then has the same numbers as `MjData.plugin_state` here.
+
+To begin a simulation of a batch as `begin` and `forward` do here, do that once with one `MjData`, and copy its state
+(`mjSTATE_INTEGRATION`) into the row. After a reset of a row to zeros, the feet stick where they are in the next step.
+
+Source of the layout: the structs `Memory`, `Foot` and `RoughContact` in `snakesim_native/laws`.
+"""
+
+import ctypes
+from collections.abc import Callable
+
+import mujoco
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.quantities import Vector
+from snakesim_sim_backend.laws.laws import Laws
+from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, load_library
+from snakesim_sim_backend.model.build import SimModel
+
+# Numbers in the memory of the plugin instance.
+PLACED = 0  # 0: the feet stick where they are in the next step
+MIN_FRICTION = 1
+CONTACT_COUNT = 2
+MEMORY_NUMBERS = 3
+# Then for each foot.
+FOOT_NORMAL_FORCE = 5
+FOOT_NUMBERS = 6
+# Then for each contact with friction.
+CONTACT_FORCE = slice(17, 20)
+CONTACT_NUMBER = 20
+CONTACT_IS_NEW = 21
+CONTACT_NUMBERS = 22
+
+
+class NativeContacts:
+    """The contacts of the last physics step, read from MuJoCo's arrays when they are needed."""
+
+    def __init__(self, data: mujoco.MjData, memory: Floats, records: Floats) -> None:
+        """Prepare views.
+
+        Args:
+            data: the simulation's data.
+            memory: the memory of the plugin instance.
+            records: (capacity, CONTACT_NUMBERS), the part of it with contacts.
+        """
+        self._data = data
+        self._contact = data.contact
+        self._memory = memory
+        self._records = records
+
+    @property
+    def geom_pairs(self) -> list[list[int]]:
+        """Return the two geoms of each contact."""
+        if not self._data.ncon:
+            return []
+        return self._contact.geom.tolist()
+
+    @property
+    def normal_force_n(self) -> list[float]:
+        """Return the normal force of each contact. A contact without a row in the solver has no force."""
+        if not self._data.ncon:
+            return []
+        solver_forces = self._data.efc_force.tolist()
+        return [solver_forces[row] if row >= 0 else 0.0 for row in self._contact.efc_address.tolist()]
+
+    @property
+    def friction_force_w(self) -> dict[int, Vector]:
+        """Return the friction force on the link, in N, by the contact's number; only contacts that have friction."""
+        count = int(self._memory[CONTACT_COUNT])
+        if not count:
+            return {}
+        records = self._records[:count].tolist()
+        return {
+            int(record[CONTACT_NUMBER]): tuple(record[CONTACT_FORCE])
+            for record in records
+            if not record[CONTACT_IS_NEW]
+        }
+
+
+class NativeLaws(Laws):
+    """Lets MuJoCo's engine compute the forces."""
+
+    def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
+        """Prepare the laws of a simulation whose model was built for the C version."""
+        model = sim.model
+        self._model = model
+        self._data = data
+        instance = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_PLUGIN, FRICTION_INSTANCE)
+        start = model.plugin_stateadr[instance]
+        self._memory = data.plugin_state[start : start + model.plugin_statenum[instance]]
+        feet = len(sim.link_geoms) + 1
+        first_contact = MEMORY_NUMBERS + FOOT_NUMBERS * feet
+        self._feet = self._memory[MEMORY_NUMBERS:first_contact].reshape(feet, FOOT_NUMBERS)
+        self._has_feet = sim.feet is not None
+        records = self._memory[first_contact:].reshape(-1, CONTACT_NUMBERS)
+        self.contacts = NativeContacts(data, self._memory, records)
+
+        self._advance = load_library().snakesim_advance
+        self._advance.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+        self._advance.restype = None
+
+    @property
+    def foot_forces_n(self) -> Floats | None:
+        """Return the normal force on each foot in the last step."""
+        if not self._has_feet:
+            return None
+        return self._feet[:, FOOT_NORMAL_FORCE].copy()
+
+    def set_min_friction(self, min_friction: float) -> None:
+        """Use at least this friction coefficient in every contact."""
+        self._memory[MIN_FRICTION] = min_friction
+
+    def begin(self) -> None:
+        """Take the feet as sticking where they are in the next `forward`, and forget all contacts."""
+        self._memory[PLACED] = 0.0
+        self._memory[CONTACT_COUNT] = 0.0
+
+    def forward(self) -> None:
+        """Compute all quantities of the present state."""
+        mujoco.mj_forward(self._model, self._data)
+        self._advance(self._model._address, self._data._address)
+
+    def step(self, count: int, after_step: Callable[[], None] | None) -> None:
+        """Make physics steps."""
+        if after_step is None:
+            mujoco.mj_step(self._model, self._data, count)
+            return
+        for _ in range(count):
+            mujoco.mj_step(self._model, self._data)
+            after_step()

@@ -1,0 +1,75 @@
+"""The two versions of the laws: in C, as plugins of MuJoCo's engine, and in Python.
+
+Both compute the same bits. The C version is used if its library can be loaded (see `snakesim_native`). The Python
+version is the specification that tests compare the C version with, and is used on a computer without a C compiler.
+"""
+
+import ctypes
+from typing import Literal
+
+import mujoco
+
+from snakesim_native.libraries import LAWS
+from snakesim_native.load import load
+from snakesim_sim_backend.laws.contact_friction import count_numbers
+from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT
+from snakesim_sim_backend.laws.yielding import DOFS, SPRING_NUMBERS
+
+LawsVersion = Literal["c", "python"]
+
+FRICTION_PLUGIN = "snakesim.dry_friction"
+YIELDING_PLUGIN = "snakesim.yielding"
+FRICTION_INSTANCE = "dry_friction"  # names in MuJoCo's model
+YIELDING_INSTANCE = "yielding"
+USER_NUMBERS_OF_GEOM = 1
+
+
+def choose_laws() -> LawsVersion:
+    """Return the version that this process uses: the C version, if it can be loaded."""
+    if load(LAWS).handle is None:
+        return "python"
+    return "c"
+
+
+def load_library() -> ctypes.CDLL:
+    """Return the library with the C version, whose plugins MuJoCo knows from then on.
+
+    Raises:
+        RuntimeError: it cannot be loaded.
+    """
+    loaded = load(LAWS)
+    if loaded.handle is None:
+        raise RuntimeError(f"the C version of the laws cannot be loaded: {loaded.problem}")
+    return loaded.handle
+
+
+def add_laws(spec: mujoco.MjSpec, laws: LawsVersion, links: int, yielding_bodies: list[str]) -> None:
+    """Add the laws' parameters and memory to a model that is otherwise complete.
+
+    Args:
+        spec: the model.
+        laws: which version computes the forces.
+        links: number of links.
+        yielding_bodies: names of the bodies of obstacles that yield.
+    """
+    spec.nuser_geom = USER_NUMBERS_OF_GEOM
+    spec.nuser_body = SPRING_NUMBERS
+    match laws:
+        case "python":
+            spec.nuserdata = NUMBERS_PER_FOOT * (links + 1) + count_numbers(links) + DOFS * len(yielding_bodies)
+        case "c":
+            load_library()
+            _add_plugin(spec, FRICTION_PLUGIN, FRICTION_INSTANCE, ["link_0"])
+            if yielding_bodies:
+                _add_plugin(spec, YIELDING_PLUGIN, YIELDING_INSTANCE, yielding_bodies)
+
+
+def _add_plugin(spec: mujoco.MjSpec, plugin: str, instance: str, bodies: list[str]) -> None:
+    """Add an instance of a plugin, which belongs to these bodies."""
+    spec.activate_plugin(plugin)
+    spec.add_plugin(name=instance, plugin_name=plugin, active=True)
+    for body in bodies:
+        reference = spec.body(body).plugin
+        reference.active = True
+        reference.plugin_name = plugin
+        reference.name = instance

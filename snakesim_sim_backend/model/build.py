@@ -1,0 +1,316 @@
+"""Builds the compiled MuJoCo model of a robot in its scene.
+
+The snake is a chain of capsules, tail to head. The free joint belongs to link 0, whose body frame is the base frame:
+its origin is at the tail end, and x points forward. Every other body's frame is the link frame of
+`model.kinematics`, with the origin at the link's rear joint. Bodies, hinges and motors are therefore in the order of
+the robot description.
+"""
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.links import Link
+from snakesim_hal.model.placement import Placed
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import RunConfig, place_obstacles
+from snakesim_hal.physics.motor import check_gains
+from snakesim_hal.wire.messages import Axis
+from snakesim_sim_backend.actuators import add_motor
+from snakesim_sim_backend.laws.chain import FREE_DOFS
+from snakesim_sim_backend.laws.flat_ground import FOOT, Feet, find_feet
+from snakesim_sim_backend.laws.version import LawsVersion, add_laws, choose_laws
+from snakesim_sim_backend.laws.yielding import check_yielding
+from snakesim_sim_backend.model.ground import add_ground
+from snakesim_sim_backend.model.imu import add_imus
+from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, geom_name
+from snakesim_sim_backend.model.surface import ContactParameters, contact_parameters
+from snakesim_sim_backend.model.tether import add_tether
+from snakesim_sim_backend.settings import SimSettings
+
+FREE_QPOS = 7  # coordinates of the base: position and quaternion
+CLAMP_INERTIA = 1e6  # kg and kg·m²: more than the robot can move, in all six degrees of freedom
+CLAMP_DAMPING = 1e6  # N·s/m and N·m·s/rad
+MIN_GAP_RADII = 2.05  # links that are closer than this when the snake is straight would always touch
+FOOT_GROUP = 3  # MuJoCo geom group of the feet, which are inside of the links' capsules
+ORANGE = [0.87, 0.45, 0.12, 1.0]  # color of the robot
+AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0]}
+
+
+@dataclass(frozen=True)
+class SimModel:
+    """A compiled model, and the indices of the robot and the obstacles in MuJoCo's arrays."""
+
+    model: mujoco.MjModel
+    steps_per_tick: int
+    first_link_body: int  # bodies of the links are consecutive
+    obstacle_of_geom: list[str | None]  # (n_geoms,); None: link, ground or step
+    feet: Feet | None  # None: the ground is not flat, and MuJoCo finds the contacts with it
+    link_geoms: list[int]  # (n_links,), tail to head
+    suspended: bool  # the tail link is clamped
+    yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
+    laws: LawsVersion  # which version of the laws the model is made for
+
+
+@dataclass(frozen=True)
+class Blueprint:
+    """The model of a run before it is compiled."""
+
+    spec: mujoco.MjSpec
+    steps_per_tick: int
+    yielding: list[Placed]  # obstacles that move when they are pushed
+    laws: LawsVersion
+
+
+def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
+    """Return views of the joints' angles in rad and velocities in rad/s, (count,) each, tail to head."""
+    angles_rad = data.qpos[FREE_QPOS : FREE_QPOS + count]
+    velocities_rad_s = data.qvel[FREE_DOFS : FREE_DOFS + count]
+    return angles_rad, velocities_rad_s
+
+
+def build(
+    config: RunConfig, settings: SimSettings, *, motors: bool = True, laws: LawsVersion | None = None
+) -> SimModel:
+    """Compile the model of a run.
+
+    Args:
+        config: the run, with its robot and its scene.
+        settings: parameters of the physics.
+        motors: False leaves the motors out. The joints are then hinges with the inertia and the friction of the motors'
+            rotors, for torques that are applied from outside.
+        laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
+
+    Raises:
+        ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
+    """
+    blueprint = make_blueprint(config, settings, motors=motors, laws=laws or choose_laws())
+    model = _compile(blueprint.spec, config.robot.name)
+    links = config.robot.chain.modules + 1
+    first_link_body = model.body("link_0").id
+    feet = None
+    if config.scene.ground.heightfield is None:
+        feet = find_feet(model, first_link_body, links, config.robot.module.radius_m)
+    return SimModel(
+        model=model,
+        steps_per_tick=blueprint.steps_per_tick,
+        first_link_body=first_link_body,
+        obstacle_of_geom=[_obstacle_name(model.geom(i).name) for i in range(model.ngeom)],
+        feet=feet,
+        link_geoms=[model.geom(f"link_{i}").id for i in range(links)],
+        suspended=settings.suspended,
+        yielding=blueprint.yielding,
+        laws=blueprint.laws,
+    )
+
+
+def make_blueprint(config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion) -> Blueprint:
+    """Return the model of a run before it is compiled.
+
+    Raises:
+        ConfigError: the settings do not match the robot or the scene.
+    """
+    steps_per_tick = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
+    step_s = config.period_ns * 1e-9 / steps_per_tick
+    _check_contact_time(settings, step_s)
+    placed = place_obstacles(config)
+    yielding = [item for item in placed if item.yields]
+    check_yielding(yielding, config.scene.name, step_s)
+
+    # The order decides the numbers of bodies: fixed obstacles, the robot, obstacles that yield.
+    spec = mujoco.MjSpec()
+    _set_options(spec, step_s)
+    contact = contact_parameters(settings)
+    rough_ground_geoms = add_ground(spec, config.scene.ground, contact)
+    fixed = [item for item in placed if not item.yields]
+    _add_obstacles(spec, fixed, config, contact, collide=bool(yielding), step_s=step_s)
+    _add_snake(spec, config, settings, contact)
+    _add_obstacles(spec, yielding, config, contact, collide=bool(yielding), step_s=step_s)
+    _add_devices(spec, config.robot, settings, step_s, motors=motors)
+
+    # Friction and the other laws.
+    links = config.robot.chain.modules + 1
+    foot_names = [f"foot_{i}" for i in range(links + 1)]
+    friction_of = dict.fromkeys([*rough_ground_geoms, *foot_names], config.scene.ground.friction)
+    friction_of |= {geom_name(item): item.friction for item in placed}
+    friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
+    for geom in spec.geoms:
+        geom.friction[0] = friction_of.get(geom.name, 0.0)
+    add_laws(spec, laws, links, [geom_name(item) for item in yielding])
+    return Blueprint(spec, steps_per_tick, yielding, laws)
+
+
+def _check_contact_time(settings: SimSettings, step_s: float) -> None:
+    """Raise ConfigError if contacts would be too stiff for the physics step."""
+    if settings.contact_time_s < 2 * step_s:
+        raise ConfigError(
+            f"`contact_time_s` = {settings.contact_time_s} s must be at least two physics steps, here "
+            f"{2 * step_s:g} s; raise it or lower `timestep_s`",
+            code="config/out-of-range",
+        )
+
+
+def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = step_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # damping of the joints is integrated implicitly
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake than the sparse one
+    # A diverged run is reported, not silently restarted. One snake is one constraint island.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
+
+
+def _add_obstacles(
+    spec: mujoco.MjSpec,
+    placed: list[Placed],
+    config: RunConfig,
+    contact: ContactParameters,
+    *,
+    collide: bool,
+    step_s: float,
+) -> None:
+    """Add obstacles to the model. collide: obstacles also collide with each other, because some of them move."""
+    hills_m = 0.0
+    if config.scene.ground.heightfield is not None:
+        hills_m = config.scene.ground.heightfield.height_m
+    for item in placed:
+        add_obstacle(
+            spec,
+            item,
+            contact,
+            body_radius_m=config.robot.module.radius_m,
+            hills_m=hills_m,
+            collide=collide,
+            step_s=step_s,
+        )
+
+
+def _add_devices(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, step_s: float, *, motors: bool) -> None:
+    """Add motors, IMUs and the tether to a model whose links are complete."""
+    if motors:
+        check_gains(robot)
+        for joint in robot.joint_table:
+            add_motor(spec, joint, robot.module, step_s)
+    if robot.sensors.imu is not None:
+        add_imus(spec, robot.link_lengths_m)
+    if settings.tether is not None:
+        add_tether(spec, settings.tether, robot, settings.contact_time_s)
+
+
+def _compile(spec: mujoco.MjSpec, robot_name: str) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ConfigError(
+            f"MuJoCo cannot build robot {robot_name!r} in this scene: {error}", code="simulator/cannot-build"
+        ) from error
+
+
+def _obstacle_name(name: str) -> str | None:
+    """Return the scene's name of the obstacle with this geom; None for geoms of other things."""
+    if name.startswith(OBSTACLE):
+        return name.removeprefix(OBSTACLE)
+    return None
+
+
+def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, contact: ContactParameters) -> None:
+    """Add the links, joints and feet.
+
+    Links are capsules. Flat ground carries them at their feet, which are spheres at joints and ends: at a joint, two
+    capsules would make two contacts.
+    """
+    robot = config.robot
+    is_flat = config.scene.ground.heightfield is None
+    lengths_m = robot.link_lengths_m
+    radius_m = robot.module.radius_m
+    body = spec.worldbody
+    for i, (length_m, mass_kg) in enumerate(zip(lengths_m, robot.link_masses_kg, strict=True)):
+        if i == 0:
+            body = body.add_body(name="link_0", pos=[0.0, 0.0, radius_m])
+            _add_free_joint(body, suspended=settings.suspended)
+        else:
+            body = body.add_body(name=f"link_{i}", pos=[lengths_m[i - 1], 0.0, 0.0])
+            _add_joint(body, robot.joint_table[i - 1])
+        if robot.links and robot.links[i].has_inertia:
+            _set_inertia(body, robot.links[i], radius_m, settings.mass_scale)
+        body.add_geom(
+            name=f"link_{i}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=[radius_m, 0.0, 0.0],
+            fromto=[0.0, 0.0, 0.0, length_m, 0.0, 0.0],
+            mass=mass_kg * settings.mass_scale,
+            rgba=ORANGE,
+            **contact,
+        )
+        _add_foot(body, f"foot_{i}", 0.0, radius_m, stands=is_flat)
+    _add_foot(body, f"foot_{len(lengths_m)}", lengths_m[-1], radius_m, stands=is_flat)
+    _exclude_near_links(spec, robot)
+
+
+def _add_free_joint(body: mujoco.MjsBody, *, suspended: bool) -> None:
+    """Add the joint of the base. A suspended robot is clamped there, by inertia and damping."""
+    if suspended:
+        body.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_FREE, armature=CLAMP_INERTIA, damping=CLAMP_DAMPING)
+    else:
+        body.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_FREE)
+
+
+def _add_joint(body: mujoco.MjsBody, joint: Joint) -> None:
+    motor = joint.motor
+    body.add_joint(
+        name=joint.name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=AXES[joint.axis],
+        limited=True,
+        range=[joint.limits.lower_rad, joint.limits.upper_rad],
+        armature=motor.armature_kg_m2,
+        damping=motor.viscous_nm_s_per_rad,
+        frictionloss=motor.friction_nm,
+    )
+
+
+def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float, scale: float) -> None:
+    """Give a link the mass and inertia of the robot file, in place of the capsule's."""
+    body.explicitinertial = True
+    body.mass = scale * link.mass_kg
+    body.ipos = list(link.center)
+    body.fullinertia = [scale * value for value in link.inertia(radius_m)]
+
+
+def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, stands: bool) -> None:
+    """Add a massless sphere of the body's radius, at a joint or an end. MuJoCo finds no contacts of it.
+
+    Args:
+        body: the link's body.
+        name: the geom's name.
+        along_m: distance from the link's rear joint.
+        radius_m: radius of the body.
+        stands: flat ground carries the foot.
+    """
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[radius_m, 0.0, 0.0],
+        pos=[along_m, 0.0, 0.0],
+        mass=0.0,
+        contype=0,
+        conaffinity=0,
+        group=FOOT_GROUP,
+        userdata=[FOOT if stands else 0.0],
+    )
+
+
+def _exclude_near_links(spec: mujoco.MjSpec, robot: RobotFile) -> None:
+    """Exclude contacts between links that have only short links between them and would touch in a straight snake."""
+    lengths_m = robot.link_lengths_m
+    for i in range(len(lengths_m)):
+        for j in range(i + 2, len(lengths_m)):
+            gap_m = math.fsum(lengths_m[i + 1 : j])
+            if gap_m < MIN_GAP_RADII * robot.module.radius_m:
+                spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")

@@ -1,0 +1,66 @@
+"""The ground as MuJoCo has it: a plane, or a height field of smooth random hills."""
+
+import mujoco
+
+from snakesim_hal.model.scene import Ground, Heightfield
+from snakesim_hal.physics.hills import make_heights
+from snakesim_sim_backend.model.surface import ContactParameters
+
+GROUND = "ground"  # name of the plane's geom
+HILLS = "hills"  # name of the height field and of its geom
+GROUND_GROUP = 1  # MuJoCo geom group of everything that the snake may lie on, including steps
+PLANE_GROUP = 4  # of the plane: where rays hit it is computed without MuJoCo, see sensors/rays.py
+SAND = [0.76, 0.70, 0.58, 1.0]  # color
+DEPTH_M = 0.5  # of the height field below its lowest point
+
+
+def add_ground(spec: mujoco.MjSpec, ground: Ground, contact: ContactParameters) -> list[str]:
+    """Add the ground to a model.
+
+    Returns:
+        The names of the geoms of which MuJoCo finds contacts; none for flat ground, see flat_ground.py.
+    """
+    if ground.heightfield is None:
+        plane = _add_plane(spec, height_m=0.0)
+        plane.contype = 0
+        plane.conaffinity = 0
+        return []
+    lowest_m = -ground.heightfield.height_m / 2
+    plane = _add_plane(spec, height_m=lowest_m)  # it catches what leaves the hills
+    plane.condim = contact["condim"]
+    plane.solref = contact["solref"]
+    plane.solimp = contact["solimp"]
+    _add_hills(spec, ground.heightfield, lowest_m, contact)
+    return [GROUND, HILLS]
+
+
+def _add_plane(spec: mujoco.MjSpec, height_m: float) -> mujoco.MjsGeom:
+    return spec.worldbody.add_geom(
+        name=GROUND,
+        group=PLANE_GROUP,
+        rgba=SAND,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        pos=[0, 0, height_m],
+    )
+
+
+def _add_hills(spec: mujoco.MjSpec, field: Heightfield, lowest_m: float, contact: ContactParameters) -> None:
+    heights_m = make_heights(field)
+    rows = len(heights_m)
+    spec.add_hfield(
+        name=HILLS,
+        nrow=rows,
+        ncol=rows,
+        size=[field.area_m / 2, field.area_m / 2, field.height_m, DEPTH_M],
+        userdata=((heights_m - lowest_m) / field.height_m).ravel().tolist(),
+    )
+    spec.worldbody.add_geom(
+        name=HILLS,
+        group=GROUND_GROUP,
+        rgba=SAND,
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=HILLS,
+        pos=[0, 0, lowest_m],
+        **contact,
+    )

@@ -1,0 +1,107 @@
+"""Puts the snake on the ground at the scenario's start pose, and lets it come to rest before the run begins."""
+
+import math
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.scenario import RunConfig, StartPose, find_start_pose
+from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, of_joints
+from snakesim_sim_backend.model.ground import GROUND_GROUP, PLANE_GROUP
+from snakesim_sim_backend.physics import Physics
+
+REST_SPEED = 1e-3  # m/s and rad/s: slower is at rest
+ROUNDS_AT_REST = 5  # in a row, until the snake has come to rest
+ROUND_S = 0.01
+CLEARANCE_M = 0.2  # below the head of a suspended robot
+RAY_START_M = 100.0  # height from which rays look for the ground
+RAYS_ALONG = 7  # rays along a link, for each of three across it
+SETTLING_FRICTION = 2.0  # so that the snake stays in place while it comes to rest
+HEAD_DOWN = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]  # quaternion wxyz: a quarter revolution about y
+
+
+def place_robot(
+    sim: SimModel, data: mujoco.MjData, physics: Physics, config: RunConfig, motors: Motors, settle_s: float
+) -> None:
+    """Put the snake at its start pose, at rest at time 0 with motors off; suspended, its head is below its tail.
+
+    It is placed above the highest ground under it and falls, while the motors hold its start angles. If it has not
+    come to rest after `settle_s`, it is stopped.
+    """
+    model = sim.model
+    pose = find_start_pose(config)
+    data.qpos[:2] = pose.position_w
+    data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
+    angles_rad, _ = of_joints(data, motors.count)
+    angles_rad[:] = pose.angles_rad
+    data.qpos[2] = highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
+    if sim.suspended:
+        data.qpos[2] += config.robot.length_m + CLEARANCE_M
+        yaw = np.array(quaternion_from_yaw(pose.yaw_rad))
+        mujoco.mju_mulQuat(data.qpos[3:FREE_QPOS], yaw, np.array(HEAD_DOWN))
+    physics.begin()
+    _settle(model, data, physics, config, motors, pose, settle_s)
+
+    # The run begins without motion, and without anything that MuJoCo remembers of settling.
+    data.qvel[:] = 0.0
+    data.act[:] = 0.0
+    data.qacc_warmstart[:] = 0.0
+    data.time = 0.0
+    data.warning.number[:] = 0
+    motors.switch_off()
+    physics.begin()
+
+
+def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, pose: StartPose) -> float:
+    """Return the height of the highest ground or step under the snake's outline, found by rays from above."""
+    mujoco.mj_kinematics(model, data)
+    robot = config.robot
+    radius_m = robot.module.radius_m
+    rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
+    origins_w, rotations = link_frames(
+        (*pose.position_w, 0.0), rotation, pose.angles_rad, robot.axes, robot.link_lengths_m
+    )
+    ground_groups = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
+    ground_groups[[GROUND_GROUP, PLANE_GROUP]] = 1
+    down_w = np.array([0.0, 0.0, -1.0])
+    hit_geom = np.zeros(1, dtype=np.int32)
+    highest_m = -np.inf
+    for origin_w, link_rotation, length_m in zip(origins_w, rotations, robot.link_lengths_m, strict=True):
+        for along_m in np.linspace(-radius_m, length_m + radius_m, RAYS_ALONG):
+            for across_m in (-radius_m, 0.0, radius_m):
+                point_w = origin_w + along_m * link_rotation[:, 0] + across_m * link_rotation[:, 1]
+                point_w[2] = RAY_START_M
+                distance_m = mujoco.mj_ray(model, data, point_w, down_w, ground_groups, 1, -1, hit_geom)
+                highest_m = max(highest_m, RAY_START_M - distance_m)
+    return float(highest_m)
+
+
+def _settle(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    physics: Physics,
+    config: RunConfig,
+    motors: Motors,
+    pose: StartPose,
+    settle_s: float,
+) -> None:
+    """Let the snake fall and come to rest, with its motors holding the start angles."""
+    modes = [Mode.POSITION] * motors.count
+    limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
+    motors.drive(modes, pose.angles_rad.tolist(), limits_nm)
+    physics.set_min_friction(SETTLING_FRICTION)
+    steps = max(round(ROUND_S / model.opt.timestep), 1)
+    rounds = round(settle_s / (steps * model.opt.timestep))
+    rounds_at_rest = 0
+    for _ in range(rounds):
+        physics.step(steps)
+        if np.abs(data.qvel).max() < REST_SPEED:
+            rounds_at_rest += 1
+        else:
+            rounds_at_rest = 0
+        if rounds_at_rest == ROUNDS_AT_REST:
+            break
+    physics.set_min_friction(0.0)

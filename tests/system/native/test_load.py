@@ -1,0 +1,121 @@
+"""Which library is loaded, and what happens without one."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_native import compile as native_compile
+from snakesim_native import libraries, load
+from snakesim_native.libraries import NativeLibrary
+
+SOURCE = "int three(void);\nint three(void) { return %d; }\n"
+NUMBERS = NativeLibrary(name="numbers", uses_mujoco=False, python_cost="counting takes longer")
+
+
+@pytest.fixture(autouse=True)
+def small_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Make a package of one library, and a user's cache."""
+    package = tmp_path / "package"
+    (package / "numbers").mkdir(parents=True)
+    (package / "numbers" / "three.c").write_text(SOURCE % 3)
+    monkeypatch.setattr(libraries, "PACKAGE", package)
+    for module in (native_compile, load):
+        monkeypatch.setattr(module, "SHIPPED_FOLDER", package / "compiled")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("SNAKESIM_NATIVE", raising=False)
+    load._load.cache_clear()
+    yield package
+    load._load.cache_clear()
+
+
+def load_again() -> load.Loaded:
+    load._load.cache_clear()
+    return load.load(NUMBERS)
+
+
+@pytest.fixture
+def compiler() -> None:
+    if not native_compile.list_compilers():
+        pytest.skip("this computer has no C compiler")
+
+
+@pytest.mark.usefixtures("compiler")
+def test_a_library_is_compiled_when_it_is_first_needed(small_package: Path) -> None:
+    loaded = load_again()
+    assert loaded.handle is not None, loaded.problem
+    assert loaded.handle.three() == 3
+    assert loaded.path is not None
+    assert loaded.path.parent == small_package / "compiled"
+
+
+@pytest.mark.usefixtures("compiler")
+def test_a_changed_source_is_compiled_again_and_the_older_build_removed(small_package: Path) -> None:
+    old = load_again()
+    (small_package / "numbers" / "three.c").write_text(SOURCE % 4)
+    new = load_again()
+    assert new.handle is not None
+    assert new.handle.three() == 4
+    assert new.path != old.path
+    assert list((small_package / "compiled").iterdir()) == [new.path]
+
+
+@pytest.mark.usefixtures("compiler")
+def test_a_file_of_other_sources_under_the_expected_name_is_not_used(small_package: Path) -> None:
+    old = load_again().path
+    assert old is not None
+    (small_package / "numbers" / "three.c").write_text(SOURCE % 4)
+    key = libraries.compute_build_key(NUMBERS, "")
+    old.rename(old.with_name(libraries.make_file_name(NUMBERS, key)))
+    loaded = load_again()
+    assert loaded.handle is None
+    assert "was compiled from other sources" in loaded.problem
+
+
+@pytest.mark.usefixtures("compiler")
+def test_a_read_only_package_uses_the_cache_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(load, "_is_writable", lambda _folder: False)
+    loaded = load_again()
+    assert loaded.handle is not None, loaded.problem
+    assert loaded.path is not None
+    assert loaded.path.is_relative_to(tmp_path / "cache")
+
+
+@pytest.mark.usefixtures("compiler")
+def test_two_processes_may_compile_at_the_same_time(tmp_path: Path) -> None:
+    program = (
+        "from snakesim_native.compile import compile_library; from snakesim_native.libraries import LAWS; "
+        "from pathlib import Path; import sys; compile_library(LAWS, Path(sys.argv[1]))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "both")]
+    processes = [subprocess.Popen(command) for _ in range(2)]
+    assert [process.wait(60) for process in processes] == [0, 0]
+    assert len(list((tmp_path / "both").iterdir())) == 1
+
+
+def test_no_compiler_is_a_reason_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native_compile, "list_compilers", lambda _target=None: [])
+    loaded = load_again()
+    assert loaded.handle is None
+    assert loaded.problem == native_compile.NO_COMPILER
+
+
+def test_a_source_that_no_compiler_accepts_is_a_reason_and_no_error(small_package: Path) -> None:
+    (small_package / "numbers" / "three.c").write_text("int three(")
+    assert load_again().problem
+
+
+def test_the_environment_variable_selects_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SNAKESIM_NATIVE", "off")
+    assert load_again().problem == "the environment variable SNAKESIM_NATIVE is `off`"
+
+
+def test_installation_succeeds_without_a_compiler_and_states_the_cost(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(native_compile, "LIBRARIES", (NUMBERS,))
+    monkeypatch.setattr(native_compile, "list_compilers", lambda _target=None: [])
+    assert native_compile.main() == 0
+    assert capsys.readouterr().out.count("\n") == 1

@@ -1,0 +1,190 @@
+"""The path search in C gives the paths of its specification in Python, to the last bit."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.geometry.planar import space_evenly
+from snakesim_gnc.navigation import native_growth
+from snakesim_gnc.navigation.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.native_growth import NativeGrowth, NativeGrowthError, is_native_available
+from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
+from snakesim_gnc.navigation.path_growth import SearchedPath, SearchTask, SpecifiedGrowth
+from snakesim_gnc.navigation.search_nodes import NodeLayer, make_start_nodes
+from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.messages import Obstacle
+from snakesim_native import load
+
+BODY_M = 1.0
+BODY_ARCS = 20
+SEARCH = SearchParameters(
+    body_length_m=BODY_M, radius_m=0.04, segment_m=0.11, kept_nodes=60, unused_tail_m=0.05, unused_head_m=0.05
+)
+needs_library = pytest.mark.skipif(not is_native_available(), reason="the C library cannot be compiled here")
+
+
+def make_body(random: np.random.Generator) -> Floats:
+    """Return a curve (n, 2) that undulates along x, from tail to head, and ends at the origin."""
+    x = np.linspace(-0.9, 0.0, 91)
+    y = random.uniform(0.0, 0.08) * np.sin(2 * np.pi * x / 0.8 + random.uniform(0.0, 6.0))
+    return space_evenly(np.column_stack([x, y - y[-1]]))
+
+
+def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[Obstacle]:
+    """Return cylinders and turned boxes on an irregular lattice, some of which touch the body's sides."""
+    spacing_m = random.uniform(0.18, 0.35)
+    columns = np.arange(-1.2, 1.8, spacing_m)
+    rows = np.arange(-0.8, 0.8, spacing_m)
+    obstacles: list[Obstacle] = []
+    for x, y in np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2) + random.uniform(0.0, 0.1, 2):
+        place_w = np.array([x, y]) + random.uniform(-0.2, 0.2, 2) * spacing_m
+        radius_m = float(random.uniform(0.02, 0.05))
+        if np.hypot(*(body_w - place_w).T).min() < 1.3 * radius_m + 0.045:
+            continue
+        obstacle = Obstacle(
+            name=f"obstacle{len(obstacles)}",
+            shape="box" if random.random() < 0.4 else "cylinder",
+            position_w=(float(place_w[0]), float(place_w[1]), 0.1),
+            radius_m=radius_m,
+            half_size_m=(radius_m, 0.7 * radius_m, 0.1),
+            yaw_rad=float(random.uniform(-3.0, 3.0)),
+            height_m=0.2,
+        )
+        obstacles.append(obstacle)
+    return obstacles
+
+
+def finish(search: PathSearch) -> tuple[list[int], SearchedPath | None]:
+    """Return the nodes of each step of a search, and its path."""
+    nodes: list[int] = []
+    while True:
+        try:
+            nodes.append(next(search))
+        except StopIteration as done:
+            return nodes, done.value
+
+
+def assert_equal_bits(
+    first: tuple[list[int], SearchedPath | None], second: tuple[list[int], SearchedPath | None]
+) -> None:
+    assert first[0] == second[0]
+    one, other = first[1], second[1]
+    if one is None or other is None:
+        assert one is other
+        return
+    assert one.points_w.tobytes() == other.points_w.tobytes()
+    assert one.margins_n.tobytes() == other.margins_n.tobytes()
+    assert one.cost_m == other.cost_m
+
+
+@needs_library
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("kind", ["ahead", "whole body", "whole body beside failed paths"])
+def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    body_w = make_body(random)
+    obstacles = make_obstacles(random, body_w)
+    parameters = replace(
+        SEARCH,
+        kept_nodes=int(random.choice([20, 60, 150])),
+        kept_per_wide_cell=int(random.choice([1, 6])),
+        assumed_obstacle_friction=float(random.choice([0.0, 0.3])),
+    )
+    goal_rad = float(random.uniform(-1.2, 1.2))
+    failed_w = np.concatenate([body_w[::3] + random.normal(0.0, 0.02, 2) for _ in range(3)])
+    found: list[tuple[list[int], SearchedPath | None]] = []
+    for growth in (SpecifiedGrowth, NativeGrowth):
+        beam = BeamSearch(ObstacleGrid(obstacles), parameters, growth)
+        if kind == "ahead":
+            search = beam.search_ahead(body_w, goal_rad, 30)
+        elif kind == "whole body":
+            search = beam.search_whole_body(body_w, goal_rad, 15, 0.07)
+        else:
+            search = beam.search_whole_body(body_w, goal_rad, 15, 0.07, failed_w)
+        found.append(finish(search))
+    assert_equal_bits(found[0], found[1])
+
+
+@needs_library
+@pytest.mark.parametrize("kept_nodes", [2, 7, 20])
+def test_of_paths_that_cost_the_same_both_keep_the_same(kept_nodes: int) -> None:
+    """Without obstacles, progress and curvature in the cost, all paths cost the same."""
+    body_w = np.column_stack([np.linspace(-1.0, 0.0, 101), np.zeros(101)])
+    parameters = replace(SEARCH, kept_nodes=kept_nodes, progress_reward=0.0, curvature_change_cost_m=0.0)
+    found = [
+        finish(BeamSearch(ObstacleGrid([]), parameters, growth).search_ahead(body_w, 0.3, 10))
+        for growth in (SpecifiedGrowth, NativeGrowth)
+    ]
+    assert_equal_bits(found[0], found[1])
+
+
+@needs_library
+def test_the_random_scenes_reach_what_they_are_to_compare() -> None:
+    """Paths that are long, that end early, that push and that cannot push: otherwise equal paths would show nothing."""
+    paths: list[SearchedPath] = []
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        body_w = make_body(random)
+        obstacles = make_obstacles(random, body_w)
+        _, path = finish(BeamSearch(ObstacleGrid(obstacles), SEARCH).search_ahead(body_w, 0.0, 30))
+        if path is not None:
+            paths.append(path)
+    assert max(len(path.points_w) for path in paths) == 31
+    margins_n = np.concatenate([path.margins_n for path in paths])
+    assert (margins_n == 0.0).any()
+    assert (margins_n > SEARCH.wanted_margin_n).any()
+    assert ((margins_n > 0.0) & (margins_n < SEARCH.wanted_margin_n)).any()
+
+
+def make_task(lying_drag_m: Floats) -> SearchTask:
+    return SearchTask(origin_w=np.zeros(2), goal_rad=0.0, goal_w=np.array([1.0, 0.0]), lying_drag_m=lying_drag_m)
+
+
+def start_layer() -> NodeLayer:
+    return make_start_nodes(np.zeros((1, 2)), np.zeros(1))
+
+
+@needs_library
+def test_an_array_of_a_wrong_size_is_named() -> None:
+    task = make_task(lying_drag_m=np.zeros((BODY_ARCS - 1, 3)))
+    message = r"the drag of the lying body has the shape \(19, 3\), the C library of the planner expects \(20, 3\)"
+    with pytest.raises(NativeGrowthError, match=message):
+        NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=5)
+
+
+@needs_library
+def test_no_more_layers_than_there_is_room_for() -> None:
+    task = make_task(lying_drag_m=np.zeros((BODY_ARCS, 3)))
+    paths = NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)
+    assert paths.trace_cheapest() is None
+    assert paths.grow()
+    assert paths.grow()
+    with pytest.raises(NativeGrowthError, match="have 2 arcs already"):
+        paths.grow()
+    path = paths.trace_cheapest()
+    assert path is not None
+    assert len(path.points_w) == 3
+
+
+@pytest.fixture
+def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Switch the C libraries off."""
+    monkeypatch.setenv(load.SWITCH, load.OFF)
+    native_growth.load_library.cache_clear()
+    yield
+    native_growth.load_library.cache_clear()
+
+
+@pytest.mark.usefixtures("no_library")
+def test_without_the_library_the_specification_plans() -> None:
+    assert not is_native_available()
+    body_w = make_body(np.random.default_rng(0))
+    nodes, path = finish(BeamSearch(ObstacleGrid([]), SEARCH).search_ahead(body_w, 0.0, 3))
+    assert nodes[0] == 1
+    assert path is not None
+    task = make_task(lying_drag_m=np.zeros((BODY_ARCS, 3)))
+    with pytest.raises(NativeGrowthError, match="SNAKESIM_NATIVE"):
+        NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)

@@ -1,0 +1,172 @@
+"""The two versions of the laws compute the same bits: the C version and the Python version, which is its specification.
+
+Each of many random states is given to both: the snake bent, lifted, pressed into the ground and into obstacles, in
+motion, with springs under the feet, contacts that rub, and obstacles that have moved.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_native.libraries import LAWS
+from snakesim_native.load import load
+from snakesim_sim_backend.laws.version import LawsVersion
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.sim.simulator_rig import make_config
+
+STATES = 100  # in each scene
+MANY_STATES = 2000  # in each scene: ten thousand together
+STEPS_PER_STATE = 2  # the second begins with the memory that the first has left
+
+PEGS = [
+    {"name": f"peg{i}", "position_m": [0.25 * i - 0.2, 0.12 * (-1) ** i], "radius_m": 0.05, "friction": 0.4}
+    for i in range(6)
+]
+MOVING = [
+    {"name": "post", "position_m": [0.3, 0.1], "size_m": [0.1, 0.1, 0.2], "friction": 0.3, "stiffness_n_per_m": 300.0},
+    {"name": "block", "position_m": [0.6, -0.1], "size_m": [0.2, 0.1, 0.2], "friction": 0.5, "mass_kg": 0.4},
+    {
+        "name": "both",
+        "position_m": [0.9, 0.1],
+        "size_m": [0.1, 0.1, 0.2],
+        "friction": 0.2,
+        "mass_kg": 0.3,
+        "stiffness_n_per_m": 200.0,
+    },
+]
+SCENES: dict[str, dict[str, Any]] = {
+    "flat ground": {"ground": {"friction": 0.2}},
+    "pegs": {"ground": {"friction": 0.1}, "cylinder": PEGS},
+    "one obstacle that moves": {"ground": {"friction": 0.3}, "box": MOVING[:1]},
+    "obstacles that move": {"ground": {"friction": 0.3}, "box": MOVING, "cylinder": PEGS[:2]},
+    "hills": {"ground": {"friction": 0.3, "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0}}},
+}
+
+
+class Simulation:
+    """One version of the laws in a scene."""
+
+    def __init__(self, config: RunConfig, laws: LawsVersion) -> None:
+        self.sim: SimModel = build(config, SimSettings(), laws=laws)
+        self.model = self.sim.model
+        self.data = mujoco.MjData(self.model)
+        self.physics = Physics(self.sim, self.data)
+
+    def go(self, state: "State", min_friction: float) -> list[Floats]:
+        """Begin at a state, and step. Returns everything that the laws compute."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = state.positions
+        self.data.qvel[:] = state.velocities
+        self.physics.set_min_friction(min_friction)
+        self.physics.begin()
+        results = self._list_results()
+        for _ in range(STEPS_PER_STATE):
+            self.data.qfrc_applied[:] = state.forces
+            self.physics.step(1)
+            results += self._list_results()
+        return results
+
+    def _list_results(self) -> list[Floats]:
+        contacts = self.physics.contacts
+        forces_w = contacts.friction_force_w
+        feet = self.physics.laws.foot_forces_n
+        return [
+            self.data.qfrc_passive.copy(),
+            self.data.qpos.copy(),
+            self.data.qvel.copy(),
+            np.array(contacts.normal_force_n),
+            np.array([[number, *forces_w[number]] for number in sorted(forces_w)]),
+            np.zeros(0) if feet is None else feet.copy(),
+        ]
+
+
+class State:
+    """A random state of a model."""
+
+    def __init__(self, model: mujoco.MjModel, random: np.random.Generator) -> None:
+        speed = 10.0 ** random.uniform(-3, 0.7)
+        self.positions = model.qpos0.copy()
+        self.positions[FREE_QPOS:] = random.normal(0.0, 0.3, model.nq - FREE_QPOS)
+        # Obstacles, whose three coordinates come last, move by centimeters.
+        joints = model.nq - FREE_QPOS - count_obstacle_dofs(model)
+        self.positions[FREE_QPOS + joints :] *= 0.1
+        self.positions[:2] += random.normal(0.0, 0.1, 2)
+        self.positions[2] += random.uniform(-0.002, 0.001)
+        tilt = random.normal(0.0, 0.02, 4)
+        self.positions[3:FREE_QPOS] = np.array([1.0, 0.0, 0.0, 0.0]) + tilt
+        self.positions[3:FREE_QPOS] /= np.linalg.norm(self.positions[3:FREE_QPOS])
+        self.velocities = random.normal(0.0, speed, model.nv)
+        self.forces = random.normal(0.0, 0.5, model.nv)
+        self.forces[:FREE_DOFS] = 0.0
+
+
+def count_obstacle_dofs(model: mujoco.MjModel) -> int:
+    """Return how many degrees of freedom the obstacles have."""
+    slides = (model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)).sum()
+    return int(slides) // 2 * 3
+
+
+@pytest.fixture(autouse=True)
+def library() -> None:
+    """Skip the test where there is no C version."""
+    loaded = load(LAWS)
+    if loaded.handle is None:
+        pytest.skip(loaded.problem)
+
+
+@pytest.mark.parametrize("scene", list(SCENES))
+def test_the_c_version_computes_the_bits_of_the_python_version(scene: str) -> None:
+    compare(scene, STATES)
+
+
+@pytest.mark.slow  # a hundred states: the test before this one
+@pytest.mark.parametrize("scene", list(SCENES))
+def test_it_computes_them_in_ten_thousand_states(scene: str) -> None:
+    compare(scene, MANY_STATES)
+
+
+def compare(scene: str, states: int) -> None:
+    """Give random states to both versions, and compare all that they compute."""
+    config = make_config(scene=SCENES[scene])
+    specification = Simulation(config, "python")
+    plugin = Simulation(config, "c")
+    random = np.random.default_rng(7)
+    rubbing = 0
+    for number in range(states):
+        state = State(specification.model, random)
+        min_friction = float(random.choice([0.0, 0.0, 2.0]))
+        expected = specification.go(state, min_friction)
+        computed = plugin.go(state, min_friction)
+        rubbing += len(specification.physics.contacts.friction_force_w)
+        for wanted, got in zip(expected, computed, strict=True):
+            assert wanted.tobytes() == got.tobytes(), f"state {number}: {wanted - got}"
+    if scene != "flat ground":
+        assert rubbing > states / 10, "too few states have contacts with friction"
+
+
+def test_forces_may_be_computed_any_number_of_times_without_changing_the_next_step() -> None:
+    config = make_config(scene=SCENES["obstacles that move"])
+    watched = Simulation(config, "c")
+    undisturbed = Simulation(config, "c")
+    state = State(watched.model, np.random.default_rng(3))
+    for simulation in (watched, undisturbed):
+        simulation.go(state, 0.0)
+    for _ in range(3):
+        mujoco.mj_forward(watched.model, watched.data)
+    for simulation in (watched, undisturbed):
+        simulation.physics.step(5)
+    assert watched.data.qpos.tobytes() == undisturbed.data.qpos.tobytes()
+
+
+def test_a_plain_mujoco_program_begins_with_feet_that_stick_where_they_are() -> None:
+    simulation = Simulation(make_config(scene=SCENES["flat ground"]), "c")
+    simulation.data.qpos[:2] = 3.0, -2.0
+    simulation.data.qpos[2] = 0.99 * simulation.data.qpos[2]
+    mujoco.mj_step(simulation.model, simulation.data)
+    assert np.abs(simulation.data.qvel[:2]).max() < 1e-6

@@ -1,0 +1,80 @@
+"""Streams that stop, clocks that step, and a simulator that is slow or diverges."""
+
+from snakesim_hal.wire import keys
+from verification.faults.row import Heading, Row
+from verification.faults.rows import guest, simulator, streams
+from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS, both, stream_row
+
+STREAM_STOPS = Heading(
+    fault="a stream that control acts on stops: of a sensor, of guidance, of navigation",
+    expected="without joint states: safe stop; without another: the controller holds, and continues when it is back",
+    deadline="joints: 30 ms and the lease; others: their `max_age`",
+    rows=(
+        Row(
+            name="stream_joints",
+            fault="sensor/joints: all of it is lost",
+            expected="no command on a state that is too old: safe stop by the lease, lease freed, fault latched",
+            deadline="30 ms that a state may be old, the lease (50 ms), and a tick (10 ms) of injector, control and "
+            "host",
+            limit=30.0 + LEASE_MS + 3 * PERIOD_MS,
+            unit="ms",
+            measures=both(streams.no_joints),
+        ),
+        stream_row("stream_pose", keys.POSE, 240.0),
+        stream_row("stream_contacts", keys.CONTACTS, 240.0),
+        stream_row("stream_world", keys.WORLD, 220.0),
+        stream_row("stream_trajectory", keys.TRAJECTORY, 840.0),
+    ),
+)
+
+WALL_CLOCK_STEPS = Heading(
+    fault="wall clock steps by an hour either way",
+    expected="nothing",
+    deadline="-",
+    rows=(
+        Row(
+            name="clock_step",
+            fault="the wall clock goes an hour ahead, and back",
+            expected="nothing: no fault, no lease missed",
+            deadline="-",
+            limit=0.0,
+            unit="faults and stops",
+            measures=both(guest.clock_step),
+            environment="guest",
+        ),
+    ),
+)
+
+SLOW_SIMULATOR = Heading(
+    fault="simulator slower than real time in lockstep (0.1x)",
+    expected="no false stop",
+    deadline="-",
+    rows=(
+        Row(
+            name="slow_simulator",
+            fault="the simulator runs at a tenth of real time, in lockstep",
+            expected="no stop, no fault: leases count in simulated time",
+            deadline="-",
+            limit=0.0,
+            unit="stops and faults",
+            measures=both(simulator.slow),
+        ),
+    ),
+)
+
+SIMULATION_DIVERGES = Heading(
+    fault="simulation diverges",
+    expected="stop, fault, last good state stays",
+    deadline="one step",
+    rows=(
+        Row(
+            name="simulation_diverges",
+            fault="the simulator's state becomes impossible",
+            expected="stop and fault in the same step; nothing that is no number is published or recorded",
+            deadline="one step",
+            limit=1.0,
+            unit="steps",
+            measures={"sim": simulator.diverges, "can": "modules on a bus are no simulation that could diverge"},
+        ),
+    ),
+)

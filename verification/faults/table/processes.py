@@ -1,0 +1,87 @@
+"""Faults of processes: the controller, the HAL host, the router, and a second run."""
+
+from verification.faults.row import Heading, Row
+from verification.faults.rows import attacks, controller, guest, network
+from verification.faults.table.row_kinds import (
+    GUEST_WATCHDOG_MS,
+    PERIOD_MS,
+    ROUTER_KILLS,
+    both,
+    lease_row,
+    watchdog_row,
+)
+
+CONTROLLER_STOPS = Heading(
+    fault="controller killed; controller frozen (SIGSTOP; busy interpreter)",
+    expected="safe stop, lease freed, latched",
+    deadline="lease",
+    rows=(
+        lease_row("controller_killed", "control: SIGKILL", controller.killed),
+        lease_row("controller_frozen", "control: SIGSTOP", controller.frozen),
+        lease_row(
+            "controller_hung",
+            "control: interpreter busy, by the injector (which takes the request at the controller's next tick)",
+            controller.suspended,
+            more_ms=PERIOD_MS,
+        ),
+    ),
+)
+
+HOST_STOPS = Heading(
+    fault="HAL host killed or frozen",
+    expected="modules' own watchdog",
+    deadline="100 ms",
+    rows=(
+        watchdog_row("host_silent", "the host sends nothing any more, at one module", guest.watchdog, 100.0),
+        watchdog_row("host_killed", "host: SIGKILL", guest.host_killed, GUEST_WATCHDOG_MS, "guest"),
+        watchdog_row("host_frozen", "host: SIGSTOP", guest.host_frozen, GUEST_WATCHDOG_MS, "guest"),
+    ),
+)
+
+ROUTER_RESTARTS = Heading(
+    fault="router dies, restarts, 50 times",
+    expected="safe stop if the stream stops; reconnects; no re-arm",
+    deadline="lease; 5 s to reconnect",
+    rows=(
+        lease_row(
+            "router_restarts",
+            "router: SIGKILL, 0.4 s later a new one",
+            network.router_restarts,
+            min_trials=ROUTER_KILLS,
+        ),
+    ),
+)
+
+SECOND_RUN = Heading(
+    fault="a second run on a robot's network, or at its endpoint",
+    expected="refuses to start; the robot stays as it is",
+    deadline="-",
+    rows=(
+        Row(
+            name="second_run",
+            fault="a person disarmed the robot; a second `snakesim run` of its name starts there",
+            expected="the second ends with an error that names the robot; nothing is armed",
+            deadline="-",
+            limit=0.0,
+            unit="setpoints not passive",
+            measures=both(attacks.second_run),
+        ),
+    ),
+)
+
+HOST_RESTARTS = Heading(
+    fault="HAL restarts while moving",
+    expected="boots disarmed; old commands void; no jump",
+    deadline="before first frame",
+    rows=(
+        Row(
+            name="host_restarts",
+            fault="host: SIGKILL while moving, started again",
+            expected="boots disarmed, refuses what was streamed before, moves nothing until armed",
+            deadline="before the first setpoints: none but passive ones until armed",
+            limit=0.0,
+            unit="setpoints not passive",
+            measures=both(controller.host_restarts),
+        ),
+    ),
+)
