@@ -73,8 +73,7 @@ def _add_settings(settings: dict[str, str], key: str, value: Any, levels: int) -
             for child_key, child in children.items():
                 _add_settings(settings, child_key, child, levels)
             return
-    is_name = isinstance(value, str) and value != ""
-    text = value if is_name else json.dumps(value, sort_keys=True)
+    text: str = value if isinstance(value, str) and value else json.dumps(value, sort_keys=True)
     settings[key] = text if len(text) <= MAX_VALUE else _hash(value)
 
 
