@@ -135,19 +135,27 @@ class ProcessEntries:
 
     def find_problems(self, own: Process, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
-        problems: list[str] = []
+        problems = [f"{process} has not published its settings yet" for process in self.unpublished(names)]
+        for entry in self._published(names).values():
+            conflict = _describe_conflict(entry, own) if entry is not None else ""
+            if conflict:
+                problems.append(conflict)
+        return problems
+
+    def unpublished(self, names: Collection[str]) -> list[str]:
+        """Return the present processes of these names that have not published their entry yet."""
+        return [keys.parse_service(key) for key, entry in self._published(names).items() if entry is None]
+
+    def _published(self, names: Collection[str]) -> dict[str, Process | None]:
+        """Return the entry of each present process of these names by its key; None: it is not published yet."""
+        published: dict[str, Process | None] = {}
         for key in sorted(self._alive.copy()):
             name = keys.parse_service(key).rpartition("-")[0]
-            if name not in names:
-                continue
-            entry = self._entries.get(key)
-            if entry is None or entry.name != name:
-                problems.append(f"{keys.parse_service(key)} has not published its settings yet")
-            else:
-                conflict = _describe_conflict(entry, own)
-                if conflict:
-                    problems.append(conflict)
-        return problems
+            if name in names:
+                entry = self._entries.get(key)
+                is_own = entry is not None and entry.name == name
+                published[key] = entry if is_own else None
+        return published
 
     def waits(self) -> dict[str, list[str]]:
         """Return the keys that each present process waits for, by its name."""
