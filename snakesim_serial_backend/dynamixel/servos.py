@@ -309,7 +309,7 @@ def _answer_finding(i: int, servo: Servo) -> Finding | None:
 def _state_finding(i: int, servo: Servo) -> Finding | None:
     """Return what has switched a servo's torque off, if anything."""
     if servo.errors:
-        cause = f"{servo.label} reports {at.error_names(servo.errors)}; a clear restarts it"
+        cause = f"{servo.label} reports {at.error_names(servo.errors)}; `snakesim robot reset` restarts it"
         return Finding("drive_fault", cause, i, alone=True)
     if servo.watchdog == at.TRIPPED:
         cause = f"{servo.label} was stopped by its bus watchdog, as it got no packet in time"
