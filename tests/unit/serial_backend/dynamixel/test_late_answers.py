@@ -57,7 +57,7 @@ class SlowBench:
         self.emulator = emulator_on(self._config, SETTINGS, [self.pty], DriverClock(self._config), None)
         self._wire = SerialWire(self.pty.path, 1_000_000)
         self.port = Port(self._wire, GAP_S)
-        self.servos = [servo_of(joint, self.port) for joint in self._config.robot.joint_table]
+        self.servos = [servo_of(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table]
         self._runs = True
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
