@@ -26,6 +26,7 @@ from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
 # A silence of this length ends an answer, whichever is longer.
 MIN_GAP_S = 0.002
 GAP_PER_PERIOD = 0.2
+EMULATED_GAP_PER_PERIOD = 0.5  # of servos in another process, which a busy computer delays
 
 UNKNOWN_CURRENT_UNIT_A = 0.00269  # of an emulated servo whose model the driver refuses
 
@@ -71,7 +72,10 @@ class DynamixelBackend(DriverTypeBackend):
                 pty = Pty()
                 emulator = emulator_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
-            port = Port(wire, gap_s)
+            port_gap_s = gap_s
+            if is_emulated(wire.port):
+                port_gap_s = max(gap_s, EMULATED_GAP_PER_PERIOD * config.period_ns * 1e-9)
+            port = Port(wire, port_gap_s)
             servos_context = ServosContext(
                 servos=[servo_of(joints[number], port, settings) for number in numbers],
                 port=port,
