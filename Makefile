@@ -27,7 +27,7 @@ packages := snakesim $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs release lock clean FORCE
+.PHONY: help setup demo compiled test test-unit test-contract test-system test-can coverage verify attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs wheels release lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -132,6 +132,9 @@ schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key sp
 docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
 	$(bin)/python docs/site/build.py
 
+wheels: $(stamp) ## Build wheels with compiled C libraries for x86-64 and aarch64, into build/wheels
+	$(bin)/python deploy/wheels.py
+
 release: $(stamp) ## Build and check what a release publishes, into build/release
 	$(bin)/python deploy/release.py $(ARGS)
 
@@ -139,7 +142,7 @@ lock: ## Resolve the lock files again (UPGRADE=1 for newer versions)
 	$(bootstrap) lock $(if $(UPGRADE),--upgrade)
 
 clean: ## Remove what setup, builds and caches left; recordings in runs/ stay
-	rm -rf .venv .tools build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .tools build dist *.egg-info snakesim_native/compiled .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Setup runs again after a change of its inputs, in a folder that was moved, when the environment's Python is gone,

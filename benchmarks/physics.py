@@ -16,6 +16,7 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_testing.hal.small_robots import clock, command
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.runs.whole_run import run as run_in_process
@@ -29,10 +30,10 @@ def load_config(*sets: str) -> RunConfig:
     return load("triplet", [parse_set(text) for text in sets]).config
 
 
-def open_simulator(config: RunConfig) -> SimBackend:
-    """Open the simulator as the host opens it."""
+def open_simulator(config: RunConfig, laws: LawsVersion | None = None) -> SimBackend:
+    """Open the simulator as the host opens it, or with a certain version of the laws."""
     settings = plugin_settings(SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim")
-    return SimBackend(config, settings)
+    return SimBackend(config, settings, laws=laws)
 
 
 class SamplePublisher:
@@ -55,8 +56,8 @@ class SamplePublisher:
 class BareSimulation:
     """Repeats a motion on the same model, by the physics alone."""
 
-    def __init__(self, config: RunConfig) -> None:
-        self._backend = open_simulator(config)
+    def __init__(self, config: RunConfig, laws: LawsVersion | None = None) -> None:
+        self._backend = open_simulator(config, laws)
 
     def measure_physics_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
         """Return the mean time of a control period over these setpoints, without the handing over of setpoints."""
@@ -73,8 +74,8 @@ class BareSimulation:
     def measure_mujoco_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
         """Return the mean time of `mj_step` for a control period, from the states of the same motion.
 
-        `mj_step` alone leaves out our ground and friction, so each period is first measured, then reset to its
-        beginning and done again with them.
+        With the Python version of the laws, `mj_step` alone leaves out ground and friction. So each period is first
+        measured, then reset to its beginning and done again with them.
         """
         model = self._backend.sim.model
         data = self._backend.data
@@ -86,8 +87,7 @@ class BareSimulation:
             self._backend.enact(tick_setpoints, "armed")
             mujoco.mj_getState(model, data, state, state_kind)
             begin_s = time.perf_counter()
-            for _ in range(steps):
-                mujoco.mj_step(model, data)
+            mujoco.mj_step(model, data, steps)
             spent_s += time.perf_counter() - begin_s
             mujoco.mj_setState(model, data, state, state_kind)
             self._backend.physics.step(steps)
@@ -117,14 +117,16 @@ class TickTimes:
 
     published_us: list[float] = field(default_factory=list[float])  # with all sensors published
     physics_us: list[float] = field(default_factory=list[float])  # of the physics alone
+    python_us: list[float] = field(default_factory=list[float])  # of the physics with the Python version of the laws
     mujoco_us: list[float] = field(default_factory=list[float])  # of `mj_step` alone
 
 
 def measure_tick_times(config: RunConfig) -> TickTimes:
-    """Measure the ticks of the same motion three times: published, physics alone, and MuJoCo alone."""
+    """Measure the ticks of the same motion: published, physics alone, with the Python laws, and MuJoCo alone."""
     full = open_simulator(config)
     physics = BareSimulation(config)
-    bare_mujoco = BareSimulation(config)
+    python = BareSimulation(config, "python")
+    bare_mujoco = BareSimulation(config, "python")
     setpoints, _ = record_motion(config)
     times = TickTimes()
     endpoint = free_endpoint()  # published messages really go over the network
@@ -143,6 +145,7 @@ def measure_tick_times(config: RunConfig) -> TickTimes:
                 full.advance()
             times.published_us.append((time.perf_counter() - begin_s) / TICKS_A_BLOCK * 1e6)
             times.physics_us.append(physics.measure_physics_us(block))
+            times.python_us.append(python.measure_physics_us(block))
             times.mujoco_us.append(bare_mujoco.measure_mujoco_us(block))
         assert all(reader.drain() for reader in readers), "a published message did not arrive"
     full.close()

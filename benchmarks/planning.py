@@ -5,13 +5,13 @@ import time
 
 from snakesim_gnc.geometry.body_on_path import chain_nodes
 from snakesim_gnc.geometry.planar import space_evenly
-from snakesim_gnc.navigation.beam import BeamSearch
-from snakesim_gnc.navigation.native_growth import NativeGrowth, is_native_available
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_growth import SpecifiedGrowth
+from snakesim_gnc.navigation.path_search.beam import BeamSearch
+from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
+from snakesim_gnc.navigation.path_search.native_library import is_native_available
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters
+from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
 from snakesim_gnc.navigation.plan import HORIZON_M
-from snakesim_gnc.navigation.search_arcs import STEP_M
-from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.scenario import find_start_pose, load, parse_set, place_obstacles

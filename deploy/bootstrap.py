@@ -18,6 +18,7 @@ VENV = ROOT / ".venv"
 VENV_PYTHON = VENV / "bin" / "python"
 STAMP = VENV / ".setup"
 UV_LOCK = Path("deploy", "bootstrap.lock")
+WHEELS_LOCK = Path("deploy", "wheels.lock")
 LOCK = Path("requirements.lock")
 
 OLDEST = (3, 11)
@@ -75,12 +76,13 @@ def set_up(requested: str) -> None:
 
 
 def lock(upgrade: bool) -> None:
-    """Resolve both lock files for every supported Python and platform, without any address in them."""
+    """Resolve the lock files for every supported Python and platform, without any address in them."""
     install_uv(find_python(""))
     resolve = (UV, *COMPILE.split(), "--custom-compile-command", "make lock", *["--upgrade"] * upgrade)
     run(*resolve, "--all-extras", "--group", "dev", "pyproject.toml", "--output-file", LOCK)
     run(*resolve, "--group", "bootstrap", "--output-file", UV_LOCK)
-    for file in (LOCK, UV_LOCK):
+    run(*resolve, "--group", "wheels", "--output-file", WHEELS_LOCK)
+    for file in (LOCK, UV_LOCK, WHEELS_LOCK):
         address = re.search(r".*(://|file:|--find-links|\s/).*", file.read_text(encoding="utf-8"))
         if address:
             sys.exit(f"lock: {file} must hold no address: {address.group().strip()}")

@@ -2,10 +2,10 @@
 
 Into `build/release/`:
 
-    dist/        the source distribution and the wheel
+    dist/        the source distribution, and a wheel for each kind of processor
     sbom.json    the software bill of materials (CycloneDX), from the hashed lock
     audit.json   the known vulnerabilities of the locked packages, as far as the vulnerability service answers
-    env/         an environment made from nothing but the wheel, in which the checks run
+    env/         an environment made from nothing but the wheel for this computer, in which the checks run
     run/         the run of the main job in that environment
 
 The exit code is 0 only if every step passed. Packages that the vulnerability service did not
@@ -13,8 +13,10 @@ judge are reported as UNKNOWN.
 """
 
 import argparse
+import importlib
 import json
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -31,6 +33,12 @@ LOCK = ROOT / "requirements.lock"
 INSTALLED_EXTRAS = "sim,record,report"  # enough for a recorded run with a report
 MAIN_JOB = ("run", "peg_row", "--controller", "obstacle_aided", "--duration", "3")
 AUDIT_TIMEOUT_S = 300
+FIND_LAWS_PROBLEM = """
+import mujoco
+from snakesim_native.libraries import LAWS
+from snakesim_native.load import load
+print(load(LAWS).problem)
+"""
 
 
 def main() -> int:
@@ -67,8 +75,12 @@ def check_version_everywhere(version: str) -> None:
 
 
 def build_distributions() -> None:
-    """Build the source distribution, and the wheel from it."""
-    run(UV, "build", "--quiet", "--no-build-isolation", "--python", BIN / "python", "--out-dir", OUT / "dist", ROOT)
+    """Build the source distribution and the wheels."""
+    sys.path.insert(0, str(ROOT))
+    wheels = importlib.import_module("deploy.wheels")
+    wheels.build_wheels(OUT / "dist")
+    options = ("--quiet", "--sdist", "--no-build-isolation", "--python", BIN / "python", "--out-dir", OUT / "dist")
+    run(UV, "build", *options, ROOT)
 
 
 def check_metadata() -> None:
@@ -78,7 +90,7 @@ def check_metadata() -> None:
 
 def install_wheel() -> None:
     """Install the wheel with its dependencies, in the locked versions, into an empty environment."""
-    wheel = next((OUT / "dist").glob("*.whl"))
+    wheel = next((OUT / "dist").glob(f"*_{platform.machine()}.whl"))
     python = OUT / "env" / "bin" / "python"
     constraints = OUT / "constraints.txt"
     constraints.write_text(read_locked_versions(), encoding="utf-8")
@@ -111,6 +123,10 @@ def run_main_job(version: str) -> None:
     printed = run(command, "--version", folder=OUT).strip()
     if printed != f"snakesim {version}":
         sys.exit(f"release: the installed command prints {printed!r} instead of 'snakesim {version}'")
+    python = OUT / "env" / "bin" / "python"
+    problem = run(python, "-c", FIND_LAWS_PROBLEM, folder=OUT).strip()
+    if problem:
+        sys.exit(f"release: the laws of the installed wheel do not run in C: {problem}")
     run(command, *MAIN_JOB, "--out", OUT / "run", folder=OUT)
     for name in ("summary.json", "report.html"):
         if not (OUT / "run" / name).is_file():

@@ -391,7 +391,7 @@ class Robot:
         if self._control is None:
             time.sleep(POLL_INTERVAL_S)
         else:
-            self._control.turn()
+            self._control.command_tick()
 
     @property
     def _clock(self) -> Clock:

@@ -75,7 +75,7 @@ def print_load(arguments: argparse.Namespace) -> int:
 
 def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: bool) -> int:
     """Print the load of every bus of a scenario. Returns the exit code."""
-    lines, all_fit = one(config, settings)
+    lines, all_fit = describe_bus_loads(config, settings)
     if as_json:
         channels = settings.channels or ["one bus"]
         buses = [
@@ -107,14 +107,14 @@ def _list_loads(
 
 
 def settings_of(loaded: Loaded) -> CanSettings:
-    """The section `backends.can` of a scenario. Raises ConfigError."""
+    """Return the section `backends.can` of a scenario. Raises ConfigError."""
     table = loaded.table
     section = Table(loaded.config.backends.get("can", {}), table.source, table.origin)
     return decode(section, CanSettings, "backends.can")
 
 
-def one(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
-    """The sum for every bus as lines, and whether all fit."""
+def describe_bus_loads(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
+    """Return the load of every bus as lines of text, and whether every bus can carry it."""
     buses, period_ms, lines = plan_buses(config, settings), 1e3 / config.rate_hz, list[str]()
     for name, bus in zip(settings.channels or ["one bus"], buses, strict=True):
         lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *explain_load(*bus)]
@@ -185,7 +185,7 @@ def list_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
 
 
 def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
-    """Discover the modules on a bus; one row a module, as text by `COLUMNS`. Sends only identify."""
+    """Discover the modules on a bus. It sends only identify. Returns a row for each module, as text by `COLUMNS`."""
     reading = ModuleReports(LAST_NODE)
     everybody = ModuleBus(wire, range(FIRST_NODE, LAST_NODE + 1))
     return [_row(identity, reading) for identity in find_modules([everybody], seconds, reading.process_frame)]
@@ -270,7 +270,7 @@ def looks(foreign: Counter[str]) -> str:
 
 
 def write_dbc(arguments: argparse.Namespace) -> int:
-    """Write the DBC file with every message of every node."""
+    """Write the DBC file with every message of every node, and return the exit code."""
     path = arguments.out or Path(EXPANDED)
     write_text(path, expanded_dbc(), encoding="cp1252")
     print_line(str(path))

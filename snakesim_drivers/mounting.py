@@ -35,19 +35,19 @@ class Mounting:
     # --- from joints to drives --------------------------------------------------------------------------------
 
     def to_drive_angle_rad(self, joint_angle_rad: Floats) -> Floats:
-        """Convert joint angles to angles of the drives' shafts."""
+        """Return the angles of the drives' shafts in rad for joint angles in rad, (n_joints,)."""
         return self.zero_rad + self._ratio * joint_angle_rad
 
     def to_drive_velocity_rad_s(self, joint_velocity_rad_s: Floats) -> Floats:
-        """Convert joint velocities to velocities of the drives' shafts."""
+        """Return the velocities of the drives' shafts in rad/s for joint velocities in rad/s, (n_joints,)."""
         return self._ratio * joint_velocity_rad_s
 
     def to_drive_torque_nm(self, joint_torque_nm: Floats) -> Floats:
-        """Convert joint torques to torques at the drives' shafts."""
+        """Return the torques at the drives' shafts in N·m for joint torques in N·m, (n_joints,)."""
         return joint_torque_nm / self._ratio
 
     def to_drive_torque_limit_nm(self, joint_limit_nm: Floats) -> Floats:
-        """Convert torque limits of joints to those at the drives' shafts. Limits have no sign."""
+        """Return the torque limits at the drives' shafts in N·m for those of joints in N·m. Limits have no sign."""
         return joint_limit_nm / self.gear
 
     def to_drive_targets(self, modes: Sequence[Mode], targets: Sequence[float]) -> Floats:
@@ -73,15 +73,15 @@ class Mounting:
     # --- from drives to joints --------------------------------------------------------------------------------
 
     def to_joint_angle_rad(self, drive_angle_rad: Floats) -> Floats:
-        """Convert angles of the drives' shafts to joint angles."""
+        """Return the joint angles in rad for angles of the drives' shafts in rad, (n_joints,)."""
         return (drive_angle_rad - self.zero_rad) / self._ratio
 
     def to_joint_velocity_rad_s(self, drive_velocity_rad_s: Floats) -> Floats:
-        """Convert velocities of the drives' shafts to joint velocities."""
+        """Return the joint velocities in rad/s for velocities of the drives' shafts in rad/s, (n_joints,)."""
         return drive_velocity_rad_s / self._ratio
 
     def to_joint_torque_nm(self, drive_torque_nm: Floats) -> Floats:
-        """Convert torques at the drives' shafts to joint torques."""
+        """Return the joint torques in N·m for torques at the drives' shafts in N·m, (n_joints,)."""
         return drive_torque_nm * self._ratio
 
 

@@ -117,6 +117,7 @@ class Controller(ABC, Generic[ParametersT]):
         class SwingParameters(snakesim.Parameters, frozen=True):
             amplitude_rad: float = 0.2
 
+
         class Swing(snakesim.Controller[SwingParameters]):
             Parameters = SwingParameters
             needs_world = False
@@ -264,7 +265,7 @@ def decode_parameters(
     return decode(Table(section, source, origin or {}), controller.Parameters, where)
 
 
-def motion_wanted(observation: Observation) -> bool:
+def is_motion_requested(observation: Observation) -> bool:
     """Return whether there is a path, a speed along it, and a world to move in; without them a controller holds."""
     return (
         observation.world is not None and observation.trajectory is not None and observation.trajectory.speed_m_s != 0.0

@@ -46,7 +46,7 @@ class Service(ABC):
 
         Args:
             client: Connection to the robot, for subscriptions and requests.
-            config: The run.
+            config: Configuration of the run, with the robot and the settings of its backend.
         """
         del client, config
 

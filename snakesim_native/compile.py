@@ -36,7 +36,7 @@ NO_COMPILER = "no C compiler was found (install gcc, or `pip install ziglang`)"
 
 
 class CannotCompileError(Exception):
-    """A library cannot be compiled here; the text says why and what to do."""
+    """A library cannot be compiled here; the text explains why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Target:
     """What a library is compiled for."""
 
     machine: str  # as `uname -m` prints it
-    libc: str  # "gnu" or "musl"
+    libc: str  # "gnu" or "musl", as zig names it; "gnu.2.28" needs no newer version
 
     @property
     def zig_name(self) -> str:
@@ -104,7 +104,8 @@ def compile_library(
     file = folder / make_file_name(library, key, machine)
     problems: list[str] = []
     for compiler in compilers:
-        problem = _run_compiler([*compiler, *extra_flags], library, key, mujoco, file)
+        command = [*compiler, *extra_flags]
+        problem = _run_compiler(command, library, key, mujoco, file, is_foreign=target is not None)
         if not problem:
             _remove_older_builds(library, machine, file)
             return file
@@ -112,29 +113,59 @@ def compile_library(
     raise CannotCompileError("; ".join(problems))
 
 
-def _run_compiler(command: list[str], library: NativeLibrary, key: str, mujoco: MujocoFiles | None, file: Path) -> str:
+def _run_compiler(
+    command: list[str],
+    library: NativeLibrary,
+    key: str,
+    mujoco: MujocoFiles | None,
+    file: Path,
+    *,
+    is_foreign: bool,
+) -> str:
     """Compile a library. Returns what is wrong; empty: nothing."""
     words = [*command, *FLAGS, f'-DSNAKESIM_BUILD_KEY="{key}"']
     words += [str(source) for source in library.list_sources()]
-    if library.uses_mujoco and mujoco is not None:
-        words += ["-isystem", str(mujoco.include_folder), str(mujoco.library)]
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=file.parent, prefix=".") as temporary:
+            if library.uses_mujoco and mujoco is not None:
+                linked = mujoco.library
+                if is_foreign:
+                    linked = _make_placeholder(command, mujoco, Path(temporary))
+                words += ["-isystem", str(mujoco.include_folder), "-Wl,--no-as-needed", str(linked)]
             compiled = Path(temporary, file.name)
-            finished = subprocess.run(
-                [*words, "-lm", "-o", str(compiled)],
-                capture_output=True,
-                text=True,
-                errors="replace",
-                check=False,
-                timeout=COMPILE_TIMEOUT_S,
-            )
-            if finished.returncode == 0:
+            problem = _call([*words, "-lm", "-o", str(compiled)])
+            if not problem:
                 compiled.replace(file)
-                return ""
-    except (OSError, subprocess.TimeoutExpired) as error:
+            return problem
+    except OSError as error:
         return str(error)
+
+
+def _make_placeholder(command: list[str], mujoco: MujocoFiles, folder: Path) -> Path:
+    """Compile an empty library with the name of MuJoCo's, and return its file.
+
+    The MuJoCo that is installed here was made for this computer. To link for another one, its name is enough.
+    """
+    source = folder / "empty.c"
+    source.write_text("")
+    file = folder / mujoco.library.name
+    problem = _call([*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)])
+    if problem:
+        raise OSError(problem)
+    return file
+
+
+def _call(words: list[str]) -> str:
+    """Run a compiler. Returns the first error that it prints; empty: it succeeded."""
+    try:
+        finished = subprocess.run(
+            words, capture_output=True, text=True, errors="replace", check=False, timeout=COMPILE_TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired as error:
+        return str(error)
+    if finished.returncode == 0:
+        return ""
     return _pick_error(finished.stderr) or f"exit code {finished.returncode}"
 
 
@@ -163,7 +194,7 @@ def compile_all(folder: Path) -> list[str]:
         try:
             compile_library(library, folder)
         except CannotCompileError as error:
-            sentences.append(f"{library.name} runs in Python: {library.python_cost}. Reason: {error}")
+            sentences.append(f"without the C library `{library.name}` {library.python_cost}: {error}")
     return sentences
 
 

@@ -20,7 +20,7 @@ class NativeLibrary:
 
     name: str  # of the folder
     uses_mujoco: bool
-    python_cost: str  # what the Python version costs, for messages
+    python_cost: str  # a clause about what the Python version costs, for messages
 
     @property
     def folder(self) -> Path:
@@ -44,7 +44,7 @@ LAWS = NativeLibrary(
 PLANNER = NativeLibrary(
     name="planner",
     uses_mujoco=False,
-    python_cost="a search of the path planner takes about eight times as long",
+    python_cost="a search of the path planner takes about seven times as long",
 )
 LIBRARIES = (LAWS, PLANNER)
 

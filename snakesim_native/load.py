@@ -90,7 +90,7 @@ def _find_cache_folder() -> Path:
 
 
 def _check_key(handle: ctypes.CDLL, path: Path, key: str) -> None:
-    """Raise OSError if a library was compiled from other sources than its name says."""
+    """Raise OSError if a library was compiled from other sources than its name stands for."""
     read_key = handle.snakesim_build_key
     read_key.restype = ctypes.c_char_p
     if read_key() != key.encode():

@@ -16,6 +16,7 @@ from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import ClockMode, Description, Fault, LifecycleState
 from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, build, of_joints
 from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
@@ -57,8 +58,13 @@ class SimBackend(Backend):
         check_backend_can(config, does=possible_faults, buses=0, because=because)
         return ("lockstep", "realtime", "free")
 
-    def __init__(self, config: RunConfig, settings: SimSettings) -> None:
+    def __init__(self, config: RunConfig, settings: SimSettings, *, laws: LawsVersion | None = None) -> None:
         """Build the scene, place the snake and let it come to rest.
+
+        Args:
+            config: the run, with its robot and its scene.
+            settings: parameters of the physics.
+            laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
 
         Raises:
             ConfigError: the settings do not match the robot or the scene.
@@ -78,7 +84,7 @@ class SimBackend(Backend):
         self._period_s = config.period_ns * 1e-9
 
         # Physics and motors, with the snake at rest.
-        self._sim = build(config, settings)
+        self._sim = build(config, settings, laws=laws)
         self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""Runs the physics tests with C libraries that check themselves: `python -m verification.sanitize`.
+"""Runs the tests of physics and planner with C libraries that check themselves: `python -m verification.sanitize`.
 
 The address sanitizer ends the program at a read or write outside of what belongs to it. The sanitizer of undefined
 behavior ends it at an integer that overflows or a pointer that is not aligned. MuJoCo's arrays lie in one block of
@@ -19,7 +19,12 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "build" / "sanitized"
 # MuJoCo's headers would replace functions by others that only a MuJoCo with sanitizers has, if they saw this macro.
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-U__SANITIZE_ADDRESS__")
-TESTS = ("tests/unit/sim_backend", "tests/system/physics", "tests/system/native")
+TESTS = (
+    "tests/unit/sim_backend",
+    "tests/unit/gnc/test_native_growth.py",
+    "tests/system/physics",
+    "tests/system/native",
+)
 LIBRARIES_TO_PRELOAD = ("libasan.so", "libubsan.so")
 
 

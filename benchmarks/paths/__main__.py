@@ -86,13 +86,13 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
 
 def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> None:
     """Arm it once, and wait for its end."""
-    asked, deadline = False, time.monotonic() + START_LIMIT_S + seconds
+    arm_requested, deadline = False, time.monotonic() + START_LIMIT_S + seconds
     while host.poll() is None:
         channel.receive()
         robot, status = channel.description, channel.status
-        if robot is not None and status is not None and status.ready_to_arm and not asked:
+        if robot is not None and status is not None and status.ready_to_arm and not arm_requested:
             channel.send_request(make_arm_request(robot, "paths"))
-            asked = True
+            arm_requested = True
         if time.monotonic() > deadline:
             raise TimeoutError(f"not done: {status and status.reason}")
         time.sleep(0.02)
@@ -141,15 +141,16 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--only-slow", action="store_true", help="only the slow link")
-    wanted = parser.parse_args()
+    arguments = parser.parse_args()
     state, command = encode_tick(load_config())
     lines = [
         "# The loop through a lab's network",
         "",
-        f"Printed by `python -m benchmarks.paths --write --seconds {wanted.seconds:g} --repeats {wanted.repeats}` on "
+        f"Printed by `python -m benchmarks.paths --write --seconds {arguments.seconds:g} "
+        f"--repeats {arguments.repeats}` on "
         f"{date.today()}, {os.cpu_count()} cores, Python {platform.python_version()}, load {os.getloadavg()[1]:.1f}.",
         "Network namespaces on one computer; state to command at 100 Hz beside a raw Zenoh round trip of",
-        f"{len(state)} and {len(command)} bytes on the same way, in turn; medians of {wanted.repeats}.",
+        f"{len(state)} and {len(command)} bytes on the same way, in turn; medians of {arguments.repeats}.",
         "",
         "| way | ours p50 / p99, µs | raw p50 / p99, µs | ratio p50 | ratio p99 | aim |",
         "|---|---|---|---|---|---|",
@@ -159,10 +160,10 @@ def main() -> None:
         folder = Path(name)
         os.environ["XDG_STATE_HOME"] = name
         lab = Lab(folder, stack)
-        for way in () if wanted.only_slow else lab.ways():
+        for way in () if arguments.only_slow else lab.ways():
             pairs = [
-                (ours(way, wanted.seconds, folder), raw(way, wanted.seconds, folder, state, command))
-                for _ in range(wanted.repeats)
+                (ours(way, arguments.seconds, folder), raw(way, arguments.seconds, folder, state, command))
+                for _ in range(arguments.repeats)
             ]
             lines.append(row(way.name, pairs))
             print(lines[-1], flush=True)
@@ -175,8 +176,8 @@ def main() -> None:
             "|---|---|---|---|---|---|---|",
         ]
         print("\n".join(slow), flush=True)
-        lines += [*slow, *slow_link(lab, wanted.seconds, wanted.repeats, folder, state, command), "", *EXPLAINED]
-    if wanted.write:
+        lines += [*slow, *slow_link(lab, arguments.seconds, arguments.repeats, folder, state, command), "", *EXPLAINED]
+    if arguments.write:
         RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

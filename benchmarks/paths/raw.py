@@ -27,18 +27,18 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=0)
     parser.add_argument("--key", default="")
     parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
-    if given.part != "read":
+    arguments = parser.parse_args()
+    if arguments.part != "read":
         set_realtime_priority(SERVICE_PRIORITY)
     zenoh.init_log_from_env_or("error")
     sys.setswitchinterval(0.0005)
-    with zenoh.open(zenoh.Config.from_file(given.file)) as session:
-        if given.part == "answer":
-            answer_requests(session, bytes(given.bytes), DROP)
-        elif given.part == "ask":
-            given.out.write_text(json.dumps(_ask(session, bytes(given.bytes), given.rounds)))
-        elif given.part == "read":
-            _read(session, given.key, given.out)
+    with zenoh.open(zenoh.Config.from_file(arguments.file)) as session:
+        if arguments.part == "answer":
+            answer_requests(session, bytes(arguments.bytes), DROP)
+        elif arguments.part == "ask":
+            arguments.out.write_text(json.dumps(_ask(session, bytes(arguments.bytes), arguments.rounds)))
+        elif arguments.part == "read":
+            _read(session, arguments.key, arguments.out)
         else:
             threading.Event().wait()
 

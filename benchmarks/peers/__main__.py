@@ -44,11 +44,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help=f"keep the table in {RESULTS.name}")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.inside:
-        return _measure(write=given.write)
+    arguments = parser.parse_args()
+    if arguments.inside:
+        return _measure(write=arguments.write)
     _install()
-    again = python_command("-m", "benchmarks.peers", "--inside", *(["--write"] if given.write else []))
+    again = python_command("-m", "benchmarks.peers", "--inside", *(["--write"] if arguments.write else []))
     user = () if os.geteuid() == 0 else ("--map-root-user",)
     shell = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
     return subprocess.call([*ISOLATED, *user, *shell, *again], env=child_environment())

@@ -12,7 +12,7 @@ state_bytes, command_bytes, rounds, period_s = sizes()
 node = Node()
 
 
-def heard() -> bool:
+def receive_event() -> bool:
     """Waits for one input; False when the dataflow ends."""
     while True:
         event = node.next()
@@ -25,13 +25,13 @@ def heard() -> bool:
 
 if sys.argv[1] == "controller":
     command = pa.array(bytearray(command_bytes), type=pa.uint8())
-    while heard():
+    while receive_event():
         node.send_output("command", command)
 else:
     state = bytearray(state_bytes)
 
     def exchange() -> None:
         node.send_output("state", pa.array(state, type=pa.uint8()))
-        heard()
+        receive_event()
 
     tell(measure(exchange, rounds, period_s))

@@ -19,7 +19,7 @@ from pathlib import Path
 from deploy.vm import cpio
 from deploy.vm.packages import PreparationError, kernel_packages, kernel_version, need_tool, unpack
 
-# What init.sh itself needs, then what can be asked for. Their dependencies stand in the module files.
+# What init.sh itself needs, then what a caller can request. Their dependencies stand in the module files.
 BOOT_MODULES = ("9p", "9pnet_virtio", "virtio_pci", "virtio_console", "overlay")
 CAN_MODULES = ("can", "can_raw", "can_bcm", "vcan", "sch_tbf")  # the last one makes a vcan slow, in tests
 INPUT_MODULES = ("uinput", "evdev")  # a virtual joystick, in tests
@@ -44,7 +44,7 @@ class Kernel:
 
 
 def cache_folder() -> Path:
-    """Where kernels, and what was learnt about this machine, are kept."""
+    """Where kernels, and what was learnt about this machine, are stored."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base, "snakesim", "vm", LAYOUT)
     folder.mkdir(parents=True, exist_ok=True)
@@ -62,10 +62,10 @@ def ready_kernel() -> Kernel:
     return Kernel(home.name, image, home / "initramfs", listed["depends"], listed["built_in"])
 
 
-def load_order(wanted: Iterable[str], kernel: Kernel) -> list[str]:
+def load_order(names: Iterable[str], kernel: Kernel) -> list[str]:
     """The modules to load, every one after those that it depends on."""
     order: list[str] = []
-    for name in wanted:
+    for name in names:
         if name in kernel.built_in:
             continue
         if name not in kernel.depends:

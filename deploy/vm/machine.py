@@ -1,7 +1,7 @@
 """Boots a guest, runs one command in it, and passes on what the command says.
 
 The guest's root is the host's file system, read-only; what the guest writes stays in its memory, except in the
-folders that it is given to write. It keeps what it has read: a file that the host changes meanwhile may be seen or not.
+folders that it may write. It keeps what it has read: a file that the host changes meanwhile may be seen or not.
 The guest reaches no network; through a forwarded port the host reaches the guest.
 """
 
@@ -72,7 +72,7 @@ class Request:
 
 
 def interface_script(request: Request) -> str:
-    """What session.sh runs, up to the first line that fails, to bring the asked-for interfaces up."""
+    """What session.sh runs, up to the first line that fails, to bring the requested interfaces up."""
     lines: list[str] = []
     for name in map(shlex.quote, request.channels):
         lines += [f"ip link add {name} type vcan", f"ip link set {name} up"]
@@ -87,11 +87,13 @@ def interface_script(request: Request) -> str:
 
 def command_script(request: Request, environment: Mapping[str, str]) -> str:
     """What the guest's shell runs: the host's environment and folder, then the command."""
-    given = {name: text for name, text in environment.items() if name not in NOT_FOR_THE_GUEST}
-    # /tmp shows the host's files; a clean folder spares whoever tidies up there.
-    given |= {"SNAKESIM_VCAN": "guest", "TMPDIR": "/run/snakesim/tmp"}
+    variables = {name: text for name, text in environment.items() if name not in NOT_FOR_THE_GUEST}
+    # /tmp shows the host's files; a clean folder is safe from programs that clean up there.
+    variables |= {"SNAKESIM_VCAN": "guest", "TMPDIR": "/run/snakesim/tmp"}
     exports = (
-        f"export {name}={shlex.quote(text)}\n" for name, text in given.items() if re.fullmatch(r"[A-Za-z_]\w*", name)
+        f"export {name}={shlex.quote(text)}\n"
+        for name, text in variables.items()
+        if re.fullmatch(r"[A-Za-z_]\w*", name)
     )
     return f"{''.join(exports)}cd {shlex.quote(str(request.folder))} || exit 1\nexec {shlex.join(request.command)}\n"
 
@@ -173,7 +175,7 @@ class Guest:
                 theirs[name] = handed_over.enter_context(their_end).fileno()
                 self._selector.register(our_end, selectors.EVENT_READ, name)
             self._control_port = ours["control"]
-            initramfs = os.memfd_create("initramfs")  # the environment in it is nobody else's business
+            initramfs = os.memfd_create("initramfs")  # the environment in it is private
             handed_over.callback(os.close, initramfs)
             with os.fdopen(os.dup(initramfs), "wb") as file:
                 file.write(kernel.initramfs.read_bytes() + first_files(request, os.environ))
@@ -220,7 +222,7 @@ class Guest:
     def _forward_signal(self, number: int, _frame: FrameType | None) -> None:
         self._signals += 1
         if self._signals > 1:
-            raise KeyboardInterrupt  # asked twice: no more patience with the command
+            raise KeyboardInterrupt  # a second request ends the command at once
         self._control_port.sendall(signal.Signals(number).name.removeprefix("SIG").encode() + b"\n")
 
     def _pass_on(self, timeout_s: float | None) -> None:
@@ -248,7 +250,7 @@ class Guest:
                 case ["exit", code, out, err]:
                     self._ended = int(code), {"out": int(out), "err": int(err)}
                 case _:
-                    raise GuestError(f"the guest said {line!r}")
+                    raise GuestError(f"the guest printed {line!r}")
 
     def _note(self, content: bytes) -> None:
         self._console = (self._console + content)[-CONSOLE_TAIL:]
@@ -260,8 +262,8 @@ class Guest:
         self._passed[name] += len(content)
 
     def _last_words(self) -> str:
-        said = self._console.replace(b"\r", b"").decode(errors="replace").strip()
-        return f". It said:\n{said}" if said else "; it said nothing"
+        output = self._console.replace(b"\r", b"").decode(errors="replace").strip()
+        return f". It printed:\n{output}" if output else "; it printed nothing"
 
 
 def _write(descriptor: int, content: bytes) -> None:

@@ -144,10 +144,10 @@ def _parsed() -> argparse.Namespace:
     guest.add_argument("--memory", default="2G", help="default: 2G")
     parser.usage = "with_vcan.py [options] -- COMMAND ..."
     # Divided here, because a command may have a `--` of its own.
-    given = sys.argv[1:]
-    divided = given.index("--") if "--" in given else len(given)
-    arguments = parser.parse_args(given[:divided])
-    arguments.command = given[divided + 1 :]
+    words = sys.argv[1:]
+    divided = words.index("--") if "--" in words else len(words)
+    arguments = parser.parse_args(words[:divided])
+    arguments.command = words[divided + 1 :]
     if not arguments.command:
         parser.error("there is no command; it comes after --")
     return arguments

@@ -181,7 +181,7 @@ PAGES = (
         "print(f\"{result.metrics['advance_m']:.2f} m, digest {result.digest[:16]}\")\n"
         'print(result["angle_rad.joint_7"].max(), result.units["angle_rad"])\n',
         {
-            "snakesim": ("run", "Result", "Robot", "use_common_arithmetic"),
+            "snakesim": ("run", "load", "Result", "Robot", "find_nodes_w", "use_common_arithmetic"),
             "snakesim.chart": ("Chart",),
             "snakesim_operator.robot_commands.parameters": ("Parameter",),
         },
@@ -297,8 +297,7 @@ INTERNAL = {
         "ParametersT",
         "decode_parameters",
         "load_controller",
-        "motion_wanted",
-        "require_controller",
+        "is_motion_requested",
     ),
     "snakesim_hal.service": ("ServiceLoop",),
     "snakesim_hal.model.sensor_model": ("NoSettings",),

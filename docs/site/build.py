@@ -22,12 +22,14 @@ SHOWN = (
     "CONTRIBUTING.md",
     "SECURITY.md",
     "LICENSE",
+    "CITATION.cff",
     "docs",
     "schemas",
     "benchmarks",
     "deploy",
     "examples",
     "snakesim_gnc/guidance",
+    "snakesim_hal/host/control_cycle.py",
 )
 FENCE = re.compile(r"^(```\w+) +(\S.*)$", re.MULTILINE)  # a block, and a file's name or where it is typed
 TITLES = {"background": "in a terminal of its own", "of root": "as root", "by hand": ""}
@@ -45,7 +47,7 @@ def main() -> None:
     for asset in ("iframe-worker.js", "site.css"):
         shutil.copy(ROOT / "docs" / "site" / asset, PAGES / "assets")
     config = str(ROOT / "docs" / "site" / "mkdocs.yml")
-    run("mkdocs", "build", "--strict", "--quiet", "--clean", "--config-file", config, NO_MKDOCS_2_WARNING="1")
+    run("mkdocs", "build", "--strict", "--clean", "--config-file", config, NO_MKDOCS_2_WARNING="1")
     print(f"open {SITE.relative_to(ROOT)}/index.html")
 
 

@@ -92,12 +92,12 @@ def make_page() -> str:
     for heading, (struct, note) in FILES.items():
         lines += [f"## {heading}", "", note, "", *_table(struct), *_inner_tables(struct, ""), ""]
     for group, (heading, section, note) in PLUGINS.items():
-        lines += [f"## {heading}", "", note, ""]
+        lines += ["", f"## {heading}", "", note, ""]
         for name, plugin in list_shipped_plugins(group):
             struct = section_type(plugin)
             path = f"{section}.{name}" if group != PHYSICS_MODELS else name
             title = f"`[{path}]`" if group != PHYSICS_MODELS else f"`{name}`"
-            lines += [f"### {title}", "", _first_paragraph(struct), "", *_table(struct)]
+            lines += ["", f"### {title}", "", _first_paragraph(struct), "", *_table(struct)]
             lines += _inner_tables(struct, path)
     text = "\n".join(lines)
     while "\n\n\n" in text:

@@ -1,7 +1,8 @@
 """Opens every page of the built site in Chromium, checks how it looks, and makes contact sheets to look at.
 
     make docs
-    python -m docs.site.view_site                     # every page, at 1400 and 400 pixels, light and dark
+    python -m docs.site.view_site                     # every page: light at 1400 pixels, and dark at 400
+    python -m docs.site.view_site --every             # both schemes at both widths
     python -m docs.site.view_site docs/tutorials      # only pages below this folder
 
 It writes sheets of nine pages each to build/view and prints one line a problem. It ends with 1 if there is a problem.
@@ -27,7 +28,8 @@ SITE = ROOT / "build" / "docs"
 COPY = ROOT / "build" / "viewed"  # so that a build meanwhile changes nothing
 SHEETS = ROOT / "build" / "view"
 WIDTHS_PX = {1400: 1000, 400: 1800}  # width: how much of the page's height a sheet shows
-SCHEMES = ("light", "dark")
+USUAL_VIEWS = ((1400, "light"), (400, "dark"))
+EVERY_VIEW = ((1400, "light"), (1400, "dark"), (400, "light"), (400, "dark"))
 PAGES_PER_SHEET = 9
 COLUMNS = {1400: 3, 400: 9}
 TILE_PX = {1400: 700, 400: 280}  # width of a page on a sheet
@@ -83,32 +85,43 @@ def main() -> int:
     """Check the pages and make the sheets."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("under", nargs="*", default=[""], help="only pages whose path begins like this")
-    parser.add_argument("--no-sheets", action="store_true", help="check only")
+    parser.add_argument("--every", action="store_true", help="both color schemes at both widths")
     arguments = parser.parse_args()
     shutil.rmtree(COPY, ignore_errors=True)
     shutil.copytree(SITE, COPY)
     pages = [page for page in list_pages() if str(page).startswith(tuple(arguments.under))]
     if not pages:
         sys.exit("view: build/docs has no such page; run `make docs`")
-    problems = [f"{page}: {problem}" for page in pages for problem in find_broken_links(page)]
     SHEETS.mkdir(parents=True, exist_ok=True)
-    problems += view(pages, with_sheets=not arguments.no_sheets)
-    for problem in problems:
-        print(problem)
-    print(f"{len(pages)} pages, {len(problems)} problems; sheets in {SHEETS.relative_to(ROOT)}")
+    problems = 0
+    for problem in check(pages, arguments):
+        print(problem, flush=True)
+        problems += 1
+    print(f"{len(pages)} pages, {problems} problems; sheets in {SHEETS.relative_to(ROOT)}")
     return 1 if problems else 0
 
 
+def check(pages: list[Path], arguments: argparse.Namespace) -> Iterator[str]:
+    """Yield every problem of the pages: broken links first, then what the browser finds."""
+    for page in pages:
+        yield from (f"{page}: {problem}" for problem in find_broken_links(page))
+    views = EVERY_VIEW if arguments.every else USUAL_VIEWS
+    with chromium() as browser:
+        tab = browser.open("about:blank")
+        tab.send("Network.enable")
+        tab.send("Network.setBlockedURLs", urls=["*search_index.js*"])  # large, and not needed here
+        for first in range(0, len(pages), PAGES_PER_SHEET):
+            yield from view(tab, pages[first : first + PAGES_PER_SHEET], views, f"{first // PAGES_PER_SHEET:02}")
+
+
 def list_pages() -> list[Path]:
-    """Return the pages of the site, relative to it."""
-    return sorted(page.relative_to(COPY) for page in COPY.rglob("*.html"))
+    """Return the pages of the site, relative to it; the links of 404.html begin at the address of a published site."""
+    return sorted(page.relative_to(COPY) for page in COPY.rglob("*.html") if page.name != "404.html")
 
 
 def find_broken_links(page: Path) -> Iterator[str]:
     """Yield every link of a page to a file or an anchor that the site does not have."""
     text = (COPY / page).read_text(encoding="utf-8")
-    if page.name == "404.html":
-        return  # its links begin at the address of a published site
     for link in dict.fromkeys(re.findall(r"""<(?:a|img|link|script)\b[^>]*?\b(?:href|src)=["']?([^"'\s>]+)""", text)):
         address = urlparse(link)
         if address.scheme or address.netloc:
@@ -122,29 +135,20 @@ def find_broken_links(page: Path) -> Iterator[str]:
                 yield f"broken anchor: {link}"
 
 
-def view(pages: list[Path], *, with_sheets: bool) -> Iterator[str]:
-    """Yield the problems of all pages at every width and color scheme, and write their contact sheets."""
-    tiles: dict[tuple[int, str], list[tuple[Path, bytes]]] = {
-        (width, scheme): [] for scheme in SCHEMES for width in WIDTHS_PX
-    }
-    with chromium() as browser:
-        tab = browser.open("about:blank")
-        tab.send("Network.enable")
-        tab.send("Network.setBlockedURLs", urls=["*search_index.js*"])  # large, and not needed here
-        for page in pages:
-            open_page(tab, page)
-            for width, scheme in tiles:
-                show(tab, width, scheme)
-                for problem in json.loads(tab.value(CHECK) or "[]"):
-                    yield f"{page} ({width}, {scheme}): {problem}"
-                if with_sheets:
-                    tiles[width, scheme].append((page, tab.picture()))
-            yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
-            tab.errors.clear()
+def view(tab: Tab, pages: list[Path], views: tuple[tuple[int, str], ...], number: str) -> Iterator[str]:
+    """Yield the problems of some pages in every view, and write their contact sheets."""
+    tiles: dict[tuple[int, str], list[tuple[Path, bytes]]] = {each: [] for each in views}
+    for page in pages:
+        open_page(tab, page)
+        for width, scheme in views:
+            show(tab, width, scheme)
+            for problem in json.loads(tab.value(CHECK) or "[]"):
+                yield f"{page} ({width}, {scheme}): {problem}"
+            tiles[width, scheme].append((page, tab.picture()))
+        yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
+        tab.errors.clear()
     for (width, scheme), pictures in tiles.items():
-        for number in range(0, len(pictures), PAGES_PER_SHEET):
-            name = f"{width}-{scheme}-{number // PAGES_PER_SHEET:02}.png"
-            make_sheet(pictures[number : number + PAGES_PER_SHEET], width).save(SHEETS / name)
+        make_sheet(pictures, width).save(SHEETS / f"{width}-{scheme}-{number}.png")
 
 
 def show(tab: Tab, width: int, scheme: str) -> None:
@@ -152,7 +156,7 @@ def show(tab: Tab, width: int, scheme: str) -> None:
     tab.size(width, WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
     attribute = json.dumps("slate" if scheme == "dark" else "default")
     tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")  # as the theme's own button does
-    time.sleep(0.3)  # until it is laid out, and colors have faded over
+    time.sleep(0.2)  # until it is laid out
 
 
 def open_page(tab: Tab, page: Path) -> None:
@@ -164,6 +168,7 @@ def open_page(tab: Tab, page: Path) -> None:
         if time.monotonic() > deadline:
             raise TimeoutError(f"{page} does not load")
         time.sleep(0.02)
+    tab.value("document.head.insertAdjacentHTML('beforeend', '<style>* { transition: none !important }</style>')")
     time.sleep(0.15)  # the theme wraps tables and colors code
 
 

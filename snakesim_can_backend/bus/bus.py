@@ -287,7 +287,7 @@ class VirtualWire:
         self._faults = VirtualFaults(channel)
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame. A virtual bus accepts everything, unless a fault is active."""
+        """Send a frame, and return whether the bus accepted it. It always does, unless a fault is active."""
         if self._faults.active:
             match self._faults.judge_send():
                 case SendOutcome.REJECTED:

@@ -261,7 +261,7 @@ def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: Can
 
     Args:
         joints: number of joints on each bus.
-        config: the run.
+        config: configuration of the run, with the robot and the settings of its backend.
         settings: settings of the backend.
     """
     fullest = max(joints)

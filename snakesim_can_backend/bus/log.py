@@ -55,7 +55,7 @@ class LoggedWire:
         self.inject = wire.inject
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame, and log it if the bus accepted it."""
+        """Send a frame, log it if the bus accepted it, and return whether it did."""
         accepted = self._wire.send(frame)
         if accepted:
             self._write([frame], "T")

@@ -130,7 +130,7 @@ class CanDriveBackend(DriverTypeBackend):
         """Return the emulated drives of a whole robot.
 
         Args:
-            config: The run.
+            config: Configuration of the run, with the robot and the settings of its backend.
             settings: The settings of the driver type.
             wires: The open buses, in the order of the channels.
             clock: The time of the drives.

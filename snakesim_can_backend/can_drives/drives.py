@@ -151,7 +151,7 @@ class CanDrives(Drives):
         """Send a setpoint.
 
         Args:
-            i: The drive.
+            i: Number of the drive on its bus, from 0 at the tail.
             mode: Its mode.
             target: At the shaft, in rad, rad/s or N·m by the mode; 0 if passive.
             limit_nm: Torque limit at the shaft.

@@ -204,7 +204,7 @@ def describe_sensors(
     """Return the sensors of this robot's modules, with their rates.
 
     Args:
-        config: the run.
+        config: configuration of the run, with the robot and the settings of its backend.
         reports: which reports the modules send, and how often.
         pose_delay_s: delay of motion capture; None: there is none.
     """

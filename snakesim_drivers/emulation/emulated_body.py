@@ -81,7 +81,7 @@ class EmulatedBody:
         """Set what a drive demands of its motor until the next call.
 
         Args:
-            i: The drive.
+            i: Number of the drive, from 0 at the tail.
             mode: Its control mode.
             target: In rad, rad/s or N·m, by the mode.
             limit_nm: Torque limit.

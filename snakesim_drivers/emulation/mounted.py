@@ -85,7 +85,7 @@ def build_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig
     """Return the configuration of the physics model that the drives move: with motors as they are in truth.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         mounted: What differs, by the name of the joint.
     """
     joints = dict(config.robot.joints)

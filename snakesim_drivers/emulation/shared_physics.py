@@ -44,7 +44,7 @@ def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: st
     """Create the physics model that a backend's settings name, moved by motors as they are in truth.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         settings: The backend's settings.
         backend: Name of the backend, for messages.
 
@@ -78,7 +78,7 @@ class SharedPhysics:
         """Begin at time 0, with all motors passive.
 
         Args:
-            config: The run.
+            config: Configuration of the run, with the robot and the settings of its backend.
             physics_model: The physics model that the motors move.
             mounted: How drives are mounted in truth, where that differs from the robot file; by the joint's name.
             send_pose: Gets a datagram of motion capture in every control period; None: no motion capture.

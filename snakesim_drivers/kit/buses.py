@@ -32,7 +32,7 @@ class Buses(Drives):
         """Open all buses.
 
         Args:
-            config: The run.
+            config: Configuration of the run, with the robot and the settings of its backend.
             readings: The readings of the whole robot, which this object fills.
             specs: The buses, which together have every joint once.
             clock_ns: The driver's time.
@@ -123,7 +123,11 @@ class Buses(Drives):
             bus.poll()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of a bus, by its number in the robot, or of a drive on a bus."""
+        """Begin or end a fault of a bus, by its number in the robot, or of a drive on a bus.
+
+        Returns:
+            Whether this fault can be injected here; False for real drives, and for an unknown target.
+        """
         match injection.target_type:
             case "bus":
                 return self._inject_into_bus(injection, begins=begins)

@@ -286,7 +286,7 @@ class DriveBackend(Backend):
         """Return the sensors with their rates and delays.
 
         Args:
-            config: The run.
+            config: Configuration of the run, with the robot and the settings of its backend.
             pose_delay_s: Delay of motion capture; None without it.
         """
         rate_hz = config.rate_hz

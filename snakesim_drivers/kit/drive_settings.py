@@ -55,7 +55,7 @@ def make_body(config: RunConfig, settings: BodySettings, backend: str, pose_addr
     """Create the body that the emulated drives of a whole robot move.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         settings: The settings of the backend.
         backend: The backend's name.
         pose_address: HOST:PORT to which its emulated motion capture sends; None: it does not send.
@@ -75,7 +75,7 @@ def check_body(
     """Check motion capture, mounting and the faults that the scenario injects.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         settings: The settings of the backend.
         emulators: Whether this process emulates the drives.
         buses: How many buses the settings name.
@@ -105,7 +105,7 @@ def check_buses(
     """Check the ports of joints, the watchdog time and the rate of the buses.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         settings: The settings of the driver type.
         section: Where the scenario has them, for messages.
         joints: The joints of the driver type.

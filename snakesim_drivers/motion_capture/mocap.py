@@ -43,7 +43,7 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
     """Check that the robot file has the delay of motion capture if a setting names its address.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         pose_listen: The setting; None or empty: no receiver.
 
     Raises:
@@ -64,7 +64,7 @@ def make_receiver(
     """Create a receiver if the robot has a pose sensor and there is an address.
 
     Args:
-        config: The run.
+        config: Configuration of the run, with the robot and the settings of its backend.
         pose_listen: HOST:PORT to listen on; None or empty: emulators send to any free port.
         emulators: Whether this process emulates the drives, and motion capture with them.
         clock: As in `MocapReceiver`.

@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, motion_wanted
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import above, bounded, from_zero
@@ -55,7 +55,7 @@ class _Gait(Controller[GaitParametersT]):
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Advance the gait while motion is requested; a robot without the necessary joints holds its pose."""
-        if self._missing or not motion_wanted(observation):
+        if self._missing or not is_motion_requested(observation):
             return self._bumpless.hold(observation, self._missing)
         self._phase_rad += math.tau * observation.period_s / self.parameters.period_s
         reference_rad = np.zeros(len(self._from_head))

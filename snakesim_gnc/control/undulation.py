@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.bumpless import Blend, BumplessReference
 from snakesim_gnc.control.standstill import Standstill
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, motion_wanted
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import above, bounded, from_zero
@@ -76,7 +76,7 @@ class LateralUndulation(Controller[LateralUndulationParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Advance the wave while there is a path to move along, and keep its phase otherwise."""
         passed_s = 0.0
-        if motion_wanted(observation):
+        if is_motion_requested(observation):
             passed_s = observation.period_s
         reference = self.reference_rad(observation, passed_s)
         setpoints = self._bumpless.follow(observation, reference)

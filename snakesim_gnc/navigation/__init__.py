@@ -6,8 +6,7 @@
 `clutter`           plans a path towards a goal, again and again, with bounded work in each update
 `planning_goal`     where that goal is, and whether it is reached
 `plan`              makes one plan: search, path fit, push-points
-`beam`              searches a path: from `search_nodes` along `search_arcs`, with the costs of `search_parameters`
-`margin`            how hard a body can push itself with the contacts that it has
+`path_search/`      searches a path
 `path_fit`          fits a path to the obstacles that the body pushes off, and smooths it
 `obstacle_grid`     finds the nearest obstacle of many points
 `platform_rises`    where a path leads over platforms

@@ -12,6 +12,7 @@ plan, and a plan takes the same robot time on every computer. Until it is there 
 """
 
 import math
+import statistics
 from collections import deque
 from collections.abc import Generator, Sequence
 
@@ -19,8 +20,9 @@ import numpy as np
 
 from snakesim_gnc.geometry.planar import space_evenly
 from snakesim_gnc.navigation.intents import DesiredMotion
-from snakesim_gnc.navigation.native_growth import is_native_available
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
+from snakesim_gnc.navigation.path_search.native_library import is_native_available
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters
 from snakesim_gnc.navigation.plan import (
     BACKED_OUT,
     COMMITTED_M,
@@ -40,8 +42,6 @@ from snakesim_gnc.navigation.plan import (
     make_plan,
 )
 from snakesim_gnc.navigation.planning_goal import PlanningGoal
-from snakesim_gnc.navigation.search_arcs import STEP_M
-from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
@@ -272,7 +272,7 @@ class ClutterPlanner:
         head_s_m = plan.route.project(body_w[-1])
         if self._back_out_from_m is not None:
             return self._check_backed_out(self._back_out_from_m, head_s_m, now_ns)
-        from_path_m = np.median([_distance_from_route_m(plan.route, point_w) for point_w in body_w[::10]])
+        from_path_m = statistics.median(_distance_from_route_m(plan.route, point_w) for point_w in body_w[::10])
         if from_path_m > OFF_PATH_M:
             return OFF_PATH
         if self._failed_w and from_path_m > SHIFTED_M and now_ns - self._planned_ns > STUCK_S * 1e9:

@@ -1,16 +1,25 @@
 """A grid that finds the obstacle nearest to each of many points in one call. Pure."""
 
-from collections.abc import Generator, Sequence
+import ctypes
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_gnc.navigation.path_search.native_library import (
+    INTEGER,
+    NativeGrid,
+    NativeMemory,
+    NativeWindow,
+    PlannerLibrary,
+    load_library,
+)
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-Ints = NDArray[np.intp]
+Ints = NDArray[np.int64]
 
 CELL_M = 0.01
 CELL_ERROR_M = CELL_M * 0.5**0.5  # distance from a cell's center to its corner
@@ -62,34 +71,69 @@ class ObstacleGrid:
         high_w = (outlines.center_w + reach_m[:, None]).max(axis=0)
         columns, rows = (np.ceil((high_w - self.low_w) / CELL_M).astype(int) + 1).tolist()
         self.shape = (columns, rows)
-        nearest = np.full(self.shape, NO_OBSTACLE, dtype=np.intp)
-        distance_m = np.full(self.shape, MAX_DISTANCE_M)
+        self.cell_nearest = np.full(columns * rows, NO_OBSTACLE, dtype=np.int64)
+        self.cell_distance_m = np.full(columns * rows, MAX_DISTANCE_M)
+        mark = self._choose_marking()
         for index, (center_w, radius_m) in enumerate(zip(outlines.center_w, reach_m, strict=True)):
             if index % OBSTACLES_PER_STEP == 0:
                 yield NODES_PER_OBSTACLE * min(OBSTACLES_PER_STEP, len(outlines) - index)
-            self._mark_obstacle(index, center_w, radius_m, nearest, distance_m)
-        self.cell_nearest = nearest.ravel()
-        self.cell_distance_m = distance_m.ravel()
+            first = np.maximum(((center_w - radius_m - self.low_w) / CELL_M).astype(int), 0)
+            last = np.minimum(((center_w + radius_m - self.low_w) / CELL_M).astype(int) + 2, self.shape)
+            mark(index, first, last)
 
     def _fill_empty(self) -> None:
         """Make a grid of one cell, which is free."""
         self.low_w = np.zeros(2)
         self.shape = (1, 1)
-        self.cell_nearest = np.full(1, NO_OBSTACLE, dtype=np.intp)
+        self.cell_nearest = np.full(1, NO_OBSTACLE, dtype=np.int64)
         self.cell_distance_m = np.full(1, MAX_DISTANCE_M)
 
-    def _mark_obstacle(self, index: int, center_w: Floats, radius_m: float, nearest: Ints, distance_m: Floats) -> None:
-        """Write an obstacle into the cells within a radius of its center that have no nearer one."""
-        first = np.maximum(((center_w - radius_m - self.low_w) / CELL_M).astype(int), 0)
-        last = np.minimum(((center_w + radius_m - self.low_w) / CELL_M).astype(int) + 2, self.shape)
+    def _choose_marking(self) -> Callable[[int, Ints, Ints], None]:
+        """Return the function that marks an obstacle: in C if the library is installed, else `_mark_obstacle`."""
+        library = load_library()
+        if library is None:
+            return self._mark_obstacle
+        return NativeMarking(library, self).mark_obstacle
+
+    def _mark_obstacle(self, index: int, first: Ints, last: Ints) -> None:
+        """Write an obstacle into the cells of a window that have no nearer one. This specifies the same in C.
+
+        Args:
+            index: of the obstacle.
+            first: (2,) column and row of the first cell.
+            last: (2,) column and row after the last cell; both are within the grid.
+        """
         x = self.low_w[0] + CELL_M * np.arange(first[0], last[0])
         y = self.low_w[1] + CELL_M * np.arange(first[1], last[1])
         cells_w = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
         to_obstacle_m, _ = self.outlines.distance_and_normal(cells_w, np.full(cells_w.shape[:2], index))
         window = (slice(first[0], last[0]), slice(first[1], last[1]))
-        is_nearer = to_obstacle_m < distance_m[window]
-        distance_m[window][is_nearer] = to_obstacle_m[is_nearer]
-        nearest[window][is_nearer] = index
+        distance_m = self.cell_distance_m.reshape(self.shape)[window]
+        nearest = self.cell_nearest.reshape(self.shape)[window]
+        is_nearer = to_obstacle_m < distance_m
+        distance_m[is_nearer] = to_obstacle_m[is_nearer]
+        nearest[is_nearer] = index
+
+    def make_native_grid(self, memory: NativeMemory) -> NativeGrid:
+        """Return the grid as C functions read it. memory: keeps its arrays alive."""
+        columns, rows = self.shape
+        outlines = self.outlines
+        count = len(outlines)
+        grid = NativeGrid()
+        grid.low_x_m, grid.low_y_m = self.low_w
+        grid.columns = columns
+        grid.rows = rows
+        grid.cell_m = CELL_M
+        grid.cell_error_m = CELL_ERROR_M
+        grid.max_distance_m = MAX_DISTANCE_M
+        cells = (columns * rows,)
+        grid.nearest = memory.pass_array("the nearest obstacle of each cell", self.cell_nearest, cells, INTEGER)
+        grid.distance_m = memory.pass_array("the distance of each cell", self.cell_distance_m, cells)
+        grid.center_m = memory.pass_array("the centers of the obstacles", outlines.center_w, (count, 2))
+        grid.direction = memory.pass_array("the directions of the obstacles", outlines.direction, (count, 2))
+        grid.half_size_m = memory.pass_array("the half sizes of the obstacles", outlines.half_m, (count, 2))
+        grid.rounding_m = memory.pass_array("the roundings of the obstacles", outlines.rounding_m, (count,))
+        return grid
 
     def approximate_distance_m(self, x: Floats, y: Floats) -> Floats:
         """Return distances to the nearest surface with an error of at most CELL_ERROR_M.
@@ -121,3 +165,17 @@ class ObstacleGrid:
         row = ((y - self.low_w[1]) / CELL_M + 0.5).astype(int)
         is_inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
         return is_inside, np.where(is_inside, column * rows + row, 0)
+
+
+class NativeMarking:
+    """Marks obstacles in a grid in C."""
+
+    def __init__(self, library: PlannerLibrary, grid: ObstacleGrid) -> None:
+        self._library = library
+        self._memory = NativeMemory()
+        self._grid = grid.make_native_grid(self._memory)
+
+    def mark_obstacle(self, index: int, first: Ints, last: Ints) -> None:
+        """Write an obstacle into the cells of a window that have no nearer one; see `ObstacleGrid`."""
+        window = NativeWindow(int(first[0]), int(last[0]), int(first[1]), int(last[1]))
+        self._library.mark_obstacle(ctypes.byref(self._grid), ctypes.byref(window), index)

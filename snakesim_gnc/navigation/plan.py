@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from snakesim_gnc.geometry.planar import SPACING_M, space_evenly
-from snakesim_gnc.navigation.beam import BeamSearch, PathSearch
 from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
 from snakesim_gnc.navigation.path_fit import PathFitParameters, fit_path
-from snakesim_gnc.navigation.path_growth import MIN_PUSH, SearchedPath
-from snakesim_gnc.navigation.search_arcs import STEP_M
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.search_parameters import MIN_PUSH, STEP_M, SearchParameters
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle

@@ -9,8 +9,8 @@ from snakesim_gnc.geometry.planar_body import PlanarBody, RecentAngles, pose_tim
 from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion, Intents
 from snakesim_gnc.navigation.known_path import KnownPath
+from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.platform_rises import PlatformRises
-from snakesim_gnc.navigation.search_parameters import SearchParameters
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, ServiceSchedule, find_start_pose, survey_obstacles
 from snakesim_hal.model.scene import make_route

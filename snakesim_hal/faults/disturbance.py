@@ -57,7 +57,7 @@ class Disturbance:
         """Return whether no fault is active and no payload is delayed."""
         return not self._amounts and not self._delayed
 
-    def put(self, payload: bytes, now_s: float) -> list[bytes]:
+    def disturb(self, payload: bytes, now_s: float) -> list[bytes]:
         """Apply the active faults to a message of the writer, and return the payloads to send now."""
         if self._newest is None:
             self._repeat_s = max(self._repeat_s, now_s)

@@ -49,7 +49,7 @@ class MessageFaults:
             if disturbed is None:
                 disturbed = DisturbedKey(key, Disturbance(f"{self._seed} {key}"))
                 self._disturbed[key] = disturbed
-                self._session.reroute(key, partial(self.put, disturbed))
+                self._session.reroute(key, partial(self.disturb_message, disturbed))
             disturbed.disturbance.begin(injection, time.monotonic())
             self._update(disturbed)
 
@@ -62,10 +62,10 @@ class MessageFaults:
                 self._send(disturbed, payloads)
                 self._update(disturbed)
 
-    def put(self, disturbed: DisturbedKey, payload: bytes) -> None:
+    def disturb_message(self, disturbed: DisturbedKey, payload: bytes) -> None:
         """Disturb a message of the writer, in place of the publisher's own `put`, in the writer's thread."""
         with self._changed:
-            payloads = disturbed.disturbance.put(payload, time.monotonic())
+            payloads = disturbed.disturbance.disturb(payload, time.monotonic())
             self._send(disturbed, payloads)
             self._update(disturbed)
 

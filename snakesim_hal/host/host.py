@@ -326,7 +326,7 @@ class Host:
     def _let_services_begin(self) -> None:
         """Leave the interpreter to the sending threads in real time, unless a service in this process needs it."""
         clock = self._state.clock
-        if clock.clock_mode == "realtime" and not self._config.beside:
+        if clock.clock_mode == "realtime" and not self._config.in_host_services:
             self._inbox.wait(min(SEND_START_S, MAX_INPUT_FRACTION * clock.period_ns * 1e-9))
 
     def _judge(self, samples: Samples) -> None:

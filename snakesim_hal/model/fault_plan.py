@@ -77,7 +77,7 @@ def check_planned(config: RunConfig, table: Table | None = None, buses: int = MA
     for i, injection in enumerate(injections):
         try:
             check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)
-            if injection.part == RUN and injection.target in config.beside:
+            if injection.part == RUN and injection.target in config.in_host_services:
                 raise ConfigError(
                     f"fault {str(injection)!r}: {injection.target} has no process of its own; it runs in the host "
                     f'(services.{injection.target}.process = "host")',

@@ -38,7 +38,7 @@ class Table:
     source: str  # the file
     origin: dict[str, str] = field(default_factory=dict)  # dotted key -> file or flag
 
-    def put(self, dotted: str, value: Any, origin: str) -> None:
+    def set_value(self, dotted: str, value: Any, origin: str) -> None:
         """Set a value, and create the sections above it.
 
         Args:
@@ -222,7 +222,7 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
         raise ConfigError(f"{path}: `extends` = {shorten(repr(base))} must be the name or the path of another file")
     whole = read_part(base, kind, path.parent, extended=(*extended, path.resolve()))
     for dotted, value in _settings(table.values):
-        whole.put(dotted, value, str(path))
+        whole.set_value(dotted, value, str(path))
     return whole
 
 

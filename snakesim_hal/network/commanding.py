@@ -110,7 +110,7 @@ class CommandingClient:
         self._commander.send(self.clock, joints, points)
         self._last_setpoints = points
 
-    def turn(self) -> None:
+    def command_tick(self) -> None:
         """Wait for the next tick, and command it as before: hold still while not armed, then the last setpoints."""
         clock = self.wait()
         joints = self.read(keys.JOINTS)
@@ -133,7 +133,7 @@ class CommandingClient:
         """
         deadline = time.monotonic() + limit_s
         while True:
-            self.turn()
+            self.command_tick()
             if condition():
                 return
             if time.monotonic() > deadline:

@@ -28,7 +28,7 @@ class RawPublisher:
 
     _publisher: Any
 
-    def put(self, payload: bytes, attachment: bytes) -> None:
+    def send(self, payload: bytes, attachment: bytes) -> None:
         """Send a payload. It is dropped if the network is too slow for it."""
         self._publisher.put(payload, attachment=attachment)
 

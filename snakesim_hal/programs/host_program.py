@@ -93,7 +93,7 @@ def _run(options: ProcessOptions, config: RunConfig, on_network: Callable[[], No
         with HostRecordWriter(
             host.black_box, host.description, partial(create_host_record, host), arguments.out, memory
         ):
-            if config.beside:  # imported only for runs with such services
+            if config.in_host_services:  # imported only for runs with such services
                 from snakesim_hal.programs.in_host_service import InHostServices
 
                 opened.enter_context(InHostServices(config, session))

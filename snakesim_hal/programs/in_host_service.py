@@ -36,7 +36,8 @@ class InHostServices:
         self._session = session
         self._closing = threading.Event()
         self._threads = [
-            threading.Thread(target=self._serve, args=(name,), name=name, daemon=True) for name in config.beside
+            threading.Thread(target=self._serve, args=(name,), name=name, daemon=True)
+            for name in config.in_host_services
         ]
 
     def __enter__(self) -> Self:

@@ -78,7 +78,7 @@ def _check_controller(
 
 def _check_in_host_services(config: RunConfig, source: str) -> None:
     """Raise ConfigError when a service other than control is to run inside the host."""
-    others = [name for name in config.beside if name != CONTROL]
+    others = [name for name in config.in_host_services if name != CONTROL]
     if others:
         raise ConfigError(
             f'{source}: `services.{others[0]}.process` = "host": only control may run in the host, '

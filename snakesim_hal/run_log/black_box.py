@@ -72,7 +72,7 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
             Column("tick", "<i8"),
             Column("time_s", "<f8"),
             *(Column(name, "<f8", joints) for name in joint_columns),
-            Column("position_w", "<f8", 3),
+            Column("position_w_m", "<f8", 3),
             Column("orientation_wxyz", "<f8", 4),
             Column("contact_peak_n", "<f8"),
             Column("contact_count", "<f8"),

@@ -65,7 +65,7 @@ class Authority:
         """Start disarmed, without a holder of the lease.
 
         Args:
-            description: the robot.
+            description: the robot as its backend describes it: joints, their limits, and the lease term.
             first_epoch: epoch of the lease before its first holder. It must differ from that of any earlier host, so
                 that commands for another host are rejected.
             awaits_reports: whether arming waits until every joint module has reported its supply.

@@ -31,7 +31,7 @@ class Derating:
         """Start with all torque and without a report.
 
         Args:
-            description: the robot.
+            description: the robot as its backend describes it: joints, their limits, and the lease term.
             awaits_reports: whether arming waits until every module has reported its supply. It must not where time
                 is paused until the arming.
         """

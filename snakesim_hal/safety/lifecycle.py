@@ -87,7 +87,7 @@ def find_far_targets(command: JointCommand, angle_rad: Floats, description: Desc
     Args:
         command: the newest command before the arming.
         angle_rad: (n_joints,), the measured angles.
-        description: the robot.
+        description: the robot as its backend describes it: joints, their limits, and the lease term.
         isolated: (n_joints,), joints that stay passive and are not checked.
     """
     reasons: list[str] = []

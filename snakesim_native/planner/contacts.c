@@ -1,4 +1,4 @@
-// Contacts and propulsion margin of a body: see `path_growth.py` and `margin.py`.
+// Contacts and propulsion margin of a body: see `body_contacts.py` and `margin.py`.
 
 #include "search.h"
 

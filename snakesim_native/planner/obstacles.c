@@ -101,3 +101,20 @@ bool planner_is_clear(const Search* search, int64_t curvature, double x_m, doubl
     bool is_inner_side = curvature_per_m > 0.0 ? normal_to_left < 0.0 : normal_to_left > 0.0;
     return !(is_inner_side && curvature_per_m != 0.0);
 }
+
+// Write an obstacle into the cells of a window that have no nearer one. The window is within the grid.
+void snakesim_planner_mark_obstacle(const Grid* grid, const Window* window, int64_t obstacle)
+{
+    for (int64_t column = window->first_column; column < window->last_column; column++) {
+        double x_m = grid->low_x_m + grid->cell_m * (double)column;
+        for (int64_t row = window->first_row; row < window->last_row; row++) {
+            double y_m = grid->low_y_m + grid->cell_m * (double)row;
+            int64_t cell = column * grid->rows + row;
+            double distance_m = measure_distance(grid, obstacle, x_m, y_m).distance_m;
+            if (distance_m < grid->distance_m[cell]) {
+                grid->distance_m[cell] = distance_m;
+                grid->nearest[cell] = obstacle;
+            }
+        }
+    }
+}

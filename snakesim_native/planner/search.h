@@ -1,6 +1,6 @@
 // The data of the beam search, and the functions that its files share.
 //
-// `snakesim_gnc/navigation/path_growth.py` is the specification, and explains the cost. The C files compute the same
+// `snakesim_gnc/navigation/path_search/specified_growth.py` is the specification, and explains the cost. The C files compute the same
 // numbers, operation by operation and in the same order, so that every path is equal to the last bit. They must be
 // compiled with `-ffp-contract=off`: a fused multiplication and addition rounds once instead of twice.
 //
@@ -14,7 +14,7 @@
 // Nothing is allocated here, and every loop is bounded by a count in the structures below.
 //
 // In comments, n is the number of parents, c the number of curvatures and m that of obstacles. Points are in the world
-// frame. The layouts of the structures are repeated in `native_growth.py`; `snakesim_planner_layout` returns their
+// frame. The layouts of the structures are repeated in `native_library.py`; `snakesim_planner_layout` returns their
 // sizes for comparison.
 
 #ifndef SNAKESIM_PLANNER_SEARCH_H
@@ -99,13 +99,21 @@ typedef struct {
     double max_distance_m; // of cells without an obstacle, and outside of the grid
     int64_t columns;
     int64_t rows;
-    const int64_t* nearest;    // (columns, rows) index of the obstacle, or NO_OBSTACLE
-    const double* distance_m;  // (columns, rows)
+    int64_t* nearest;          // (columns, rows) index of the obstacle, or NO_OBSTACLE
+    double* distance_m;        // (columns, rows)
     const double* center_m;    // (m, 2)
     const double* direction;   // (m, 2) cosine and sine of the yaw
     const double* half_size_m; // (m, 2)
     const double* rounding_m;  // (m)
 } Grid;
+
+// A rectangle of cells; the last ones are not in it.
+typedef struct {
+    int64_t first_column;
+    int64_t last_column;
+    int64_t first_row;
+    int64_t last_row;
+} Window;
 
 // The arcs of all curvatures, as in `search_arcs.py`. Each array has c numbers.
 typedef struct {

@@ -27,7 +27,7 @@ MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower tha
 
 
 def list_topics(*, as_json: bool) -> int:
-    """Print the keys on which a robot publishes, with their content."""
+    """Print the keys on which a robot publishes, with their content. Returns the exit code."""
     if as_json:
         rows = [
             {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about} for row in _published_rows()
@@ -108,11 +108,11 @@ def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str
     """
     latched_keys = [f"{prefix}{row.key}" for row in rows if row.kind == "latched"]
     for latched_key in latched_keys:
-        session.on_latched_arrival(latched_key, queue.filtered_put(lambda key: intersects(pattern, key)))
+        session.on_latched_arrival(latched_key, queue.filtered_add(lambda key: intersects(pattern, key)))
     if len(latched_keys) < len(rows):
         session.on_arrival(
             pattern,
-            queue.filtered_put(lambda key: not any(intersects(latched_key, key) for latched_key in latched_keys)),
+            queue.filtered_add(lambda key: not any(intersects(latched_key, key) for latched_key in latched_keys)),
         )
 
 
@@ -154,7 +154,7 @@ class OutputQueue:
         self._bytes = 0
         self._dropped = 0
 
-    def put(self, arrival: Arrival) -> None:
+    def add(self, arrival: Arrival) -> None:
         """Add a sample. This runs in Zenoh's threads."""
         with self._lock:
             if self._bytes + len(arrival.payload) > MAX_WAITING_BYTES:
@@ -163,14 +163,14 @@ class OutputQueue:
             self._bytes += len(arrival.payload)
         self._arrivals.put(arrival)
 
-    def filtered_put(self, is_wanted: Callable[[str], bool]) -> Callable[[Arrival], None]:
-        """Return a function that adds a sample if `is_wanted` is true for its key."""
+    def filtered_add(self, is_selected: Callable[[str], bool]) -> Callable[[Arrival], None]:
+        """Return a function that adds a sample if `is_selected` is true for its key."""
 
-        def put(arrival: Arrival) -> None:
-            if is_wanted(arrival.key):
-                self.put(arrival)
+        def add_if_selected(arrival: Arrival) -> None:
+            if is_selected(arrival.key):
+                self.add(arrival)
 
-        return put
+        return add_if_selected
 
     def get(self, timeout: float | None = None) -> Arrival:
         """Return the oldest sample. Raises queue.Empty after `timeout` in s; None waits without a limit."""

@@ -79,7 +79,7 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     """Record episodes until q, or the end of the input.
 
     Args:
-        where: The robot.
+        where: Which robot to address.
         folder: Where the recordings go.
         task: The task that the operator demonstrates, in words.
         lines: Lines that the operator types.

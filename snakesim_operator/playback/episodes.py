@@ -98,7 +98,7 @@ def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool
     """
     record = RunRecord.load(run)
     reward_m = None
-    advance = Advance.of(record)
+    advance = Advance.from_run(record)
     if advance is not None:
         reward_m = _compute_reward_m(record, advance)
         if success is None and advance.goal_m is not None:

@@ -42,7 +42,6 @@ UNIT_OF_SUFFIX = {
     "_j": "J",
     "_hz": "Hz",
 }
-SIGNAL_NAMES = {"position_w": "position_w_m"}  # field of the record -> signal, where they differ
 UNITS = {
     "time_s": "s",
     "age_s": "s",
@@ -162,7 +161,7 @@ def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
     for column in fields(record):  # `vars` would include what the record has computed and cached
         value = getattr(record, column.name)
         if isinstance(value, np.ndarray):
-            signals[SIGNAL_NAMES.get(column.name, column.name)] = value
+            signals[column.name] = value
     return signals | record.custom
 
 

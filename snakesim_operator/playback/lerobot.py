@@ -71,7 +71,7 @@ def write_lerobot(
     """
     robot_hz = _common_rate_hz([one.record for one in episodes])
     step = _step(robot_hz, fps)
-    content = _Content.of(episodes)
+    content = _Content.from_episodes(episodes)
     chosen = [(episode, *_rows(episode, content, step)) for episode in episodes]
     non_empty = [(episode, rows, shown) for episode, rows, shown in chosen if len(rows)]
     for episode in episodes:
@@ -193,7 +193,7 @@ class _Content:
     cameras: dict[str, tuple[int, int]]  # width and height
 
     @staticmethod
-    def of(episodes: Sequence[Episode]) -> "_Content":
+    def from_episodes(episodes: Sequence[Episode]) -> "_Content":
         """Return what is known of every one of some episodes."""
         cameras = _camera_sizes(episodes[0])
         for episode in episodes[1:]:
@@ -309,7 +309,7 @@ def _frames(episode: Episode, content: _Content, rows: NDArray[np.int64]) -> Fra
     """Return the values of the features that an episode has by itself, (n, width) or (n,), without pictures."""
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]
-    state += [record.position_w, record.orientation_wxyz] if content.posed else []
+    state += [record.position_w_m, record.orientation_wxyz] if content.posed else []
     done = np.arange(len(rows)) == len(rows) - 1
     frames: Frames = {
         "observation.state": np.hstack(state)[rows].astype(np.float32),

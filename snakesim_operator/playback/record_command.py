@@ -28,7 +28,7 @@ def record_robot(
     """Record a robot until Ctrl-C, or for a time.
 
     Args:
-        where: The robot.
+        where: Which robot to address.
         out: The file; None: named after the robot and the time, in the working folder.
         duration_s: Wall time; None: until Ctrl-C.
         foxglove_port: Serve viewers on this port meanwhile; None: serve none.

@@ -67,7 +67,7 @@ def film(
     """Film a record.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         out: The film, an .mp4 or .gif file.
         size: Width and height in pixels.
         fps: Pictures a second.
@@ -97,7 +97,7 @@ def film(
             row = record.row_at(time_s)
             look_at = look_at + (_center(record, row) - look_at) * min(picture_s / FOLLOW_S, 1.0)
             picture = camera.picture(
-                record.position_w[row],
+                record.position_w_m[row],
                 record.orientation_wxyz[row],
                 record.angle_rad[row],
                 look_at,

@@ -22,7 +22,7 @@ INCOMPLETE_CODE = "recording/incomplete"
 
 MAX_MAGNITUDE = 1e9  # no signal is larger, in its SI unit; a larger number counts as infinite
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
-POSE = ("position_w", "orientation_wxyz")
+POSE = ("position_w_m", "orientation_wxyz")
 CONTACTS = ("contact_peak_n", "contact_count")
 
 

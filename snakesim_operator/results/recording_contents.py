@@ -183,7 +183,7 @@ class RecordingContents:
         columns: dict[str, NDArray[Any]] = {
             "tick": ticks,
             "time_s": ticks * robot.period_ns * 1e-9,
-            "position_w": poses[:, :3],
+            "position_w_m": poses[:, :3],
             "orientation_wxyz": poses[:, 3:],
             "contact_peak_n": np.array([row.contact_peak_n for row in rows], dtype=float),
             "contact_count": np.array([row.contact_count for row in rows], dtype=float),

@@ -49,7 +49,7 @@ class RunRecord:
     mode: NDArray[np.int8]  # (n, joints), values of messages.Mode
     target: Floats  # (n, joints), in the unit of the mode
     torque_limit_nm: Floats  # (n, joints)
-    position_w: Floats  # (n, 3) of the base
+    position_w_m: Floats  # (n, 3) of the base
     orientation_wxyz: Floats  # (n, 4)
     contact_peak_n: Floats  # (n,) strongest contact, mean over 50 ms
     contact_count: Floats  # (n,) obstacles touched
@@ -158,11 +158,11 @@ class RunRecord:
     @cached_property
     def posed(self) -> NDArray[np.bool_]:
         """A mask of the rows in which the pose and all angles are known, (n,)."""
-        signals = (self.position_w, self.orientation_wxyz, self.angle_rad)
+        signals = (self.position_w_m, self.orientation_wxyz, self.angle_rad)
         return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in signals])
 
     def nodes_w(self, row: int) -> Floats | None:
         """Return tail end, joints and head end in the world, (joints + 2, 3), or None if the pose is unknown."""
         if len(self.time_s) == 0 or not self.posed[row]:
             return None
-        return find_nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])
+        return find_nodes_w(self.description, self.position_w_m[row], self.orientation_wxyz[row], self.angle_rad[row])

@@ -66,7 +66,7 @@ class RunReader(Protocol):
         """Return the ticks since the first arming, one row each, in columns that are named as in the black box.
 
         `tick`, `time_s` (robot time), `contact_peak_n` and `contact_count` are (n,). `angle_rad`, `velocity_rad_s`,
-        `torque_nm`, `mode`, `target` and `torque_limit_nm` are (n, joints). `position_w` is (n, 3) in m, and
+        `torque_nm`, `mode`, `target` and `torque_limit_nm` are (n, joints). `position_w_m` is (n, 3), and
         `orientation_wxyz` is (n, 4). Numbers may be NaN or invalid.
         """
         ...

@@ -200,7 +200,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     """Compute the numbers of a run.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         ended: How it ended: complete, interrupted, or what failed.
         restarts: The processes that ended and were restarted.
         hosts: How many HAL hosts the run had.
@@ -212,7 +212,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     moved_m = path_m if path_m is not None else net_m
     motion = measure_motion(record)
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
-    advance = Advance.of(record)
+    advance = Advance.from_run(record)
     last_report = record.control[-1] if record.control else None
     too_slow: list[str] = []
     if last_report and last_report.too_slow:
@@ -239,15 +239,15 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         # Motion.
         path_distance_m=path_m,
         net_displacement_m=net_m,
-        **vars(Estimates.of(record)),
+        **vars(Estimates.from_run(record)),
         mean_speed_m_s=moved_m / known_s if moved_m is not None else None,
         locomoting_fraction=motion.moving_fraction if motion else None,
         **_reported_numbers(record, motion, last_report),
         # Forces and effort.
         **_load_numbers(record, has_power=has_power),
         **_advance_numbers(record, advance, has_power=has_power),
-        **vars(Effort.of(record, advance, has_power=has_power)),
-        **vars(Directions.of(record, advance, net_m, known_s, has_power=has_power)),
+        **vars(Effort.from_run(record, advance, has_power=has_power)),
+        **vars(Directions.from_run(record, advance, net_m, known_s, has_power=has_power)),
         # The host and its processes.
         state_to_command_us=host.state_to_command_us,
         tick_times=host.tick_times,

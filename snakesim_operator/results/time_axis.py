@@ -50,7 +50,7 @@ def merge_reports(record: RunRecord, values: Sequence[str | None]) -> list[Inter
     """Merge adjacent equal values into intervals.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         values: One value for each state that control reported; None: no interval.
     """
     bands: list[Interval] = []

@@ -90,7 +90,7 @@ def _arm_once(robot: str, backend: str, where: RobotSelection, print_text: Print
 
 
 def disarm(where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Make the joints passive; later commands do not move them."""
+    """Make the joints passive; later commands do not move them. Returns the exit code."""
     request = LifecycleRequest(action="disarm", requester=get_user_name())
     return _request_from_robot(only_robot(where, "robot disarm"), keys.LIFECYCLE, request, "disarmed", print_text)
 
@@ -99,6 +99,9 @@ def reset(where: RobotSelection, print_text: PrintLine = print_line) -> int:
     """Reset a fault or an emergency stop. The robot is disarmed then.
 
     If no robot runs, an emergency stop stored by the last run is removed.
+
+    Returns:
+        The exit code.
     """
     try:
         link = only_robot(where, "robot reset")
@@ -118,7 +121,10 @@ def reset(where: RobotSelection, print_text: PrintLine = print_line) -> int:
 
 
 def simulator(order: SimulatorOrder, where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses."""
+    """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses.
+
+    Returns the exit code.
+    """
     request = SimulatorRequest(
         action=order.action, requester=order.requester or get_user_name(), ticks=order.ticks, speed=order.speed
     )

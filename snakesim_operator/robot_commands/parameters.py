@@ -244,7 +244,7 @@ def known_name(name: str, in_force: ControlParameters) -> str:
 
 
 def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
-    """Print all parameters for `snakesim param list`."""
+    """Print all parameters for `snakesim param list`. Returns the exit code."""
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
         in_force = read_parameters_in_force(session)
     parameters = read_parameters(in_force)
@@ -267,7 +267,7 @@ def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
 
 
 def get_parameter(name: str, where: RobotSelection, *, as_json: bool) -> int:
-    """Print one value alone, for `snakesim param get`."""
+    """Print one value alone, for `snakesim param get`. Returns the exit code."""
     with open_session(only_robot(where, "param get"), CONNECT_S) as session:
         in_force = read_parameters_in_force(session)
     field = known_name(name, in_force)

@@ -26,12 +26,12 @@ def estop(where: RobotSelection, print_text: PrintLine = print_line) -> int:
     local = local_stop_ports(where)
     elsewhere = stop_ports_elsewhere(where, local)
 
-    def ask(address: Address) -> StopAnswer | None:
+    def request(address: Address) -> StopAnswer | None:
         return request_stop(*address, get_user_name(), LIMIT_S)
 
     with ThreadPoolExecutor(2 * len(local) + len(elsewhere) + 1) as pool:
-        local_futures = [pool.submit(stop_at_port, ask, address, robot) for address, robot in local.items()]
-        remote_futures = [pool.submit(stop_at_port, ask, address, robot) for address, robot in elsewhere.items()]
+        local_futures = [pool.submit(stop_at_port, request, address, robot) for address, robot in local.items()]
+        remote_futures = [pool.submit(stop_at_port, request, address, robot) for address, robot in elsewhere.items()]
         # Imported only now: the datagrams are sent meanwhile.
         from snakesim_operator.robot_commands.stop_by_query import ask_network
 

@@ -146,12 +146,12 @@ def write_results(
     summary = summarise(record, _describe_ending(ending), outcome.restarts, outcome.hosts)
     if outcome.too_slow:
         summary = msgspec.structs.replace(summary, too_slow=list(outcome.too_slow))
-    files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
+    files.write_file(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
     if report and extras.is_installed("record"):
         # Templates take a while to import, and the start of a run does not wait for them.
         from snakesim_operator.results.report import page
 
-        files.put(REPORT, page(record, summary).encode())
+        files.write_file(REPORT, page(record, summary).encode())
     return record, summary
 
 

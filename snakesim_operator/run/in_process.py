@@ -71,7 +71,7 @@ class ControlFailure:
     cause: BaseException | None  # what the controller raised; None: its answer was not allowed
 
     @staticmethod
-    def of(error: SnakesimError | None) -> "ControlFailure | None":
+    def from_error(error: SnakesimError | None) -> "ControlFailure | None":
         """Return the failure that belongs to the error that ended control; None without an error."""
         if error is None:
             return None
@@ -168,7 +168,7 @@ def simulate(
         note_reasons(ending, create_host_record(run.host), config)
         record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
         # No local variable holds the failure: its traceback holds this function's frame.
-        return Result(record, summary, gave_up, ControlFailure.of(run.take_errors().get(CONTROL)))
+        return Result(record, summary, gave_up, ControlFailure.from_error(run.take_errors().get(CONTROL)))
 
 
 def run_in_process(
@@ -269,7 +269,7 @@ def _run_to_end(
                     if recording is not None:
                         recording.flush_when_due()
                     if progress is not None and host.authority.arm_session:  # before the arming nothing changes
-                        progress.show(host.status(), control_states.newest(lambda _state: True), armed=True)
+                        progress.update(host.status(), control_states.newest(lambda _state: True), armed=True)
                     if ends_at_goal and goal_watch.over(host.black_box):
                         host.complete()
                 if ending.interrupted:

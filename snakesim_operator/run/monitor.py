@@ -145,7 +145,7 @@ class RunMonitor:
         self._read_host()
         newest_state = self._control_states.newest(lambda _state: True)
         self._control_state = newest_state or self._control_state
-        self._progress.show(self._status, self._control_state, armed=self._armed)
+        self._progress.update(self._status, self._control_state, armed=self._armed)
 
     def _sample_processor_waits(self) -> None:
         pids = self._supervisor.pids()

@@ -61,7 +61,7 @@ class Progress(OneLine):
         self._last_status = None
         self._armed_s = 0.0
 
-    def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
+    def update(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
         """Update the line, if an update is due.
 
         Args:

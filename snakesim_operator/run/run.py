@@ -246,7 +246,7 @@ class _RunProcesses:
         """Start each service that is the run's own, except those that run inside the host."""
         config = self.request.config
         for name, service in config.own_services.items():
-            if name in config.beside:
+            if name in config.in_host_services:
                 continue
             arguments = ["snakesim_hal.programs.service_program", name, *self.common_arguments]
             self.supervisor.start(name, arguments, may_restart=service.restart)

@@ -63,7 +63,7 @@ class RunFiles:
         self._appended[name] = appended_bytes
         self._add_task(_Task("append", name, content))
 
-    def put(self, name: str, content: bytes) -> None:
+    def write_file(self, name: str, content: bytes) -> None:
         """Write a whole file."""
         self._add_task(_Task("put", name, content))
 

@@ -19,7 +19,7 @@ def explain_key(loaded: Loaded, name: str, *, as_json: bool) -> int:
     """Print type, unit, range, default, meaning, value and origin of a key; for a table also one line for each key.
 
     Args:
-        loaded: the scenario.
+        loaded: the checked scenario, with the origin of each value.
         name: dotted key; `control.KEY` and `backend.KEY` are those of the chosen controller and backend.
         as_json: print JSON.
 

@@ -27,7 +27,7 @@ Row = tuple[str, Any, str]  # key, value, and the file or flag that it came from
 
 
 def print_shipped_files(*, as_json: bool) -> int:
-    """Print the name and the description of every shipped file."""
+    """Print the name and the description of every shipped file. Returns the exit code."""
     shipped_files: dict[str, dict[str, str]] = {}
     for kind, description_key in DESCRIPTION_KEYS.items():
         shipped_files[kind] = {
@@ -44,7 +44,10 @@ def print_shipped_files(*, as_json: bool) -> int:
 
 
 def show_config(loaded: Loaded, *, as_json: bool) -> int:
-    """Print every value of a scenario, and the file or flag that it came from. Raises ConfigError."""
+    """Print every value of a scenario, and the file or flag that it came from. Raises ConfigError.
+
+    Returns the exit code.
+    """
     check_plugins(loaded.config, loaded.table, run_files=False)
     rows = list_values(loaded)
     if as_json:

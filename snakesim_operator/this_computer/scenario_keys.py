@@ -49,7 +49,7 @@ def list_keys(loaded: Loaded, named: str = "") -> dict[str, Key]:
     """Return every key of a scenario by its dotted name.
 
     Args:
-        loaded: the scenario.
+        loaded: the checked scenario, with the origin of each value.
         named: a key; if it is in the section of a plugin that the scenario does not use, that section is listed too.
     """
     config = loaded.config

@@ -170,7 +170,7 @@ def emulator_on(
     """Make emulated servos for a whole robot.
 
     Args:
-        config: the run.
+        config: configuration of the run, with the robot and the settings of its backend.
         settings: the scenario's section of this driver type.
         ptys: a pseudo terminal for each of its ports.
         clock: the time of the servos.

@@ -275,7 +275,7 @@ class Servos(Drives):
         return findings
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of servos that are emulated in this process, or of their bus."""
+        """Begin or end a fault of emulated servos here, or of their bus. Returns whether it is possible."""
         if self._emulator is None or (injection.target_type, injection.kind) not in INJECTABLE:
             return False
         if injection.target_type == "joint":

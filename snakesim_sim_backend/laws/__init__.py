@@ -4,4 +4,8 @@
 `contact_friction`  friction of the contacts that MuJoCo finds
 `yielding`          obstacles on springs, and obstacles that slide on the ground
 `chain`             adds forces on the links to MuJoCo's generalized forces
+`laws`              what each version of the laws does
+`python_laws`       the Python version, made of the four modules above
+`native_laws`       the C version, in `snakesim_native/laws`
+`version`           chooses the version, and adds its parameters and memory to a model
 """

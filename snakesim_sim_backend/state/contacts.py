@@ -6,7 +6,7 @@ chain of NumPy calls.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -42,12 +42,11 @@ class TouchReader:
         """Yield all contacts of links with obstacles, in MuJoCo's order."""
         obstacle_geoms = self._obstacle_geoms
         pairs = self._friction.geom_pairs
-        touching: list[int] = []  # contacts of one obstacle with something else, so with a link
-        for i, (first, second) in enumerate(pairs):
-            if (first in obstacle_geoms) != (second in obstacle_geoms):
-                touching.append(i)
+        touching = self._find_touching(pairs)
         if not touching:
             return
+        normal_force_n = self._friction.normal_force_n
+        friction_force_w = self._friction.friction_force_w
         # Whole columns are converted at once: a view of each contact would cost more.
         frames = self._contact.frame.tolist()
         points_w = self._contact.pos.tolist()
@@ -63,8 +62,8 @@ class TouchReader:
                 sign = -1.0
             # MuJoCo's normal leads from the first geom to the second.
             x, y, z = (sign * component for component in frames[i][:3])
-            normal_n = self._friction.normal_force_n[i]
-            fx, fy, fz = self._friction.friction_force_w.get(i, NO_FORCE)
+            normal_n = normal_force_n[i]
+            fx, fy, fz = friction_force_w.get(i, NO_FORCE)
             yield Touch(
                 link=self._link_of_geom[link],
                 obstacle=self._obstacle_of_geom[obstacle] or "",
@@ -78,14 +77,28 @@ class TouchReader:
 
         It runs in every physics step, so it computes no vectors.
         """
-        obstacle_geoms = self._obstacle_geoms
+        pairs = self._friction.geom_pairs
+        touching = self._find_touching(pairs)
+        if not touching:
+            return {}
+        normal_force_n = self._friction.normal_force_n
         friction_force_w = self._friction.friction_force_w
         sums_n: dict[object, float] = {}
-        contacts = zip(self._friction.geom_pairs, self._friction.normal_force_n, strict=True)
-        for i, ((first, second), normal_n) in enumerate(contacts):
-            if normal_n > 0.0 and (first in obstacle_geoms) != (second in obstacle_geoms):
+        for i in touching:
+            normal_n = normal_force_n[i]
+            if normal_n > 0.0:
+                first, second = pairs[i]
                 force_n = normal_n
                 if i in friction_force_w:
                     force_n = math.hypot(normal_n, *friction_force_w[i])
                 sums_n[first, second] = sums_n.get((first, second), 0.0) + force_n
         return sums_n
+
+    def _find_touching(self, pairs: Sequence[Sequence[int]]) -> list[int]:
+        """Return the numbers of the contacts of one obstacle with something else, so with a link."""
+        obstacle_geoms = self._obstacle_geoms
+        touching: list[int] = []
+        for i, (first, second) in enumerate(pairs):
+            if (first in obstacle_geoms) != (second in obstacle_geoms):
+                touching.append(i)
+        return touching

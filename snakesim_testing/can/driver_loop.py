@@ -86,7 +86,8 @@ class Loop:
 def chain_of(backend: CanBackend) -> ModuleChain:
     """The emulators at the other end of its virtual buses."""
     wire = backend.modules.wires[0]
-    assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessEmulators)
+    assert isinstance(wire, VirtualWire)
+    assert isinstance(wire.peer, InProcessEmulators)
     return wire.peer.server.chain
 
 

@@ -201,14 +201,19 @@ class Model(RuleBasedStateMachine):
 
     def check(self, answer: Answer, ok: bool) -> None:
         assert answer.ok == ok and (answer.refusal is None) == ok, answer
-        assert answer.reason and answer.epoch == self.epoch and answer.lifecycle == self.state
+        assert answer.reason
+        assert answer.epoch == self.epoch
+        assert answer.lifecycle == self.state
 
     def check_aside(self, decision: TickDecision) -> None:
         points = decision.setpoints
-        assert points.isolated == self.aside and len(self.aside) <= self.max_isolated
+        assert points.isolated == self.aside
+        assert len(self.aside) <= self.max_isolated
         assert self.authority.isolated_joints == [f"joint_{i + 1}" for i in sorted(self.aside)]
         for i in self.aside:
-            assert (points.mode[i], points.target[i], points.torque_limit_nm[i]) == (Mode.PASSIVE, 0.0, 0.0)
+            assert points.mode[i] == Mode.PASSIVE
+            assert points.target[i] == 0.0
+            assert points.torque_limit_nm[i] == 0.0
 
     def of_the_rest(self, values: list[Any]) -> list[Any]:
         """What concerns the joints that are not set aside."""
@@ -218,7 +223,8 @@ class Model(RuleBasedStateMachine):
         return pytest.approx(self.of_the_rest([TORQUE * share for share in self.shares]))
 
     def check_safe(self, decision: TickDecision) -> None:
-        assert decision.sequence is None and not decision.limited
+        assert decision.sequence is None
+        assert not decision.limited
         action = self.action if self.state == "fault" and self.halt is not None else "passive"
         assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
         if action == "hold":
@@ -232,7 +238,8 @@ class Model(RuleBasedStateMachine):
         assert decision.setpoints.target == [0.0] * JOINTS
 
     def check_held(self, decision: TickDecision, angle_rad: list[float]) -> None:
-        assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION} and not decision.limited
+        assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION}
+        assert not decision.limited
         held = [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
         assert self.of_the_rest(decision.setpoints.target) == self.of_the_rest(held)
         assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
@@ -246,11 +253,13 @@ class Model(RuleBasedStateMachine):
             before = TORQUE if self.last is None else self.last.setpoints.torque_limit_nm[i]
             allowed = TORQUE if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
             cool = TORQUE * self.shares[i] + TINY
-            assert 0.0 <= applied <= min(cool, allowed) and applied <= before + TORQUE_RATE * PERIOD_S + TINY
+            assert 0.0 <= applied <= min(cool, allowed)
+            assert applied <= before + TORQUE_RATE * PERIOD_S + TINY
             if sent.mode[i] is not Mode.PASSIVE:
                 self.check_target(i, decision, sent.mode[i], sent.target[i], bound_by_heat=min(TORQUE, allowed) > cool)
             else:
-                assert decision.setpoints.target[i] == 0.0 and i not in decision.limited
+                assert decision.setpoints.target[i] == 0.0
+                assert i not in decision.limited
 
     def check_target(self, i: int, decision: TickDecision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
         """Inside the limits, no faster than allowed, as near to what is wanted as that permits; else named."""
@@ -273,7 +282,8 @@ class Model(RuleBasedStateMachine):
             step, start = TORQUE_RATE * PERIOD_S, torque
         if self.last is not None and self.last.setpoints.mode[i] is mode:
             start = self.last.setpoints.target[i]
-        assert math.isfinite(target) and low <= target <= high
+        assert math.isfinite(target)
+        assert low <= target <= high
         assert abs(target - start) <= step + TINY or target in (low, high)  # the limits themselves outrank the rate
         assert abs(target - within(within(wanted, start - step, start + step), low, high)) <= TINY
         assert (i in decision.limited) == (target != wanted or bound_by_heat)

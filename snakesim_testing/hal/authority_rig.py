@@ -65,7 +65,8 @@ def commanded(target: Any = 0.1, mode: Any = Mode.POSITION, **robot: Any) -> Rig
     """Not armed yet: its joints are at 0.1 rad, and a holder of the lease commands it."""
     rig = Rig(**robot)
     rig.observe(0.1)
-    assert rig.acquire().ok and rig.send(target, mode) is None
+    assert rig.acquire().ok
+    assert rig.send(target, mode) is None
     return rig
 
 
@@ -79,5 +80,5 @@ def modes(decision: TickDecision) -> set[Mode]:
     return set(decision.setpoints.mode)
 
 
-def receive(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
+def report_power(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
     rig.authority.observe_power(power(motor_c, volts, valid=valid or True), rig.now_ns)

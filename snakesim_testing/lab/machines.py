@@ -25,7 +25,8 @@ class Machine:
     def __init__(self, stack: ExitStack, name: str = "a machine") -> None:
         self.name, self._stack = name, stack
         self._holder = self._started(["unshare", "--net", "sh", "-c", "echo ready; exec sleep infinity"])
-        assert self._holder.stdout is not None and self._holder.stdout.readline() == b"ready\n"
+        assert self._holder.stdout is not None
+        assert self._holder.stdout.readline() == b"ready\n"
         self.run("ip", "link", "set", "lo", "up")
 
     @property

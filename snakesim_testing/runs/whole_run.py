@@ -32,7 +32,7 @@ class Run:
         assert route is not None
         places: list[float] = []
         near: float | None = None
-        for point in self.record.position_w[:, :2]:
+        for point in self.record.position_w_m[:, :2]:
             near = route.project(point, near)
             places.append(near)
         return np.array(places)

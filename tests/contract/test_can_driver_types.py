@@ -133,17 +133,23 @@ def test_driver_describes_the_drives_where_they_report_themselves(robot: Robot) 
 def test_drive_error_persists_until_reset_and_is_reported_again(
     robot: Robot,
 ) -> None:
-    assert robot.run(30, "disarmed") == [] and robot.run(30, "armed") == []
+    assert robot.run(30, "disarmed") == []
+    assert robot.run(30, "armed") == []
     robot.go_wrong("overheat:joint_2@0-9")
     fault = robot.run(SHOWN, "armed")[0]
-    assert (fault.what, fault.joint) == ("drive_fault", "joint_2") and robot.driver_type.overheated in fault.cause
-    assert robot.run(50, "fault") == [] and robot.run(50, "estop") == [] and robot.following() == [False] * JOINTS
+    assert fault.what == "drive_fault"
+    assert fault.joint == "joint_2"
+    assert robot.driver_type.overheated in fault.cause
+    assert robot.run(50, "fault") == []
+    assert robot.run(50, "estop") == []
+    assert robot.following() == [False] * JOINTS
     assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], "reset while it was still hot"
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
     robot.emulator.body.thermal.winding_c[:] = 20.0
     robot.run(5, "fault")
     assert robot.run(CLEARED, "disarmed") == []
-    assert robot.run(60, "armed") == [] and robot.joints is not None
+    assert robot.run(60, "armed") == []
+    assert robot.joints is not None
     assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
 
 
@@ -151,14 +157,19 @@ def test_drive_restarted_in_motion_stays_off_until_reset(robot: Robot) -> None:
     robot.run(20, "armed")
     robot.go_wrong("reboot:joint_3@0")
     faults = robot.run(80, "armed")
-    assert faults[0].what == "drive_silent" and faults[0].joint == "joint_3"
-    assert not faults[1:] and robot.following() == [False] * JOINTS
-    assert robot.run(10, "fault") == [] and robot.run(10, "disarmed") == []
+    assert faults[0].what == "drive_silent"
+    assert faults[0].joint == "joint_3"
+    assert not faults[1:]
+    assert robot.following() == [False] * JOINTS
+    assert robot.run(10, "fault") == []
+    assert robot.run(10, "disarmed") == []
     robot.run(40, "armed")
-    assert robot.following() == [True] * JOINTS and robot.joints is not None
+    assert robot.following() == [True] * JOINTS
+    assert robot.joints is not None
     assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
     settings = [robot.driver_type.settings(robot.emulator, joint) for joint in range(JOINTS)]
-    assert settings[2] == settings[0] and law_of(robot.emulator, 2)[1] == pytest.approx(1.0, abs=0.01)
+    assert settings[2] == settings[0]
+    assert law_of(robot.emulator, 2)[1] == pytest.approx(1.0, abs=0.01)
 
 
 def test_drive_restarted_between_ticks_does_not_continue(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,11 +183,14 @@ def test_joint_lost_while_armed_is_ignored_until_used_again(robot: Robot) -> Non
     robot.run(20, "armed")
     robot.go_wrong("mute:joint_1@0")
     robot.isolated = frozenset({0})
-    assert robot.run(60, "armed") == [] and robot.following() == [False, True, True, True]
+    assert robot.run(60, "armed") == []
+    assert robot.following() == [False, True, True, True]
     assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, "it silences nobody behind it"
     robot.go_wrong("mute:joint_1@0", begins=False)
     robot.isolated = frozenset()
-    assert robot.run(30, "disarmed") == [] and robot.run(20, "armed") == [] and robot.following() == [True] * JOINTS
+    assert robot.run(30, "disarmed") == []
+    assert robot.run(20, "armed") == []
+    assert robot.following() == [True] * JOINTS
 
 
 def test_drives_stop_by_watchdog_when_driver_is_gone(
@@ -192,7 +206,8 @@ def test_drives_stop_by_watchdog_when_driver_is_gone(
     assert {fault.what for fault in faults} == {"drive_fault"}
     assert all(robot.driver_type.expired in fault.cause for fault in faults)
     robot.backend._drives.bring_up()
-    assert robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
+    assert robot.run(SHOWN, "disarmed") == []
+    assert robot.run(SHOWN, "armed") == []
 
 
 def test_drives_stopped_behind_cut_bus_are_read_before_clearing(robot: Robot) -> None:
@@ -205,8 +220,11 @@ def test_drives_stopped_behind_cut_bus_are_read_before_clearing(robot: Robot) ->
     robot.damps = True
     faults = robot.run(SHOWN, "fault")
     assert {(fault.what, fault.joint) for fault in faults} == {("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)}
-    assert all(robot.driver_type.expired in fault.cause for fault in faults) and robot.following() == [False] * JOINTS
-    assert robot.run(10, "disarmed") == [] and robot.run(30, "armed") == [] and robot.following() == [True] * JOINTS
+    assert all(robot.driver_type.expired in fault.cause for fault in faults)
+    assert robot.following() == [False] * JOINTS
+    assert robot.run(10, "disarmed") == []
+    assert robot.run(30, "armed") == []
+    assert robot.following() == [True] * JOINTS
 
 
 def test_unreadable_stop_is_not_cleared_meanwhile(robot: Robot) -> None:
@@ -262,17 +280,23 @@ def test_drive_with_other_id_is_missing_then_a_stranger(robot: Robot, monkeypatc
 def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: Robot) -> None:
     robot.run(20, "armed")
     serials = [joint.serial for joint in robot.backend.describe().joints]
-    assert len(set(serials)) == JOINTS and all(serials)
+    assert len(set(serials)) == JOINTS
+    assert all(serials)
     robot.go_wrong("duplicate:joint_2@0-9")
     [fault] = robot.run(SHOWN, "armed")
-    assert (fault.what, fault.joint, fault.reach) == ("duplicate_node", "joint_2", "robot")
-    assert serials[1] in fault.cause and robot.following() == [False] * JOINTS
+    assert fault.what == "duplicate_node"
+    assert fault.joint == "joint_2"
+    assert fault.reach == "robot"
+    assert serials[1] in fault.cause
+    assert robot.following() == [False] * JOINTS
     assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "reset while it is there"
     with raises_error(BackendError, code="drive/not-complete"):
         robot.backend._drives.bring_up()
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
     robot.backend._drives.bring_up()
-    assert robot.run(5, "fault") == [] and robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
+    assert robot.run(5, "fault") == []
+    assert robot.run(SHOWN, "disarmed") == []
+    assert robot.run(SHOWN, "armed") == []
 
 
 @on_can
@@ -295,7 +319,8 @@ def test_bus_log_is_read_by_python_can_as_sent(driver_type: Family, tmp_path: Pa
     one.backend.close()
     with can.LogReader(tmp_path / "bus.log") as log:
         frames = list(log)
-    assert len(frames) > 5 * 3 * JOINTS and {frame.is_fd for frame in frames} == {driver_type.backend is MoteusBackend}
+    assert len(frames) > 5 * 3 * JOINTS
+    assert {frame.is_fd for frame in frames} == {driver_type.backend is MoteusBackend}
     assert {frame.is_rx for frame in frames} == {True, False}
     assert all(frame.is_extended_id == (frame.arbitration_id > 0x7FF) for frame in frames)
 

@@ -27,7 +27,8 @@ def test_readme_walk_reaches_the_line_that_limits_torque() -> None:
     readme = (ROOT / "README.md").read_text()
     assert "](docs/concepts/architecture.md#walks-through-the-code)" in readme
     assert f"]({HOPS[0][1]})" in readme
-    assert len(HOPS) < 5 and HOPS[-1][1] == "snakesim_hal/safety/limiter.py"
+    assert len(HOPS) < 5
+    assert HOPS[-1][1] == "snakesim_hal/safety/limiter.py"
     for (name, path, line), following in zip(HOPS, [*HOPS[1:], None], strict=True):
         assert any(line in source for source in sources(path, name)), f"{line!r} is not in {name} of {path}"
         if following is not None:

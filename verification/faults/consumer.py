@@ -22,11 +22,11 @@ def main() -> None:
     """Until killed."""
     kind, endpoint, namespace = sys.argv[1:]
     die_with_parent()
-    said: list[bool] = []
+    was_reported: list[bool] = []
 
     def sleeps(_arrival: Arrival) -> None:
-        if not said:
-            said.append(True)
+        if not was_reported:
+            was_reported.append(True)
             print(STUCK, flush=True)
         time.sleep(SLEEP_S)
 
@@ -35,8 +35,8 @@ def main() -> None:
             with Path("/dev/full").open("wb") as file:
                 file.write(arrival.payload)
         except OSError as error:
-            if not said:
-                said.append(True)
+            if not was_reported:
+                was_reported.append(True)
                 print(f"{STUCK}: {error.strerror}", flush=True)
             raise
 

@@ -58,12 +58,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("notes", type=Path)
     parser.add_argument("--pose", required=True)
     parser.add_argument("--parent", type=int, required=True)
-    given = parser.parse_args(argv)
-    die_with_parent(given.parent)
+    arguments = parser.parse_args(argv)
+    die_with_parent(arguments.parent)
     running = [True]
     on_stop_signal(running.clear)
-    with ExitStack() as opened, given.notes.open("w", buffering=1) as notes:
-        drives = open_drives(load(given.config).config, given.pose, opened)
+    with ExitStack() as opened, arguments.notes.open("w", buffering=1) as notes:
+        drives = open_drives(load(arguments.config).config, arguments.pose, opened)
         tune_garbage_collector()
         with contextlib.suppress(OSError):  # real drives do not wait for a busy computer
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVICE_PRIORITY))

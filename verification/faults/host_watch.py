@@ -13,7 +13,7 @@ import msgspec
 
 from snakesim_hal.network.private_channel import MAX_BYTES, HostMessage, socket_pair
 from snakesim_hal.wire.messages import Status
-from verification.faults.observer import Heard, TrialError
+from verification.faults.observer import Received, TrialError
 
 LOOK_S = 0.0005
 LIMIT_S = 10.0
@@ -24,7 +24,7 @@ OBSERVER_PRIORITY = 30  # of 99; host and control have 20
 def urgently() -> Iterator[None]:
     """Have this thread, and those that start meanwhile, outrank the robot's own where the system lets them.
 
-    So an observer is not kept waiting by a controller that is busy, and has priority. Processes do not inherit it.
+    So a busy controller does not delay an observer, and has priority. Processes do not inherit it.
     """
     priority = os.sched_param(OBSERVER_PRIORITY)
     with contextlib.suppress(OSError):
@@ -42,7 +42,7 @@ class HostWatch:
     def __init__(self) -> None:
         self._socket, self.inherited = socket_pair()
         self._socket.settimeout(0.1)
-        self._statuses: list[Heard[Status]] = []
+        self._statuses: list[Received[Status]] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="host watch", daemon=True)
         with urgently():
@@ -56,16 +56,16 @@ class HostWatch:
         self.inherited.close()
 
     def lifecycle(self) -> str | None:
-        """What was told last."""
+        """Return the newest status."""
         return self._statuses[-1].message.lifecycle if self._statuses else None
 
-    def first(self, condition: Callable[[Status], bool], since_ns: int, what: str) -> Heard[Status]:
+    def first(self, condition: Callable[[Status], bool], since_ns: int, what: str) -> Received[Status]:
         """The first status after a time of which a condition holds. Raises TrialError when none comes."""
         deadline = time.monotonic() + LIMIT_S
         while time.monotonic() < deadline:
-            for heard in list(self._statuses):
-                if heard.at_ns >= since_ns and condition(heard.message):
-                    return heard
+            for received in list(self._statuses):
+                if received.at_ns >= since_ns and condition(received.message):
+                    return received
             time.sleep(LOOK_S)
         raise TrialError(f"the host did not say within {LIMIT_S:g} s: {what}; last: {self.lifecycle()}")
 
@@ -73,11 +73,11 @@ class HostWatch:
         decoder = msgspec.msgpack.Decoder(HostMessage)
         while not self._over.is_set():
             try:
-                said = decoder.decode(self._socket.recv(MAX_BYTES))
+                host_message = decoder.decode(self._socket.recv(MAX_BYTES))
             except TimeoutError:
                 continue
             except (OSError, msgspec.DecodeError):  # the host is gone
                 self._over.wait(0.1)
                 continue
-            if said.status is not None:
-                self._statuses.append(Heard(time.monotonic_ns(), said.status))
+            if host_message.status is not None:
+                self._statuses.append(Received(time.monotonic_ns(), host_message.status))

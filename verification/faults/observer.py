@@ -1,4 +1,4 @@
-"""Watches a robot from a session of its own, and stands for the operator: what came when, reset, and arm.
+"""Watches a robot from a session of its own, and acts as the operator: records when messages arrive, resets and arms.
 
 Times are of the monotonic clock when a sample reached this process, so they are upper bounds.
 """
@@ -29,7 +29,7 @@ from snakesim_hal.wire.messages import (
 
 LIMIT_S = 30.0
 LOOK_S = 0.002
-ASKED = 5  # times, before nobody seems to be there
+MAX_REQUESTS = 5  # before the host counts as absent
 FoundT = TypeVar("FoundT")
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -39,23 +39,23 @@ class TrialError(AssertionError):
 
 
 @dataclass(frozen=True)
-class Heard(Generic[MessageT]):
-    """A message, and when it came."""
+class Received(Generic[MessageT]):
+    """A message, and when it arrived."""
 
     at_ns: int
     message: MessageT
 
 
 class Observer:
-    """Keeps what it hears until `forget`."""
+    """Records what the robot publishes, until `forget`."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self.status: Status | None = None
         self.stumbles = 0  # armings that did not last, or were refused at the last moment
-        self.statuses: list[Heard[Status]] = []
-        self.applied: list[Heard[AppliedCommand]] = []
-        self.clocks: list[Heard[Clock]] = []
+        self.statuses: list[Received[Status]] = []
+        self.applied: list[Received[AppliedCommand]] = []
+        self.clocks: list[Received[Clock]] = []
         self.joints: dict[int, JointState] = {}
         self.commands: list[Arrival] = []
         self._inbox: SimpleQueue[Arrival] = SimpleQueue()
@@ -77,7 +77,7 @@ class Observer:
     # --- what comes in ----------------------------------------------------------------------------------------
 
     def listen(self) -> None:
-        """Take in what has come."""
+        """Record the messages that have arrived since the last call."""
         while True:
             try:
                 arrival = self._inbox.get_nowait()
@@ -89,31 +89,31 @@ class Observer:
             try:
                 message = self._decoders[arrival.key].decode(arrival.payload, arrival.encoding)
             except WireError as error:  # a joint state with no number in it, say
-                self.could_not_read(arrival, error)
+                self.on_unreadable(arrival, error)
             else:
                 self.receive(arrival.monotonic_ns, message)
 
-    def could_not_read(self, arrival: Arrival, error: WireError) -> None:
-        """Something came that is no message: it is left out."""
+    def on_unreadable(self, arrival: Arrival, error: WireError) -> None:
+        """Ignore a sample that cannot be decoded. Subclasses may record it."""
 
     def receive(self, at_ns: int, message: Any) -> None:
-        """A message came."""
+        """Record a message. at_ns: its arrival, by the monotonic clock."""
         match message:
             case Status():
                 self.status = message
-                self.statuses.append(Heard(at_ns, message))
+                self.statuses.append(Received(at_ns, message))
             case AppliedCommand():
-                self.applied.append(Heard(at_ns, message))
+                self.applied.append(Received(at_ns, message))
             case Clock():
-                self.clocks.append(Heard(at_ns, message))
+                self.clocks.append(Received(at_ns, message))
             case _:
                 self.joints[message.tick] = message
 
     def forget(self) -> None:
-        """Start afresh; the newest status stays known."""
+        """Delete the recorded messages; the newest status stays known."""
         self.listen()
-        for kept in (self.statuses, self.applied, self.clocks, self.joints, self.commands):
-            kept.clear()
+        for messages in (self.statuses, self.applied, self.clocks, self.joints, self.commands):
+            messages.clear()
 
     def until(self, condition: Callable[[], FoundT | None], what: str, limit_s: float = LIMIT_S) -> FoundT:
         """Listen until a condition holds; what it found. Raises TrialError with its name when it does not in time."""
@@ -134,11 +134,11 @@ class Observer:
             self.listen()
 
     def in_words(self) -> str:
-        """What the robot said last."""
+        """Return the newest status in words."""
         return "no status" if self.status is None else f"{self.status.lifecycle}: {self.status.reason}"
 
     def state(self) -> str | None:
-        """The lifecycle that was told last."""
+        """Return the newest lifecycle state."""
         return None if self.status is None else self.status.lifecycle
 
     def description(self) -> Description:
@@ -152,8 +152,8 @@ class Observer:
 
     # --- what is looked for -----------------------------------------------------------------------------------
 
-    def first_safe(self, since_ns: int) -> Heard[AppliedCommand] | None:
-        """The first setpoints after a time that are the host's own stop mode."""
+    def first_safe(self, since_ns: int) -> Received[AppliedCommand] | None:
+        """Return the first setpoints after a time that are the host's own stop mode."""
         return next((h for h in self.applied if h.at_ns >= since_ns and h.message.sequence is None), None)
 
     def safe_after_ms(self, since_ns: int) -> float:
@@ -171,20 +171,20 @@ class Observer:
     # --- the operator -----------------------------------------------------------------------------------------
 
     def ask(self, key: str, request: Message) -> Answer:
-        """Ask until it is answered; a no is an answer too. Raises TrialError when nobody answers.
+        """Repeat a request until the host answers; a refusal is an answer, too. Raises TrialError without an answer.
 
-        A flood of queries may push an answer out, and then whoever asked asks again.
+        A flood of queries may displace an answer; then the request is repeated.
         """
         why = ""
-        for _ in range(ASKED):
+        for _ in range(MAX_REQUESTS):
             try:
                 return self.session.request(key, request, timeout_s=2.0)
             except NotConnectedError as error:
                 why = str(error)
-        raise TrialError(f"{why}, asked {ASKED} times")
+        raise TrialError(f"{why}, requested {MAX_REQUESTS} times")
 
     def inject(self, part: str, kind: str, target: str, **more: Any) -> Answer:
-        """Let something go wrong by the product's own injector. Raises TrialError when it refuses."""
+        """Inject a fault through the robot's own injector. Raises TrialError if it refuses."""
         answer = self.ask(keys.fault_key(part), FaultRequest(kind=kind, target=target, **more))
         if not answer.ok:
             raise TrialError(f"{kind}:{target} was refused: {answer.reason}")
@@ -194,11 +194,11 @@ class Observer:
         """Reset what is latched, if anything is."""
         self.until(lambda: self.status is not None, "a status")
         if self.state() in ("fault", "estop"):
-            asked_ns = time.monotonic_ns()
+            requested_ns = time.monotonic_ns()
             self.ask(keys.LIFECYCLE, LifecycleRequest(action="reset"))
 
             def is_reset() -> bool:  # if only for a moment: what goes wrong next is another fault
-                since = [h.message.lifecycle for h in self.statuses if h.at_ns > asked_ns]
+                since = [h.message.lifecycle for h in self.statuses if h.at_ns > requested_ns]
                 return self.state() == "disarmed" or "disarmed" in since
 
             self.until(is_reset, "disarmed after reset", 5.0)
@@ -231,7 +231,7 @@ class Observer:
         return self.state() != "fault"
 
     def _make_ready(self, limit_s: float) -> None:
-        """Reset, as often as something more is told: what went wrong in the meantime is told after the reset."""
+        """Reset until no further fault is reported: a fault of the meantime is reported after the reset."""
         deadline = time.monotonic() + limit_s
         while self.status is None or not self.status.ready_to_arm:
             self.reset()
@@ -246,8 +246,8 @@ class Observer:
         """Largest steps of applied angle targets since `forget`, which `arm` calls; as a trial tells them."""
         within = first = 0.0
         before: AppliedCommand | None = None
-        for heard in self.applied:
-            now = heard.message
+        for received in self.applied:
+            now = received.message
             measured = self.joints.get(now.tick)
             for i, mode in enumerate(now.mode):
                 if mode is not Mode.POSITION:

@@ -37,7 +37,7 @@ class Robot:
     """Host, guidance, navigation and control, each a process of its own; any can be killed, frozen, started again."""
 
     def __init__(self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False) -> None:
-        """router: somebody else listens at the endpoint."""
+        """router: another process listens at the endpoint."""
         self.folder, self.config, self.router = folder, config, router
         self.endpoint = endpoint or free_endpoint()
         self.running: dict[str, Child] = {}
@@ -101,7 +101,7 @@ class Robot:
 
     def ended(self) -> list[str]:
         """Which of its processes are gone, and how."""
-        return [how for child in self.running.values() if (how := child.describe_end()) is not None]
+        return [ending for child in self.running.values() if (ending := child.describe_end()) is not None]
 
     def last_words(self) -> str:
         """Of those that are gone."""
@@ -132,14 +132,14 @@ def robot(
     request: Request, config: RunConfig | None = None, *, router: bool = False, **dotted: Any
 ) -> Iterator[tuple[Robot, Observer]]:
     """A robot with all its processes, and who watches it. config: other than `configuration` with these values."""
-    with Robot(request.folder, config or configuration(request.backend, **dotted), router=router) as made:
+    with Robot(request.folder, config or configuration(request.backend, **dotted), router=router) as started_robot:
         if router:
-            made.start("router")
-            made.observe().session.close()  # it is there
-        made.start_all()
-        observer = made.observe()
+            started_robot.start("router")
+            started_robot.observe().session.close()  # it is there
+        started_robot.start_all()
+        observer = started_robot.observe()
         observer.arm(START_LIMIT_S)
-        yield made, observer
+        yield started_robot, observer
         request.retry(observer.stumbles)
 
 

@@ -30,7 +30,14 @@ from verification.installation.distributions import required
 pytestmark = pytest.mark.e2e
 
 SCHEMAS = REPOSITORY / "schemas"
-PACKAGES = ("snakesim_can_backend", "snakesim_gnc", "snakesim_hal", "snakesim_operator", "snakesim_sim_backend")
+PACKAGES = (
+    "snakesim_can_backend",
+    "snakesim_gnc",
+    "snakesim_hal",
+    "snakesim_native",
+    "snakesim_operator",
+    "snakesim_sim_backend",
+)
 
 
 def run(*command: object, cwd: Path, **more: str) -> str:

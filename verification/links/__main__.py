@@ -85,7 +85,7 @@ def moved(folder: Path) -> tuple[str, str]:
         return "-", "-"
     host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
     record = RunRecord.load(folder)
-    steps_m = np.hypot(*np.diff(record.position_w[:, :2], axis=0).T)
+    steps_m = np.hypot(*np.diff(record.position_w_m[:, :2], axis=0).T)
     steps_s = np.diff(record.time_s)
     driven = (steps_s < 0.1) & np.isfinite(steps_m) & (np.abs(record.torque_nm[1:]).max(axis=1) > 0.05)
     speed = steps_m[driven].sum() / max(steps_s[driven].sum(), 1e-9)

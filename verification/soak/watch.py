@@ -33,7 +33,7 @@ class Watch(Observer):
         super().listen()
         self.commands.clear()
 
-    def could_not_read(self, arrival: Arrival, error: WireError) -> None:
+    def on_unreadable(self, arrival: Arrival, error: WireError) -> None:
         """It is counted, by key and reason."""
         self.counts[f"{arrival.key}: {error.reason}"] += 1
 

@@ -95,7 +95,7 @@ def compose_table(scenario: str, overrides: Sequence[Override] = ()) -> Table:
     # Another robot or scene is chosen before its single values are changed.
     file_choices = [override for override in overrides if override.key in ("robot", "scene")]
     for choice in file_choices:
-        table.put(choice.key, choice.value, choice.flag)
+        table.set_value(choice.key, choice.value, choice.flag)
     chosen_by_flag = {choice.key for choice in file_choices}
     for part, kind in (("robot", "robots"), ("scene", "scenes")):
         relative_to = None if part in chosen_by_flag else path.parent
@@ -118,7 +118,7 @@ def _include_file(table: Table, part: str, kind: str, relative_to: Path | None) 
     if not isinstance(name, str):
         return
     included = read_part(name, kind, relative_to)
-    table.put(part, included.values, included.source)
+    table.set_value(part, included.values, included.source)
     # With `extends`, the values of one part come from two files.
     table.origin |= {f"{part}.{key}": origin for key, origin in included.origin.items()}
 
@@ -126,7 +126,7 @@ def _include_file(table: Table, part: str, kind: str, relative_to: Path | None) 
 def _apply_override(table: Table, override: Override) -> None:
     """Put a value from the command line into the table."""
     key = _expand_chosen(table, override.key)
-    table.put(key, override.value, override.flag)
+    table.set_value(key, override.value, override.flag)
     if key == "controller":
         _split_policy(table, override.value, override.flag)
 
@@ -156,11 +156,11 @@ def _fit_scene(table: Table, flags: set[str]) -> None:
 
     changed = fit_scene(config.scene, config.robot, is_set_by_flag)
     for key, value in changed.items():
-        table.put(f"scene.{key}", value, f"fitted to robot {config.robot.name!r}")
+        table.set_value(f"scene.{key}", value, f"fitted to robot {config.robot.name!r}")
 
 
 def _split_policy(table: Table, controller: Any, origin: str) -> None:
     """Replace the controller `policy:MODEL` by the controller `policy` and its parameter `model`."""
     if isinstance(controller, str) and controller.startswith(POLICY):
-        table.put("controller", POLICY_CONTROLLER, origin)
-        table.put(f"controllers.{POLICY_CONTROLLER}.model", controller.removeprefix(POLICY), origin)
+        table.set_value("controller", POLICY_CONTROLLER, origin)
+        table.set_value(f"controllers.{POLICY_CONTROLLER}.model", controller.removeprefix(POLICY), origin)

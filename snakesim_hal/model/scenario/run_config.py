@@ -184,7 +184,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return {name: service for name, service in self.services.items() if not service.external}
 
     @property
-    def beside(self) -> list[str]:
+    def in_host_services(self) -> list[str]:
         """Return the names of the services that run in the process of the HAL host."""
         return [name for name, service in self.own_services.items() if service.process == "host"]
 

@@ -1,6 +1,6 @@
 """The robot as its HAL host describes it: joints, links, sensors, and the configuration of the run."""
 
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -97,6 +97,10 @@ class Description(Message, frozen=True, kw_only=True):
         Meta(max_length=8),
         about("hashes of what the host's BLAS, NumPy and C library compute: where they are equal, digests can be"),
     ] = {}
+    laws: Annotated[
+        Literal["c", "python"] | None,
+        about("in which language a simulator computes ground and friction, with equal results; null: no simulator"),
+    ] = None
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
     links: Annotated[
         list[LinkDescription],

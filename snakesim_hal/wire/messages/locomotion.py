@@ -19,7 +19,7 @@ class Obstacle(Message, frozen=True, kw_only=True):
     radius_m: Annotated[q.Length, about("of a cylinder or sphere")] = 0.0
     half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
     height_m: q.Length = 0.0
-    confidence: q.Fraction = 1.0
+    confidence: Annotated[q.Fraction, about("1: measured; less: estimated")] = 1.0
     position_sd_m: Annotated[q.Distance, about("standard deviation of `position_w`, horizontally; 0: exact")] = 0.0
     size_sd_m: Annotated[q.Distance, about("standard deviation of `radius_m` or `half_size_m`; 0: exact")] = 0.0
     last_seen_ns: Annotated[
@@ -34,11 +34,11 @@ class WorldContact(Message, frozen=True, kw_only=True):
     link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
     obstacle: Annotated[q.Name | None, about("touched obstacle; null: unknown")]
     body_s_m: Annotated[q.Length, about("arc length from the tail end along the chain")]
-    position_w: q.Vector
+    position_w: Annotated[q.Vector, about("where the body touches the obstacle")]
     normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
     tangent_w: Annotated[q.UnitVector, about("across the normal, towards the head")]
     force_w: Annotated[q.ForceVector, about("on the body")]
-    confidence: q.Fraction = 1.0
+    confidence: Annotated[q.Fraction, about("1: measured; less: estimated")] = 1.0
 
 
 class World(Message, frozen=True, kw_only=True):
@@ -46,11 +46,11 @@ class World(Message, frozen=True, kw_only=True):
 
     tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
     timestamp_ns: Annotated[q.Stamp, about("of the joint state that it was computed from")]
-    base_position_w: q.Vector
-    base_orientation_wxyz: q.Quaternion
-    base_confidence: q.Fraction
-    contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS)]
-    obstacles: Annotated[list[Obstacle], Meta(max_length=4096)]
+    base_position_w: Annotated[q.Vector, about("of the tail end")]
+    base_orientation_wxyz: Annotated[q.Quaternion, about("of the tail link")]
+    base_confidence: Annotated[q.Fraction, about("of the base's pose")]
+    contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")]
+    obstacles: Annotated[list[Obstacle], Meta(max_length=4096), about("in the neighborhood of the body")]
     pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
     contacts_timestamp_ns: Annotated[
         q.Stamp | None, about("of the contacts in it; null: no sample yet, and no estimate")

@@ -47,7 +47,7 @@ class Fault(Message, frozen=True, kw_only=True):
 
     tick: q.Tick
     what: Annotated[q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")]
-    cause: q.Reason
+    cause: Annotated[q.Reason, about("in words, for the operator")]
     joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
     reach: Annotated[
         Reach,

@@ -169,7 +169,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
 
     Args:
         path: robot file.
-        selection: the robot.
+        selection: which robot to address.
         names: joints; none: all.
 
     Returns:
@@ -197,7 +197,7 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
 
     Args:
         path: robot file.
-        selection: the robot.
+        selection: which robot to address.
         names: joints; none: all.
         degrees: the angle.
 
@@ -271,7 +271,7 @@ def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
 
     Args:
         path: robot file.
-        selection: the robot.
+        selection: which robot to address.
         names: joints; none: all.
 
     Returns:

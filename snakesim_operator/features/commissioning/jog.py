@@ -109,7 +109,7 @@ def jog(path: Path, selection: RobotSelection, request: JogRequest) -> int:
 
     Args:
         path: the robot file that the host was started with.
-        selection: the robot.
+        selection: which robot to address.
         request: the joint and its bounds.
     """
     keyboard = Keyboard("robot jog reads keys, and stdin is no terminal; start it in one")

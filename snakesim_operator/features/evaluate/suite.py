@@ -272,10 +272,10 @@ def seed_keys(table: Table) -> list[str]:
 def _configure_field(table: Table, field: int, randomizations: Sequence[Randomization]) -> RunConfig:
     """Return the configuration of one field, with the values that are drawn for it."""
     for key in seed_keys(table):
-        table.put(key, field, "--seed")
+        table.set_value(key, field, "--seed")
     for randomization in randomizations:
         for override in randomization.overrides_for_scene(field):
-            table.put(override.key, override.value, override.flag)
+            table.set_value(override.key, override.value, override.flag)
     return decode(table, RunConfig)
 
 

@@ -91,7 +91,7 @@ def draw_signals(record: RunRecord, names: Sequence[str], width_in: float, span_
     """Draw signals over one time axis.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         names: One name for each pair of axes, or several that a comma joins, such as "angle_rad.joint_1,target".
         width_in: Width of the figure in inches.
         span_s: Begin and end of the part of the run to draw, in s on the time axis.

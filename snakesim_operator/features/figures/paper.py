@@ -45,7 +45,7 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
     """Draw the figures of a run.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         width_in: Width of a column of the paper in inches.
         span_s: Begin and end of the part of the run to draw, in s on the time axis.
 

@@ -372,12 +372,12 @@ def _put_links(table: Table, links: list[dict[str, Any]], axes: list[str], radiu
     inner = links[1:-1]
     length_m = _common_value([link["length_m"] for link in inner])
     mass_kg = _common_value([link["mass_kg"] for link in inner])
-    table.put("chain", {"modules": len(axes), "axes": axes[: _find_period(axes)]}, source)
-    table.put("module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source)
+    table.set_value("chain", {"modules": len(axes), "axes": axes[: _find_period(axes)]}, source)
+    table.set_value("module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source)
     fractions = [0.5] + [1.0] * len(inner) + [0.5]  # tail and head are half a module each
     for link, fraction in zip(links, fractions, strict=True):
         if not _is_fraction(link, fraction, length_m, mass_kg):
-            table.put("links", links, source)
+            table.set_value("links", links, source)
             return
 
 

@@ -87,7 +87,7 @@ def _put_name(found: Imported, urdf: Element, file: Path) -> None:
     if name is None:
         found.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
         name = file.stem
-    found.table.put("name", found.plain_name(name, "robot", urdf), str(file))
+    found.table.set_value("name", found.plain_name(name, "robot", urdf), str(file))
 
 
 def _report_shipped_name(found: Imported) -> None:
@@ -107,7 +107,7 @@ def _values_of_other(urdf: Element, order: ImportOptions) -> Table:
         table.values.pop(section, None)
     for mounted in ("depth", "range"):  # their places fit another body
         table.values.get("sensors", {}).pop(mounted, None)
-    table.put("about", f"Imported from {Path(urdf.source).name}.", urdf.source)
+    table.set_value("about", f"Imported from {Path(urdf.source).name}.", urdf.source)
     return table
 
 
@@ -123,7 +123,7 @@ def _exported_values(urdf: Element) -> Table:
             raise element.error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
         seen.add(key)
         try:
-            table.put(key, json.loads(element.get("value")), urdf.source)
+            table.set_value(key, json.loads(element.get("value")), urdf.source)
         except ValueError as error:
             raise element.error(f"has a `value` that is not JSON: {shorten(str(error))}") from None
     return table

@@ -74,7 +74,7 @@ def put_limits(found: Imported, joints: list[UrdfJoint], source: str, *, own: bo
     if not own:
         for number in NUMBERS:
             [(common, _)] = Counter(columns[number.key]).most_common(1)
-            found.table.put(f"{number.section}.{number.key}", common, source)
+            found.table.set_value(f"{number.section}.{number.key}", common, source)
     _put_exceptions(found, joints, ranges, columns, source)
 
 
@@ -210,11 +210,11 @@ def _put_common_range(found: Imported, ranges: list[AngleRange], source: str) ->
     limits = table.values.get("limits", {})
     for side in ("angle_min_rad", "angle_max_rad"):
         limits.pop(side, None)
-    table.put("limits.angle_rad", max(-common.lower_rad, common.upper_rad), source)
+    table.set_value("limits.angle_rad", max(-common.lower_rad, common.upper_rad), source)
     if -common.lower_rad < common.upper_rad:
-        table.put("limits.angle_min_rad", common.lower_rad, source)
+        table.set_value("limits.angle_min_rad", common.lower_rad, source)
     if -common.lower_rad > common.upper_rad:
-        table.put("limits.angle_max_rad", common.upper_rad, source)
+        table.set_value("limits.angle_max_rad", common.upper_rad, source)
 
 
 def _put_exceptions(
@@ -241,7 +241,7 @@ def _put_exceptions(
         for key, in_urdf, in_sections, unit in compared:
             if in_urdf == in_sections:
                 continue
-            found.table.put(f"joints.{built.name}.{key}", in_urdf, source)
+            found.table.set_value(f"joints.{built.name}.{key}", in_urdf, source)
             differences.setdefault(key, []).append(f"{built.name} ({joints[i].name}) {in_urdf:g} {unit}")
     for key, values in differences.items():
         found.changes.add(f"{key} differs from that of the others: {', '.join(values)}")

@@ -80,7 +80,7 @@ def _put_on_every_link(found: Imported, sensor: Element, section: str, reference
     )
     rate = _read_rate(found, sensor, section)
     existing = found.table.values.get("sensors", {}).get(section) or {}
-    found.table.put(f"sensors.{section}", existing | rate, sensor.source)
+    found.table.set_value(f"sensors.{section}", existing | rate, sensor.source)
 
 
 def _put_on_one_link(found: Imported, sensor: Element, link: int, link_from_reference: Floats, scale: float) -> None:
@@ -98,7 +98,7 @@ def _put_on_one_link(found: Imported, sensor: Element, link: int, link_from_refe
     else:
         values |= _read_lidar(found, sensor, values["yaw_rad"])
     existing = found.table.values.get("sensors", {}).get(section, [])
-    found.table.put(f"sensors.{section}", [*existing, values], sensor.source)
+    found.table.set_value(f"sensors.{section}", [*existing, values], sensor.source)
 
 
 def _read_rate(found: Imported, sensor: Element, section: str) -> dict[str, Any]:

@@ -138,7 +138,7 @@ class RosPublisher:
     def publish(self, message: bytes) -> None:
         """Send a message in CDR."""
         attachment = make_attachment(next(self._sequence), time.time_ns(), self._gid)
-        self._publisher.put(message, attachment)
+        self._publisher.send(message, attachment)
 
 
 class Node:

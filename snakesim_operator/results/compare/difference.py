@@ -230,7 +230,7 @@ def _check_shapes(record: RunRecord) -> None:
     """Raise ConfigError for arrays of a wrong shape or type, which a damaged black box may hold."""
     ticks = len(record.time_s)
     joints = len(record.description.joints)
-    shapes = {"time_s": (ticks,), "position_w": (ticks, 3), "orientation_wxyz": (ticks, 4)}
+    shapes = {"time_s": (ticks,), "position_w_m": (ticks, 3), "orientation_wxyz": (ticks, 4)}
     for name in ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target"):
         shapes[name] = (ticks, joints)
     for name, shape in shapes.items():

@@ -30,7 +30,7 @@ class Advance:
     head_w: Floats  # (m, 2)
 
     @staticmethod
-    def of(record: RunRecord) -> "Advance | None":
+    def from_run(record: RunRecord) -> "Advance | None":
         """Sample a run, or return None if its pose is never known."""
         posed_rows = np.flatnonzero(record.posed)
         if len(posed_rows) < 2:
@@ -186,7 +186,7 @@ class GoalWatch:
     def _add_sample(self, black_box: BlackBox, first_row: int) -> bool:
         """Add the first row from a number on in which the pose is known. Returns False if there is none."""
         rows = black_box.layout.arrays(black_box.read_rows(first_row)[1])
-        poses = zip(rows["position_w"], rows["orientation_wxyz"], rows["angle_rad"], strict=True)
+        poses = zip(rows["position_w_m"], rows["orientation_wxyz"], rows["angle_rad"], strict=True)
         for i, pose in enumerate(poses):
             if all(np.isfinite(part).all() for part in pose):
                 self._time_s.append(float(rows["time_s"][i]))

@@ -29,11 +29,11 @@ class Effort:
     planning_fraction: float | None = None  # fraction of navigation's cycles in which it searched for a path
 
     @staticmethod
-    def of(record: RunRecord, advance: Advance | None, *, has_power: bool) -> "Effort":
+    def from_run(record: RunRecord, advance: Advance | None, *, has_power: bool) -> "Effort":
         """Compute the effort of a run.
 
         Args:
-            record: The run.
+            record: What was recorded of the run.
             advance: How the run advanced; None: the pose is unknown.
             has_power: Whether torques and speeds are known.
         """
@@ -73,13 +73,13 @@ class Directions:
     displacement_cost_of_transport: float | None = None
 
     @staticmethod
-    def of(
+    def from_run(
         record: RunRecord, advance: Advance | None, net_m: float | None, known_s: float, *, has_power: bool
     ) -> "Directions":
         """Compute the effort of a run along both directions.
 
         Args:
-            record: The run.
+            record: What was recorded of the run.
             advance: How the run advanced; None: the pose is unknown.
             net_m: Net displacement of the center of mass.
             known_s: Time within which that displacement was measured.

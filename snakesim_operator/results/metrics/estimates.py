@@ -21,7 +21,7 @@ class Estimates:
     dead_reckoning_error_m: float | None = None
 
     @staticmethod
-    def of(record: RunRecord) -> "Estimates":
+    def from_run(record: RunRecord) -> "Estimates":
         """Return the estimates of a run. Distances are known only where the pose was estimated by dead reckoning."""
         if not record.worlds or len(record.time_s) == 0:
             return Estimates()
@@ -59,7 +59,7 @@ def _position_error_m(record: RunRecord, world: World) -> float | None:
     row = record.row_at(world.timestamp_ns * 1e-9)
     if not record.posed[row]:
         return None
-    x, y, _ = record.position_w[row].tolist()
+    x, y, _ = record.position_w_m[row].tolist()
     return math.dist((x, y), world.base_position_w[:2])
 
 

@@ -89,7 +89,7 @@ def _read_center(record: RunRecord) -> tuple[Floats, Floats] | None:
 
     A pose that guidance estimated by dead reckoning is no measurement. None: there is no measured pose.
     """
-    advance = Advance.of(record)
+    advance = Advance.from_run(record)
     if advance is not None:
         return advance.time_s, advance.center_w
     begin_s = zero_s(record)

@@ -85,7 +85,7 @@ def _gap_m(record: RunRecord, pair: Pair, place_w: Floats, outlines: Sequence[Fl
     """Return the gap between the body and the obstacle at a push-point, seen from above.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         pair: The push-point at one moment.
         place_w: (2,) its place.
         outlines: The obstacles, each as points (n, 2).

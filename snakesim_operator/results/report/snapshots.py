@@ -110,7 +110,7 @@ def balanced_snapshots(record: RunRecord, begin_s: float = 0.0, end_s: float = m
     """Return the moments of locomotion whose solved forces balance, in order of time.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         begin_s: Reports before this time are left out.
         end_s: Reports after this time are left out.
     """

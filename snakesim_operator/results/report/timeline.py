@@ -137,7 +137,7 @@ def distance(record: RunRecord) -> Series | None:
         if None not in arc:
             along = np.array(arc, dtype=np.float64)
             return Series(time_s, along - along[0], "advance along the route, mean over the body")
-        moved = record.position_w[rows, :2] - record.position_w[rows[0], :2]
+        moved = record.position_w_m[rows, :2] - record.position_w_m[rows[0], :2]
         return Series(time_s, np.hypot(*moved.T), "distance of the tail end from where it was")
     return reported_distance(record)
 

@@ -95,7 +95,7 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> V
     """Judge a run that was not meant to locomote: it is good if it moved every joint.
 
     Args:
-        record: The run.
+        record: What was recorded of the run.
         summary: Its numbers.
         command: The command that judges such a run in detail.
     """

@@ -32,7 +32,7 @@ class View:
     height: float
     upright: bool  # the snake lies along y: the ground is turned by a quarter
 
-    def turned(self, vectors_w: Floats) -> Floats:
+    def rotate(self, vectors_w: Floats) -> Floats:
         """Rotate world vectors (..., 2) into the frame of the drawing, with y still up."""
         if not self.upright:
             return vectors_w
@@ -40,12 +40,12 @@ class View:
 
     def at(self, point_w: Floats | tuple[float, ...]) -> Point:
         """Return the place in the drawing of a point of the ground."""
-        x, y = (self.turned(np.asarray(point_w, dtype=np.float64)[:2]) - self.low_w) * self.scale
+        x, y = (self.rotate(np.asarray(point_w, dtype=np.float64)[:2]) - self.low_w) * self.scale
         return float(x), float(self.height - FOOT - y)
 
     def along(self, start: Point, vector_w: Floats | tuple[float, ...], units: float) -> Point:
         """Return `start` moved by `units` times a world vector."""
-        x, y = self.turned(np.asarray(vector_w, dtype=np.float64)[:2])
+        x, y = self.rotate(np.asarray(vector_w, dtype=np.float64)[:2])
         return float(start[0] + units * x), float(start[1] - units * y)
 
     def shows(self, obstacle: Obstacle) -> bool:
@@ -95,7 +95,7 @@ def _windows(record: RunRecord, point_sets: list[Floats], units_per_n: float, wi
     spans = np.ptp(point_sets[0], axis=0)
     upright = bool(spans[1] > 1.3 * spans[0])
     unscaled = View(np.zeros(2), 1.0, units_per_n, 0.0, 0.0, upright)
-    turned = [unscaled.turned(points) for points in point_sets]
+    turned = [unscaled.rotate(points) for points in point_sets]
     max_span_m = max(float(np.ptp(points[:, 0])) for points in turned)
     air_m = AIR * max_span_m / (width - 2 * AIR)
     boxes: list[tuple[Floats, Floats]] = []
@@ -117,7 +117,7 @@ def _grow_around_obstacles(record: RunRecord, unscaled: View, low: Floats, high:
     for item in record.placed:
         obstacle_reach_m = reach_m(item.obstacle)
         if obstacle_reach_m <= max_reach_m:
-            small.append((unscaled.turned(np.array(item.obstacle.position_w[:2])), 1.1 * obstacle_reach_m))
+            small.append((unscaled.rotate(np.array(item.obstacle.position_w[:2])), 1.1 * obstacle_reach_m))
     for _ in range(MAX_GROWTH_STEPS):
         cut = [(at, reach) for at, reach in small if (at + reach > low).all() and (at - reach < high).all()]
         low = np.min([low, *(at - reach for at, reach in cut)], axis=0)

@@ -38,16 +38,20 @@ def test_can_interface_down_stops_joints_and_recovers(spare_channel: str) -> Non
         start = run.tick
         run.run(WATCHDOG_MS // PERIOD_MS + 3, run.waving)
         (fault,) = run.faults
-        assert fault.what == "interface_down" and fault.cause.startswith(f"{spare_channel}: the interface is down")
-        assert run.lifecycle == "fault" and fault.tick - start <= 1
+        assert fault.what == "interface_down"
+        assert fault.cause.startswith(f"{spare_channel}: the interface is down")
+        assert run.lifecycle == "fault"
+        assert fault.tick - start <= 1
         assert run.true_states() == [ModuleState.FAULT] * 4, "the modules' own watchdogs"
         stopped_ms = PERIOD_MS * next(n for n in range(1, 20) if run.true_state_at[start + n] == {ModuleState.FAULT})
         assert stopped_ms <= WATCHDOG_MS + PERIOD_MS
         run.run(40)
-        assert run.at_rest() and len(run.faults) == 1
+        assert run.at_rest()
+        assert len(run.faults) == 1
         must(ip("link", "set", spare_channel, "up"))
         run.run(10)
-        assert run.states() == [ModuleState.FAULT] * 4 and run.watch_seen("interface_up") == 1
+        assert run.states() == [ModuleState.FAULT] * 4
+        assert run.watch_seen("interface_up") == 1
         reported = {f.what for f in run.faults[1:]}
         assert reported and reported <= {"module_watchdog", "module_fault"}, "now they can tell"
         moves_again(run)
@@ -96,9 +100,11 @@ def test_can_queue_full_for_three_periods_is_a_fault(slow_channel: str) -> None:
         clog(slow_channel)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
         (fault,) = run.faults
-        assert fault.what == "bus_stuck" and "its transmit queue stays full" in fault.cause
+        assert fault.what == "bus_stuck"
+        assert "its transmit queue stays full" in fault.cause
         run.run(20)
-        assert run.true_states() == [ModuleState.FAULT] * 4 and len(run.faults) == 1
+        assert run.true_states() == [ModuleState.FAULT] * 4
+        assert len(run.faults) == 1
         assert run.watch_seen("queue_full") > 0
         unclog(slow_channel)
         before = set_points_out(run)
@@ -117,7 +123,9 @@ def test_can_queue_full_for_a_moment_is_counted_and_skipped(slow_channel: str) -
         run.run(1, run.waving)
         assert set_points_out(run) == out + 4, "one for each joint: the latest"
         run.run(30, run.waving)
-        assert not run.faults and full > 0 and run.states() == [ModuleState.ARMED] * 4
+        assert not run.faults
+        assert full > 0
+        assert run.states() == [ModuleState.ARMED] * 4
 
 
 @pytest.mark.slow
@@ -142,16 +150,20 @@ def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_
     with shared_bus(channel) as run:
         raw_socket.send(error_frame(ACK))
         run.run(5, run.waving)
-        assert run.watch_seen("not_acknowledged") == 1 and not run.faults
+        assert run.watch_seen("not_acknowledged") == 1
+        assert not run.faults
         assert run.states() == [ModuleState.ARMED] * 4
         raw_socket.send(error_frame(BUSOFF))
         run.run(2, run.waving)
         (fault,) = run.faults
-        assert fault.what == "bus_off" and fault.cause.startswith(f"{channel}: transmit errors 130, receive errors 7; ")
+        assert fault.what == "bus_off"
+        assert fault.cause.startswith(f"{channel}: transmit errors 130, receive errors 7; ")
         out = set_points_out(run)
         run.run(30, run.waving)
         assert run.lifecycle == "fault" and set_points_out(run) == out, "not one setpoint more"
-        assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest() and len(run.faults) == 1
+        assert run.true_states() == [ModuleState.DISARMED] * 4
+        assert run.at_rest()
+        assert len(run.faults) == 1
         moves_again(run)
 
 
@@ -170,7 +182,8 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
         assert fault.what == "receive_overflow"
         dropped = int(fault.cause.partition("dropped ")[2].partition(" ")[0])
         kept = run.backend.modules.reading.malformed
-        assert dropped > 0 and dropped + kept == 50
+        assert dropped > 0
+        assert dropped + kept == 50
         moves_again(run)
 
 
@@ -184,7 +197,9 @@ def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket
         run.run(1, run.waving)
         assert run.true_states() == [ModuleState.EMERGENCY] * 4, "one frame"
         run.run(20)
-        assert run.faults[0].what == "emergency" and run.lifecycle == "fault" and run.at_rest()
+        assert run.faults[0].what == "emergency"
+        assert run.lifecycle == "fault"
+        assert run.at_rest()
         assert run.true_states() == [ModuleState.EMERGENCY] * 4
         moves_again(run)
 
@@ -198,4 +213,5 @@ def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket:
                 raw_socket.send(frame(CAN_RTR_FLAG | number))
         assert not [one for one in run.wire.receive() if one.data in (b"", bytes(8))]  # the modules' own are not zero
         run.run(5, run.waving)
-        assert not run.faults and run.states() == [ModuleState.ARMED] * 4
+        assert not run.faults
+        assert run.states() == [ModuleState.ARMED] * 4

@@ -66,9 +66,11 @@ def test_a_joystick_is_found_read_and_lost() -> None:
     wait_until(lambda: sticks.append(stick) or True if (stick := found()) else False, "the device to be there")
     stick = sticks[0]
     device.sends(EV_ABS, ABS_Y, 0)
-    assert not stick.read_events(1.0) and stick.forward == pytest.approx(1.0)
+    assert not stick.read_events(1.0)
+    assert stick.forward == pytest.approx(1.0)
     device.sends(EV_ABS, ABS_X, -100)
-    assert not stick.read_events(1.0) and stick.right == pytest.approx(-1.0)
+    assert not stick.read_events(1.0)
+    assert stick.right == pytest.approx(-1.0)
     device.sends(EV_KEY, BTN_SOUTH, 1)
     assert stick.read_events(1.0), "the emergency stop"
     device.unplug()

@@ -34,9 +34,9 @@ def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, ch
     virtual, real = records["virtual"], records[channel]
     assert real.host.command_digest == virtual.host.command_digest
     assert real.host.armed_ticks == virtual.host.armed_ticks == round(float(ROBOT_TIME_S) * 100)
-    for what in ("angle_rad", "mode", "target", "position_w"):
+    for what in ("angle_rad", "mode", "target", "position_w_m"):
         assert np.array_equal(getattr(real, what), getattr(virtual, what)), what
-    assert np.isfinite(real.position_w).all(), "the base too: it comes by UDP, as from motion capture"
+    assert np.isfinite(real.position_w_m).all(), "the base too: it comes by UDP, as from motion capture"
     moved_rad = float(np.abs(real.angle_rad[-1] - real.angle_rad[0]).max())
     assert moved_rad > 0.01, "and it moved"
     print(

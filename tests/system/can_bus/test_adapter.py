@@ -40,13 +40,15 @@ def test_frames_go_both_ways_and_foreign_ones_are_left_out(channel: str, other: 
     assert isinstance(wire, AdapterWire)
     assert wire.send(STATE)
     got = other.recv(1.0)
-    assert got is not None and (got.arbitration_id, bytes(got.data), got.is_extended_id) == (*STATE, False)
+    assert got is not None
+    assert (got.arbitration_id, bytes(got.data), got.is_extended_id) == (*STATE, False)
     other.send(can.Message(arbitration_id=STATE.id, data=bytes(8), is_extended_id=True))
     other.send(can.Message(arbitration_id=STATE.id, is_remote_frame=True, is_extended_id=False))
     other.send(can.Message(arbitration_id=0, is_error_frame=True))
     other.send(can.Message(arbitration_id=STATE.id, data=b"12345678", is_extended_id=False))
     assert wire.receive() == [Frame(STATE.id, b"12345678")]
-    assert [error.kind for error in wire.errors()] == ["error_frames"] and wire.errors() == []
+    assert [error.kind for error in wire.errors()] == ["error_frames"]
+    assert wire.errors() == []
     wire.close()
 
 
@@ -85,7 +87,8 @@ def test_adapter_with_missing_library_or_device_explains_what_to_do(interface: s
     with pytest.raises(SnakesimError) as raised:
         open_bus(f"{interface}:/dev/none", 1_000_000, data_bit_rate)
     words = str(raised.value)
-    assert words.startswith(f"{interface}:/dev/none: cannot be opened: ") and NEEDS[interface] in words
+    assert words.startswith(f"{interface}:/dev/none: cannot be opened: ")
+    assert NEEDS[interface] in words
     assert "Traceback" not in words and len(words) < 700, words
 
 
@@ -96,8 +99,11 @@ def test_a_bus_is_named_once() -> None:
 
 
 def test_modules_are_emulated_where_no_real_ones_can_be() -> None:
-    assert is_emulated("vcan0") and is_emulated("udp_multicast:239.74.163.2")
-    assert not is_emulated("can0") and not is_emulated("slcan:/dev/ttyACM0") and not is_emulated("socketcan:can0")
+    assert is_emulated("vcan0")
+    assert is_emulated("udp_multicast:239.74.163.2")
+    assert not is_emulated("can0")
+    assert not is_emulated("slcan:/dev/ttyACM0")
+    assert not is_emulated("socketcan:can0")
 
 
 def test_half_the_bit_rate_takes_twice_as_long() -> None:

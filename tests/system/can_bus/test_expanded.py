@@ -60,7 +60,8 @@ def test_signals_are_the_same_for_every_node(database: Database) -> None:
     source = {message.name: message for message in load_database().messages}
     for message in database.messages:
         original = source[message.name.partition("_")[0]]
-        assert message.length == original.length and message.senders == original.senders
+        assert message.length == original.length
+        assert message.senders == original.senders
         assert layout_of(message) == layout_of(original)
 
 

@@ -84,13 +84,13 @@ def test_a_bus_that_fails_stops_the_joints_and_comes_back(
         inject(run, f"{kind}:bus_1")
         start = run.tick
         run.run(13, run.waving)
-        assert [fault.what for fault in run.faults] == what and run.faults[0].tick - start == after
+        assert [fault.what for fault in run.faults] == what
+        assert run.faults[0].tick - start == after
         assert run.lifecycle == "fault"
         inject(run, f"{kind}:bus_1", begins=False)
         run.run(10)
-        assert [
-            fault.what for fault in run.faults
-        ] == what + then and run.backend.modules.monitor.minor_error_counts.keys() == counted
+        assert [fault.what for fault in run.faults] == what + then
+        assert run.backend.modules.monitor.minor_error_counts.keys() == counted
         assert run.states() == [ModuleState.FAULT if then else ModuleState.DISARMED] * 4
         cleared_and_armed_again(run)
 
@@ -99,14 +99,18 @@ def test_one_end_of_a_virtual_bus() -> None:
     here, there = VirtualWire("wire-faults"), VirtualWire("wire-faults")
     try:
         frame = Frame(0x105, b"1")
-        assert here.send(frame) and there.receive() == [frame] and here.errors() == []
+        assert here.send(frame)
+        assert there.receive() == [frame]
+        assert here.errors() == []
         for kind, taken in (("cut", False), ("bus_off", True), ("full", False)):
             here.inject(kind, begins=True)
-            assert here.send(frame) is taken and there.receive() == []
+            assert here.send(frame) is taken
+            assert there.receive() == []
             there.send(frame)
             assert here.receive() == ([frame] if kind == "full" else [])
             here.inject(kind, begins=False)
-            assert here.send(frame) and there.receive() == [frame]
+            assert here.send(frame)
+            assert there.receive() == [frame]
         here.inject("overflow", begins=True)
         there.send(frame)
         there.send(frame)

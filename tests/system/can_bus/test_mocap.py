@@ -63,9 +63,13 @@ def read(mocap: Mocap, *datagrams: object) -> Pose | None:
 def test_a_pose_is_taken_once() -> None:
     with receiver() as mocap:
         pose = read(mocap, mocap.at())
-        assert pose is not None and (pose.tick, pose.timestamp_ns) == (7, mocap.now_ns)
-        assert pose.position_w == (1.0, 2.0, 0.5) and pose.orientation_wxyz == (1.0, 0.0, 0.0, 0.0)
-        assert pose.velocity_w == (0.0, 0.0, 0.0) and pose.angular_velocity_w == (0.1, 0.2, 0.3)
+        assert pose is not None
+        assert pose.tick == 7
+        assert pose.timestamp_ns == mocap.now_ns
+        assert pose.position_w == (1.0, 2.0, 0.5)
+        assert pose.orientation_wxyz == (1.0, 0.0, 0.0, 0.0)
+        assert pose.velocity_w == (0.0, 0.0, 0.0)
+        assert pose.angular_velocity_w == (0.1, 0.2, 0.3)
         assert mocap.read() is None
 
 
@@ -75,9 +79,12 @@ def test_stamps_go_on_although_a_tick_is_late() -> None:
         send(mocap, mocap.at())
         mocap.now_ns += 25 * MS  # what came 15 ms ago is read now, in the tick that was due then
         second = mocap.read_newest(8, mocap.now_ns - 15 * MS)
-        assert first is not None and second is not None and second.timestamp_ns == first.timestamp_ns + 1
+        assert first is not None
+        assert second is not None
+        assert second.timestamp_ns == first.timestamp_ns + 1
         third = read(mocap, mocap.at())
-        assert third is not None and third.timestamp_ns == mocap.now_ns
+        assert third is not None
+        assert third.timestamp_ns == mocap.now_ns
 
 
 def test_mocap_captured_before_robot_start_is_no_pose() -> None:
@@ -86,7 +93,8 @@ def test_mocap_captured_before_robot_start_is_no_pose() -> None:
             send(mocap, mocap.at())
             mocap.now_ns += 10 * MS
             pose = mocap.read_newest(0, timestamp_ns)
-            assert (pose is not None) is known and (pose is None or pose.timestamp_ns == 0)
+            assert (pose is not None) is known
+            assert pose is None or pose.timestamp_ns == 0
 
 
 def bare(mocap: Mocap, x: float, late_ms: float = 0.0) -> dict[str, Any]:
@@ -101,7 +109,8 @@ def test_mocap_velocity_uses_capture_times_not_arrival_times(late_ms: float) -> 
     with receiver() as mocap:
         assert read(mocap, bare(mocap, 0.0)) is None, "one pose has no velocity"
         pose = read(mocap, bare(mocap, 0.5 * (0.01 - late_ms * 1e-3), late_ms))
-        assert pose is not None and pose.velocity_w == pytest.approx((0.5, 0.0, 0.0))
+        assert pose is not None
+        assert pose.velocity_w == pytest.approx((0.5, 0.0, 0.0))
 
 
 def test_a_turn_gives_the_angular_velocity() -> None:
@@ -109,7 +118,8 @@ def test_a_turn_gives_the_angular_velocity() -> None:
         read(mocap, bare(mocap, 0.0))
         turned = {**bare(mocap, 0.0), "orientation_wxyz": [0.99998750, 0.0, 0.0, 0.00499998]}  # 0.01 rad about z
         pose = read(mocap, turned)
-        assert pose is not None and pose.angular_velocity_w == pytest.approx((0.0, 0.0, 1.0), abs=1e-4)
+        assert pose is not None
+        assert pose.angular_velocity_w == pytest.approx((0.0, 0.0, 1.0), abs=1e-4)
 
 
 def test_mocap_velocity_after_gap_is_known_with_second_pose() -> None:
@@ -123,17 +133,19 @@ def test_mocap_velocity_after_gap_is_known_with_second_pose() -> None:
             assert read(mocap, jumped) is None
         assert mocap.refused == {"future": 4}
         pose = read(mocap, {**bare(mocap, 0.105), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS})
-        assert (
-            pose is not None and pose.velocity_w == pytest.approx((0.5, 0.0, 0.0)) and pose.timestamp_ns == mocap.now_ns
-        )
+        assert pose is not None
+        assert pose.velocity_w == pytest.approx((0.5, 0.0, 0.0))
+        assert pose.timestamp_ns == mocap.now_ns
 
 
 def test_a_leap_that_no_body_makes_is_no_velocity() -> None:
     with receiver() as mocap:
         read(mocap, bare(mocap, 0.0))
-        assert read(mocap, bare(mocap, 1e6)) is None and mocap.refused == {"leap": 1}
+        assert read(mocap, bare(mocap, 1e6)) is None
+        assert mocap.refused == {"leap": 1}
         pose = read(mocap, bare(mocap, 1e6))
-        assert pose is not None and pose.velocity_w == (0.0, 0.0, 0.0)
+        assert pose is not None
+        assert pose.velocity_w == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +175,8 @@ def test_a_leap_that_no_body_makes_is_no_velocity() -> None:
 )
 def test_what_is_malformed_is_counted_and_the_next_is_taken(datagram: object) -> None:
     with receiver() as mocap:
-        assert read(mocap, datagram) is None and mocap.refused == {"malformed": 1}
+        assert read(mocap, datagram) is None
+        assert mocap.refused == {"malformed": 1}
         assert read(mocap, mocap.at()) is not None
 
 

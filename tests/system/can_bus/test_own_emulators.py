@@ -94,7 +94,8 @@ def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: py
     emulators = EmulatorProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
     noted = child.noted()
     arguments = noted["arguments"]
-    assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.emulator.command"] and "--stepped" in arguments
+    assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.emulator.command"]
+    assert "--stepped" in arguments
     assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
@@ -104,7 +105,8 @@ def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: py
     emulators.stop()
     child.must_be_gone()
     said = capsys.readouterr().err
-    assert "a warning" in said and "last words" in said
+    assert "a warning" in said
+    assert "last words" in said
 
 
 def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +154,8 @@ def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_p
     child.does(READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     arguments = child.noted()["arguments"]
-    assert "--interactive" in arguments and "--stepped" not in arguments
+    assert "--interactive" in arguments
+    assert "--stepped" not in arguments
     assert arguments[arguments.index("--pose") + 1] == "none"
     emulators.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=True)
     emulators.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=False)

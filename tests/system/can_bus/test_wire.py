@@ -64,7 +64,8 @@ def test_an_error_frame_in_words(classes: int, controller: int, kinds: list[Kind
 @given(st.integers(0, 0x1FFFFFFF), st.binary(min_size=8, max_size=8))
 def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
     found = decode_error_frame(CAN_ERR_FLAG | classes, data, "can0")
-    assert found and len({error.kind for error in found}) == len(found)
+    assert found
+    assert len({error.kind for error in found}) == len(found)
 
 
 # --- frames through a socket -------------------------------------------------------------------------------
@@ -79,7 +80,8 @@ class CanLike(socket.socket):
 
     def setsockopt(self, level: int, option: int, value: object, *_more: object) -> None:  # pyright: ignore
         if level == socket.SOL_CAN_RAW:
-            assert option == socket.CAN_RAW_FILTER and isinstance(value, bytes)
+            assert option == socket.CAN_RAW_FILTER
+            assert isinstance(value, bytes)
             self.filters = value
 
     def bind(self, address: tuple[str]) -> None:  # pyright: ignore
@@ -139,7 +141,8 @@ def test_drain_takes_everything_in_its_order(frames: list[tuple[int, bytes]]) ->
             far.send(can_frame(identifier, data))
         far.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
         drain_socket(near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data)))
-        assert taken == [Frame(*frame) for frame in frames] and all(type(frame) is Frame for frame in taken)
+        assert taken == [Frame(*frame) for frame in frames]
+        assert all(type(frame) is Frame for frame in taken)
         assert errors == [(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8)))]
         drain_socket(near, bytearray(16), taken, lambda *_: None)
         assert len(taken) == len(frames)
@@ -159,7 +162,8 @@ def test_a_bus_that_babbles_does_not_keep_its_reader() -> None:
 def test_a_frame_goes_out_as_the_kernel_wants_it(rig: Rig) -> None:
     assert rig.wire.send(Frame(0x0C5, bytes.fromhex("3178EC581BF4")))
     assert rig.kernel.recv(64) == bytes.fromhex("C5000000 06000000 3178EC581BF40000")
-    assert rig.wire.fileno() == rig.socket.fileno() and rig.wire.idle() == math.inf
+    assert rig.wire.fileno() == rig.socket.fileno()
+    assert rig.wire.idle() == math.inf
     assert rig.opened_with == {"channel": "can7", "ignore_rx_error_frames": False}
 
 
@@ -168,7 +172,8 @@ def test_frames_and_errors_come_in(rig: Rig) -> None:
     rig.kernel.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(8)))
     rig.kernel.send(can_frame(0x080, bytes(5)))
     assert rig.wire.receive() == [Frame(0x105, b"\x01\x02"), Frame(0x080, bytes(5))]
-    assert rig.kinds() == ["bus_off"] and rig.kinds() == []
+    assert rig.kinds() == ["bus_off"]
+    assert rig.kinds() == []
     assert rig.wire.receive() == []
 
 
@@ -182,7 +187,8 @@ def test_wire_full_queue_is_reported_and_nothing_kept(rig: Rig) -> None:
     rig.kernel.settimeout(0.01)
     with pytest.raises(TimeoutError):
         rig.kernel.recv(64)
-    assert rig.wire.send(Frame(0x102, b"")) and rig.kinds() == []
+    assert rig.wire.send(Frame(0x102, b""))
+    assert rig.kinds() == []
 
 
 @pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
@@ -196,13 +202,15 @@ def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
 def test_wire_lost_interface_is_reported_once_per_loss(rig: Rig, number: int, word: str) -> None:
     rig.socket.fails, rig.up = OSError(number, ""), False
     for _ in range(3):
-        assert not rig.wire.send(Frame(0x101, b"")) and rig.wire.receive() == []
+        assert not rig.wire.send(Frame(0x101, b""))
+        assert rig.wire.receive() == []
     assert rig.wire.errors() == [BusError("interface_down", "can7", f"the interface is {word}")]
     assert rig.kinds() == []
     rig.socket.fails, rig.up = None, True
     assert rig.wire.errors() == [BusError("interface_up", "can7", "the interface is up again")]
     assert rig.socket.bound_to == (("can7",) if word == "gone" else None)
-    assert rig.kinds() == [] and rig.wire.send(Frame(0x101, b""))
+    assert rig.kinds() == []
+    assert rig.wire.send(Frame(0x101, b""))
 
 
 def test_wire_sent_frame_proves_interface_is_back(rig: Rig) -> None:
@@ -224,7 +232,8 @@ def test_what_came_before_an_error_is_not_lost(rig: Rig) -> None:
         return receive(buffer)
 
     rig.socket.recv_into, rig.up = then_down, False
-    assert rig.wire.receive() == [Frame(0x105, b"\x01")] and rig.kinds() == ["interface_down"]
+    assert rig.wire.receive() == [Frame(0x105, b"\x01")]
+    assert rig.kinds() == ["interface_down"]
 
 
 def test_anything_else_ends_the_run(rig: Rig) -> None:
@@ -253,13 +262,15 @@ def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest
     drops = iter([3, 3, 10])
 
     def meminfo(_level: int, option: int, length: int) -> bytes:
-        assert (option, length) == (55, 36)  # SO_MEMINFO, nine numbers of which the last is the drops
+        assert option == 55
+        assert length == 36  # SO_MEMINFO, nine numbers of which the last is the drops
         return struct.pack("=9I", *range(8), next(drops))
 
     monkeypatch.setattr(rig.socket, "getsockopt", meminfo)
     reported = [rig.wire.errors() for _ in range(3)]
     assert [[t.kind for t in found] for found in reported] == [["receive_overflow"], [], ["receive_overflow"]]
-    assert "dropped 3 frames" in reported[0][0].detail and "dropped 7 frames" in reported[2][0].detail
+    assert "dropped 3 frames" in reported[0][0].detail
+    assert "dropped 7 frames" in reported[2][0].detail
 
 
 # --- interfaces --------------------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ from snakesim_testing.runs.in_process_command import snakesim
 
 def test_the_command_alone_lists_all_by_task(tmp_path: Path) -> None:
     ended = snakesim(cwd=tmp_path)
-    assert ended.code == 0 and ended.out == snakesim("--help", cwd=tmp_path).out
+    assert ended.code == 0
+    assert ended.out == snakesim("--help", cwd=tmp_path).out
     tasks = [line.rstrip(":") for line in ended.out.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert tasks == ["daily work", "robot", "runs and studies", "files and computers"]
     assert all(f"  {name} " in ended.out for name in ("drive", "policy", "lab")), "those of installed packages"
@@ -46,7 +47,8 @@ def test_echo_without_a_key_lists_the_keys(tmp_path: Path) -> None:
 
 def test_version(tmp_path: Path) -> None:
     ended = snakesim("--version", cwd=tmp_path)
-    assert ended.code == 0 and ended.out == f"snakesim {version('snakesim')}\n"
+    assert ended.code == 0
+    assert ended.out == f"snakesim {version('snakesim')}\n"
 
 
 def test_config_runs_no_code_of_a_file(tmp_path: Path) -> None:
@@ -56,5 +58,6 @@ def test_config_runs_no_code_of_a_file(tmp_path: Path) -> None:
         assert ended.code == 0, ended.err
         assert "ers.Wave: not checked" in ended.out or "ends.Wave: not checked" in ended.out
     ended = snakesim("config", "triplet", "--controller", "./wave.py", cwd=tmp_path)
-    assert ended.code == 2 and "the classes in it are Wave" in ended.err
+    assert ended.code == 2
+    assert "the classes in it are Wave" in ended.err
     assert not (tmp_path / "mark").exists()

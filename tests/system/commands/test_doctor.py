@@ -20,9 +20,11 @@ def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.C
     assert main(["doctor", "--json", "--endpoint", free_endpoint()]) == 1, "nobody answers there"
     reported = json.loads(capsys.readouterr().out)
     assert {"Python", "OpenGL", "CAN", "disk", "kernel"} < {finding["what"] for finding in reported["findings"]}
-    assert not reported["ok"] and reported["findings"][-1]["state"] == "fail"
+    assert not reported["ok"]
+    assert reported["findings"][-1]["state"] == "fail"
     for finding in reported["findings"]:
-        assert finding["state"] in ("ok", "warn", "fail") and finding["detail"]
+        assert finding["state"] in ("ok", "warn", "fail")
+        assert finding["detail"]
         assert finding["state"] == "ok" or finding["fix"] or finding["what"] == "KVM"
     assert os.sched_getscheduler(0) == before
 
@@ -30,12 +32,14 @@ def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.C
 def test_doctor_endpoint_without_zenoh_fails_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         (finding,) = check_routers(RobotSelection(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
-    assert finding.state == "fail" and finding.fix
+    assert finding.state == "fail"
+    assert finding.fix
 
 
 def test_the_default_port_is_free_or_has_a_user() -> None:
     (finding,) = check_ports()
-    assert finding.what == "port 7447" and finding.state in ("ok", "warn")
+    assert finding.what == "port 7447"
+    assert finding.state in ("ok", "warn")
 
 
 @pytest.mark.parametrize(

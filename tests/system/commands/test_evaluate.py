@@ -77,12 +77,18 @@ def lives(process: psutil.Process) -> bool:
 def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     ended = evaluate(home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1]))
     assert ended.code == 0, ended.out + ended.err
-    assert ended.out.count("cost of transport") == 1 and "code " in ended.out and "fields 1 to 2" in ended.out
-    assert "hold against path_following" in ended.out and "of 2; p = " in ended.out
+    assert ended.out.count("cost of transport") == 1
+    assert "code " in ended.out
+    assert "fields 1 to 2" in ended.out
+    assert "hold against path_following" in ended.out
+    assert "of 2; p = " in ended.out
     assert "Holm's correction for 2 comparisons" in ended.out
     (score,) = json.loads((home / "part" / "card.json").read_bytes())["scores"]
-    assert (score["controller"], score["runs"], score["crossed"]) == ("hold", 2, 0)
-    assert score["medians"]["jam_ratio"] is not None and score["medians"]["desired_force_error"] is None
+    assert score["controller"] == "hold"
+    assert score["runs"] == 2
+    assert score["crossed"] == 0
+    assert score["medians"]["jam_ratio"] is not None
+    assert score["medians"]["desired_force_error"] is None
 
 
 @pytest.mark.slow
@@ -90,7 +96,8 @@ def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> No
     ended, out = undisturbed
     rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
     assert [row[2:4] for row in rows] == [["path_following", "2/2"], ["hold", "0/2"]] * 2
-    assert done(out) == CASES and all((out / name).is_file() for name in TABLES)
+    assert done(out) == CASES
+    assert all((out / name).is_file() for name in TABLES)
     scores = json.loads((out / "card.json").read_bytes())["scores"]
     assert all(0 < score["medians"]["planning_fraction"] <= 1 for score in scores)
     assert all(0 <= score["medians"]["form_closure"] <= 1 for score in scores)
@@ -124,7 +131,8 @@ def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tup
     with (out / "cases.jsonl").open("a") as file:
         file.write('{"id": "cut')
     refused = evaluate(home, "killed")
-    assert refused.code == 2 and "--resume" in refused.err
+    assert refused.code == 2
+    assert "--resume" in refused.err
     ended = evaluate(home, "killed", "--resume")
     assert f"{before} of {CASES} cases are done already" in ended.out, ended.out + ended.err
     assert table_of(ended) == table_of(undisturbed[0])
@@ -247,7 +255,8 @@ def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[Ended, Pat
     chosen = [row for row in rows if row[0] == "2" and row[2:4] == ["path_following", "2"]]
     assert [row[names.index("command_digest")] for row in chosen] == [digest]
     unclear = evaluate(home, "none", "--only", "path_following:2")
-    assert unclear.code == 2 and "path_following:2:1" in unclear.err
+    assert unclear.code == 2
+    assert "path_following:2:1" in unclear.err
 
 
 DEADLY = """

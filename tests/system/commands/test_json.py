@@ -18,7 +18,8 @@ from snakesim_testing.harness.endpoint import free_endpoint
 def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenario", "list", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
-    assert sorted(reported["robots"]) == list_shipped("robots") and reported["scenarios"]["triplet"]
+    assert sorted(reported["robots"]) == list_shipped("robots")
+    assert reported["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
     reported = json.loads(capsys.readouterr().out)
     assert reported["robot.limits.torque_nm"] == {"value": 3, "origin": "--set robot.limits.torque_nm=3"}
@@ -70,5 +71,6 @@ def test_json_isolated_joint_is_reported_with_how_to_recover(capsys: pytest.Capt
         session.latched_publisher(keys.STATUS, Status).put(lost)
         assert main(["status", "--endpoint", endpoint]) == 0
     said = capsys.readouterr().out
-    assert "isolated: joint_3; passive until a reset" in said and "to end the isolation of joint_3" in said
+    assert "isolated: joint_3; passive until a reset" in said
+    assert "to end the isolation of joint_3" in said
     assert "or, without: `snakesim robot arm worm lag" in said

@@ -44,18 +44,22 @@ def test_arming_is_for_what_is_named(run: Running) -> None:
     assert tell(run, "robot", "disarm").code == 0
     for robot, backend, word in (("mamba", "sim", "'planar13', not 'mamba'"), ("planar13", "can", "'sim', not 'can'")):
         ended = tell(run, "robot", "arm", robot, backend)
-        assert ended.code == 1 and word in ended.err and "snakesim robot arm planar13 sim" in ended.err
+        assert ended.code == 1
+        assert word in ended.err
+        assert "snakesim robot arm planar13 sim" in ended.err
     until_armed(run)
     assert "planar13: armed" in tell(run, "status").out
     again = tell(run, "robot", "arm", "planar13", "sim")
-    assert again.code == 1 and "must be disarmed" in again.err
+    assert again.code == 1
+    assert "must be disarmed" in again.err
     assert tell(run, "robot", "reset").code == 1
 
 
 def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
     until_armed(run) if "planar13: armed" not in tell(run, "status").out else None
     stopped = tell(run, "estop")
-    assert stopped.code == 0 and "planar13: stopped" in stopped.out
+    assert stopped.code == 0
+    assert "planar13: stopped" in stopped.out
     kept = run.out.parent / "snakesim" / "robots" / "planar13-sim" / ESTOP
     assert kept.is_file()
     first = run.part("host")
@@ -63,13 +67,12 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
     wait_until(lambda: "planar13: estop" in tell(run, "status").out, "a new host in estop", 30.0)
     assert run.part("host") != first
     status = tell(run, "status").out
-    assert (
-        "before this host" in status
-        and "`snakesim robot reset" in status
-        and "then `snakesim robot arm planar13 sim" in status
-    )
+    assert "before this host" in status
+    assert "`snakesim robot reset" in status
+    assert "then `snakesim robot arm planar13 sim" in status
     refused = tell(run, "robot", "arm", "planar13", "sim")
-    assert refused.code == 1 and "state is estop" in refused.err
+    assert refused.code == 1
+    assert "state is estop" in refused.err
     assert tell(run, "robot", "reset").code == 0
     assert not kept.exists()
     until_armed(run)
@@ -87,4 +90,5 @@ def test_nobody_there(tmp_path: Path) -> None:
     ):
         ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
         words = "no robot answers" if arguments == ["status"] else "no robot on tcp/127.0.0.1:9"
-        assert ended.code == 1 and words in ended.err + ended.out
+        assert ended.code == 1
+        assert words in ended.err + ended.out

@@ -32,7 +32,8 @@ def param(run: Running, tmp_path: Path):
 
 def test_they_are_listed_with_unit_range_and_meaning(param) -> None:
     listed = param("list")
-    assert listed.code == 0 and listed.out.startswith("controller obstacle_triplet, 26 parameters, ")
+    assert listed.code == 0
+    assert listed.out.startswith("controller obstacle_triplet, 26 parameters, ")
     row = next(line for line in listed.out.splitlines() if "control.gap_m " in line)
     meaning = "Maximum gap between the skin and an obstacle that is chosen as a push-point."
     said = f"control.gap_m 0.06 m >= 0, <= 1 {meaning}"
@@ -66,4 +67,5 @@ def test_what_is_not_allowed_changes_nothing(param, value: str, code: int, words
 
 def test_a_robot_that_is_not_there_is_named(param) -> None:
     absent = param("list", robot="mamba")
-    assert absent.code == 1 and "no robot named mamba on " in absent.err
+    assert absent.code == 1
+    assert "no robot named mamba on " in absent.err

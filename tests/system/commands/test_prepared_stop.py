@@ -106,7 +106,8 @@ def test_prepared_stop_works_with_full_file_table_and_broken_network(
     monkeypatch.setattr(socket, "socket", no_socket)
     for _ in range(2):
         assert bench.stop.stop("anna") == "worm: stopped: emergency stop (tcp/127.0.0.1:9)"
-    assert bench.searched == 0 and bench.log[0] == ("anna", "worm: stopped: emergency stop (tcp/127.0.0.1:9)")
+    assert bench.searched == 0
+    assert bench.log[0] == ("anna", "worm: stopped: emergency stop (tcp/127.0.0.1:9)")
 
 
 def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> None:
@@ -114,11 +115,14 @@ def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> N
     first = bench.stop.request("anna")
     wait_until(lambda: bench.asked, "the first stop", 5.0)
     later: list[Future[str]] = [bench.stop.request(f"viewer {number}") for number in range(100)]
-    assert not first.done() and len({id(future) for future in later}) == 1
+    assert not first.done()
+    assert len({id(future) for future in later}) == 1
     assert bench.stop.readiness().text.startswith("a stop has been under way")
     bench.go_on.set()
-    assert later[0].result(5.0).startswith("worm: stopped") and first.done()
-    assert len(bench.log) == 2 and bench.log[1][0].startswith("viewer 0, viewer 1, ")
+    assert later[0].result(5.0).startswith("worm: stopped")
+    assert first.done()
+    assert len(bench.log) == 2
+    assert bench.log[1][0].startswith("viewer 0, viewer 1, ")
 
 
 def test_prepared_stop_of_unreachable_robot_explains_the_failure(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,11 @@ def depth(tick: int = 0) -> DepthImage:
 def test_depth_keeps_its_values() -> None:
     made = preview_of(depth(7), 80)
     seen = np.array(PIL.Image.open(io.BytesIO(made.data)))
-    assert (made.tick, made.width, made.height, made.format, made.scale_m) == (7, 80, 60, "png", 0.001)
+    assert made.tick == 7
+    assert made.width == 80
+    assert made.height == 60
+    assert made.format == "png"
+    assert made.scale_m == 0.001
     assert np.array_equal(seen, np.arange(160 * 120).reshape(120, 160)[::2, ::2])
 
 
@@ -46,10 +50,13 @@ def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) 
     image = ColorImage(tick=0, timestamp_ns=0, width=160, height=120, rgb=ramp.tobytes(), **CAMERA)
     made = preview_of(image, width)
     seen = np.array(PIL.Image.open(io.BytesIO(made.data))).astype(int)
-    assert (made.width, made.height) == expected and made.format == "jpeg" and made.scale_m is None
+    assert (made.width, made.height) == expected
+    assert made.format == "jpeg"
+    assert made.scale_m is None
     assert len(made.data) < 4000
     across = np.linspace(0, 255, expected[0])
-    assert np.abs(seen[expected[1] // 2, :, 0] - across).max() < 24 and seen[..., 1].max() < 40
+    assert np.abs(seen[expected[1] // 2, :, 0] - across).max() < 24
+    assert seen[..., 1].max() < 40
 
 
 def test_only_what_is_looked_at() -> None:
@@ -67,5 +74,6 @@ def test_only_what_is_looked_at() -> None:
             images.put(depth(3))
             found: list[Preview] = []
             wait_until(lambda: camera.publish_preview() or found.extend(seen.drain()) or found, "a preview")
-            assert found[0].tick == 3 and found[0].width == 80
+            assert found[0].tick == 3
+            assert found[0].width == 80
         wait_until(lambda: camera.publish_preview() or not images.has_subscriber(), "the image left alone again")

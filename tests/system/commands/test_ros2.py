@@ -105,7 +105,8 @@ class RosSide:
                 if (sample := declared.try_recv()) is None:
                     time.sleep(0.01)
                     continue
-                assert sample.attachment is not None and len(sample.attachment.to_bytes()) == 33
+                assert sample.attachment is not None
+                assert len(sample.attachment.to_bytes()) == 33
                 if wanted(found := STORE.deserialize_cdr(sample.payload.to_bytes(), kind)):
                     return found
         finally:
@@ -124,9 +125,12 @@ class RosSide:
         (*_, reply) = [None, *self.session.get(key, payload=payload, attachment=sent, target=complete, timeout=20.0)]
         if reply is None:
             return None
-        assert reply.ok is not None and reply.ok.attachment is not None
+        assert reply.ok is not None
+        assert reply.ok.attachment is not None
         sequence, _, length, gid = struct.unpack("<qqB16s", reply.ok.attachment.to_bytes())
-        assert (sequence, length, gid) == (7, 16, bytes(range(16)))
+        assert sequence == 7
+        assert length == 16
+        assert gid == bytes(range(16))
         return STORE.deserialize_cdr(reply.ok.payload.to_bytes(), f"{kind}_Response")
 
     def trigger(self, name: str) -> None:
@@ -168,9 +172,11 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
     with running(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
         run.wait_for(" s  ")
         refused = tell(run, "start", "ros2", "--ros-router", run.endpoint)
-        assert refused.code == 2 and "itself is on this endpoint" in refused.err
+        assert refused.code == 2
+        assert "itself is on this endpoint" in refused.err
         refused = tell(run, "start", "ros2", "--ros-router", at, "--joint-commands")
-        assert refused.code != 0 and "has a controller already, which holds the lease" in refused.err
+        assert refused.code != 0
+        assert "has a controller already, which holds the lease" in refused.err
         bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
         with session_at(at) as session, background(tmp_path, *bridge):
             _sees(RosSide(session))
@@ -192,7 +198,8 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
         session_at(at) as session,
         background(tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
     ):
-        assert waiting.stdout is not None and "Waiting for it up to 60 s" in waiting.stdout.readline()
+        assert waiting.stdout is not None
+        assert "Waiting for it up to 60 s" in waiting.stdout.readline()
         with background(tmp_path, *late):
             ros = RosSide(session)
             ros.first("joint_states", "sensor_msgs/msg/JointState")
@@ -224,7 +231,8 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
             there = ros.moved(lambda: ros.command(["joint_7"], position=[0.3]), lambda now: now["joint_7"] > 0.28)
             # The others hold their angles between pegs, which give: a position loop is as stiff as its gains.
             others = [abs(there[name] - was) for name, was in zip(limp.name, limp.position, strict=True)]
-            assert sorted(others)[-2] < 0.15 and there["joint_7"] == pytest.approx(0.3, abs=0.03)
+            assert sorted(others)[-2] < 0.15
+            assert there["joint_7"] == pytest.approx(0.3, abs=0.03)
             ros.moved(lambda: ros.command(["joint_3"], velocity=[-0.5]), lambda now: now["joint_3"] < -0.2)
             ros.first("joint_states", "sensor_msgs/msg/JointState", lambda now: max(abs(now.velocity)) < 0.05)
             stood = ros.first("joint_states", "sensor_msgs/msg/JointState")
@@ -233,7 +241,8 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
             assert max(abs(stands.position - stood.position)) < 0.02
             ros.trigger("stop")
             refused = ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0))
-            assert not refused.success and "stop" in refused.message
+            assert not refused.success
+            assert "stop" in refused.message
             ros.trigger("reset")
             ros.trigger("arm")
             ros.trigger("disarm")
@@ -245,15 +254,21 @@ def _tunes(ros: RosSide) -> None:
     listed = ros.parameters("list_parameters", "ListParameters", [], 0)
     assert name in listed.result.names
     (about,) = ros.parameters("describe_parameters", "DescribeParameters", [name]).descriptors
-    assert (about.name, about.type) == (name, 3) and "[s]" in about.description and about.floating_point_range
+    assert about.name == name
+    assert about.type == 3
+    assert "[s]" in about.description
+    assert about.floating_point_range
     wanted = ros.parameter(name, 0.3)
     (done,) = ros.parameters("set_parameters", "SetParameters", [wanted]).results
     assert done.successful, done.reason
     (now, nothing) = ros.parameters("get_parameters", "GetParameters", [name, "control.x"]).values
-    assert (now.type, now.double_value, nothing.type) == (3, 0.3, 0)
+    assert now.type == 3
+    assert now.double_value == 0.3
+    assert nothing.type == 0
     wanted = ros.parameter(name, -1.0)
     refused = ros.parameters("set_parameters_atomically", "SetParametersAtomically", [wanted]).result
-    assert not refused.successful and "speed_kp_s" in refused.reason
+    assert not refused.successful
+    assert "speed_kp_s" in refused.reason
 
 
 def _sees(ros: RosSide) -> None:
@@ -264,13 +279,19 @@ def _sees(ros: RosSide) -> None:
     clock = ros.first("clock", "rosgraph_msgs/msg/Clock").clock
     assert abs(clock.sec - joints.header.stamp.sec) <= 2
     image = ros.first("head/depth/image_raw", "sensor_msgs/msg/Image")
-    assert (image.encoding, image.width, image.height, len(image.data)) == ("16UC1", 160, 120, 38400)
+    assert image.encoding == "16UC1"
+    assert image.width == 160
+    assert image.height == 120
+    assert len(image.data) == 38400
     png = ros.first("head/depth/image_raw/compressedDepth", "sensor_msgs/msg/CompressedImage")
-    assert png.format == "16UC1; compressedDepth png" and png.data[12:20].tobytes() == b"\x89PNG\r\n\x1a\n"
+    assert png.format == "16UC1; compressedDepth png"
+    assert png.data[12:20].tobytes() == b"\x89PNG\r\n\x1a\n"
     imu = ros.first("link_7/imu", "sensor_msgs/msg/Imu")
-    assert imu.header.frame_id == "link_7_imu_frame" and 8 < imu.linear_acceleration.z < 12
+    assert imu.header.frame_id == "link_7_imu_frame"
+    assert 8 < imu.linear_acceleration.z < 12
     info = ros.first("head/depth/camera_info", "sensor_msgs/msg/CameraInfo")
-    assert info.header.frame_id == image.header.frame_id and info.k[0] == info.p[0] > 0
+    assert info.header.frame_id == image.header.frame_id
+    assert info.k[0] == info.p[0] > 0
     placed = "link_7_imu_frame"
     static = ros.first(
         "tf_static",
@@ -290,7 +311,9 @@ def _sees(ros: RosSide) -> None:
     drawn = ros.first("obstacles", "visualization_msgs/msg/MarkerArray", lambda found: len(found.markers) > 1)
     assert {marker.header.frame_id for marker in drawn.markers} == {"odom"}
     kinds = [token.split("/")[5] for token in ros.tokens()]
-    assert (kinds.count("NN"), kinds.count("MS")) == (1, 1) and kinds.count("MP") >= 9
+    assert kinds.count("NN") == 1
+    assert kinds.count("MS") == 1
+    assert kinds.count("MP") >= 9
 
 
 def _steers(ros: RosSide, endpoint: str) -> None:
@@ -310,7 +333,9 @@ def _steers(ros: RosSide, endpoint: str) -> None:
 
         wait_until(followed, "navigation at the speed of /cmd_vel", 30.0)
         (*_, newest) = intents.drain()
-        assert newest.speed_m_s == 0.1 and newest.heading_w_rad is not None and abs(newest.heading_w_rad) < 3.2
+        assert newest.speed_m_s == 0.1
+        assert newest.heading_w_rad is not None
+        assert abs(newest.heading_w_rad) < 3.2
         wait_until(
             lambda: plans.newest(lambda plan: plan.speed_m_s == 0 and "has expired" in plan.reason) is not None,
             "standing still without /cmd_vel",
@@ -343,7 +368,8 @@ def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
             (first, *_) = _within(3.0, clocks)
             assert first.lifecycle == "armed"
             (*_, last) = _within(1.0, clocks)
-            assert last.tick > first.tick and last.lifecycle == "armed"
+            assert last.tick > first.tick
+            assert last.lifecycle == "armed"
         finally:
             os.kill(router, signal.SIGCONT)
     images.undeclare()

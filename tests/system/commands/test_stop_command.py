@@ -22,7 +22,8 @@ def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
     with running(run_config()) as run:
         at, said = run.link.endpoint, list[str]()
         assert stop.estop(RobotSelection(at), said.append) == 0
-        assert said == [f"lab/worm: stopped: {run.status.reason} ({at})"] and run.status.lifecycle == "estop"
+        assert said == [f"lab/worm: stopped: {run.status.reason} ({at})"]
+        assert run.status.lifecycle == "estop"
         with open_session(Link(at, "lab/deaf")) as deaf:
             deaf.declare_alive("hal")
             said.clear()

@@ -48,7 +48,8 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
         with open_session(Link(run.endpoint, "planar13")) as session:
             intents, way = session.reader(keys.INTENT, Intent), Way(session)
             with at_the_keyboard(run, tmp_path) as lost:
-                assert intents.drain() == [] and lost.shows("nothing asked for yet") is None
+                assert intents.drain() == []
+                assert lost.shows("nothing asked for yet") is None
                 lost.type(2 * UP)
                 wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost.type(LEFT)
@@ -60,7 +61,8 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 left.type(UP)
                 wait_until(lambda: way.is_at(0.05, "teleop"), "navigation to go at 0.05 m/s")
                 left.type(b"q")
-                assert left.process.wait(10) == 0 and left.given_back
+                assert left.process.wait(10) == 0
+                assert left.given_back
                 wait_until(
                     lambda: way.speed_m_s == 0.0 or way.is_at(0.0, "wants it to stop"), "navigation to stop", 5.0
                 )
@@ -69,12 +71,14 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
             ) as program:
                 wait_until(lambda: way.is_at(0.1, "as steer.py wants it"), "navigation to follow the documented client")
                 program.terminate()
-                assert program.stderr is not None and program.stderr.read() == b""
+                assert program.stderr is not None
+                assert program.stderr.read() == b""
             with at_the_keyboard(run, tmp_path) as stops:
                 stops.type(b" ")
                 wait_until(lambda: lifecycle(session) == "estop", "the emergency stop", 5.0)
                 stops.process.send_signal(signal.SIGTERM)
-                assert stops.process.wait(10) == 0 and stops.given_back
+                assert stops.process.wait(10) == 0
+                assert stops.given_back
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,8 @@ def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any
     ended = command.tell(run, "topic", "echo", key, "--count", str(count), *more)
     assert ended.code == 0 and ended.err == "", ended.err
     lines = [json.loads(line) for line in ended.out.splitlines()]
-    assert len(lines) == count and all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
+    assert len(lines) == count
+    assert all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
     return lines
 
 
@@ -38,9 +39,12 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         done = subprocess.run(
             [*SNAKESIM, "scenario", "list"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
-    assert done.returncode == 1 and done.stderr.startswith("snakesim: ") and done.stderr.count("\n") == 1
+    assert done.returncode == 1
+    assert done.stderr.startswith("snakesim: ")
+    assert done.stderr.count("\n") == 1
     seen = call(["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], tmp_path)
-    assert seen.err == "" and seen.out.count("\n") == 1
+    assert seen.err == ""
+    assert seen.out.count("\n") == 1
 
 
 @pytest.mark.slow
@@ -130,7 +134,8 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
         (reported,) = echoed(run, "hal/description", 1)
-        assert reported["key"] == "planar13/hal/description" and reported["message"]["joints"][12]["name"] == "joint_13"
+        assert reported["key"] == "planar13/hal/description"
+        assert reported["message"]["joints"][12]["name"] == "joint_13"
         found = echoed(run, "sensor/**", 40)
         assert {"planar13/sensor/joints", "planar13/sensor/imu"} <= {line["key"] for line in found}
         assert all("tick" in line["message"] for line in found)
@@ -139,11 +144,16 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         named = echoed(run, "*/joints", 3, "--namespace", "planar13")
         assert {line["key"] for line in named} <= {"sensor/joints", "actuator/joints"}
         unknown = command.tell(run, "topic", "echo", "sensor/smell")
-        assert unknown.code == 2 and "sensor/contacts" in unknown.err
+        assert unknown.code == 2
+        assert "sensor/contacts" in unknown.err
         wrong = command.tell(run, "topic", "echo", "sensor/***")
-        assert wrong.code == 2 and "is not a key" in wrong.err and wrong.err.count("\n") == 1
+        assert wrong.code == 2
+        assert "is not a key" in wrong.err
+        assert wrong.err.count("\n") == 1
         status = command.tell(run, "status")
-        assert status.code == 0 and "planar13: armed" in status.out and "control, guidance, navigation" in status.out
+        assert status.code == 0
+        assert "planar13: armed" in status.out
+        assert "control, guidance, navigation" in status.out
         assert run.interrupt() == 130
 
 
@@ -171,7 +181,9 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     flags = ("--duration", "2", "--in-process")
     ended, summary = command.run_to_summary(tmp_path / "run", "triplet", "--controller", "./wave.py:Wave", *flags[:2])
     assert ended.code == 0, ended.out + ended.err
-    assert summary.controller == "./wave.py:Wave" and summary.energy_j is not None and summary.energy_j > 0.1
+    assert summary.controller == "./wave.py:Wave"
+    assert summary.energy_j is not None
+    assert summary.energy_j > 0.1
 
     # The same class as a stranger's installed package: an entry point is all it takes.
     package = tmp_path / "site" / "waves-1.0.dist-info"

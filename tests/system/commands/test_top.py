@@ -33,9 +33,12 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
         traffic.add(arrival("lab/worm/actuator/joints", answer, 10 * tick + 3))
     lines = {line.key: line for line in traffic.lines(1000 * MS)}
     joints = lines[keys.JOINTS]
-    assert (joints.robot, joints.writer) == ("lab/worm", "HAL")
-    assert joints.rate_hz == pytest.approx(100.0) and joints.jitter_ms == pytest.approx(0.0, abs=1e-9)
-    assert joints.received_ago_s == pytest.approx(0.01) and joints.age_ms == pytest.approx(20.0)
+    assert joints.robot == "lab/worm"
+    assert joints.writer == "HAL"
+    assert joints.rate_hz == pytest.approx(100.0)
+    assert joints.jitter_ms == pytest.approx(0.0, abs=1e-9)
+    assert joints.received_ago_s == pytest.approx(0.01)
+    assert joints.age_ms == pytest.approx(20.0)
     (latency,) = traffic.latencies()
     assert (latency.arrival_median_ms, latency.arrival_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
 
@@ -48,10 +51,13 @@ def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
     for i in range(2 * MAX_ARRIVALS):
         traffic.add(Arrival("evil/0", b"x", "", i * MS))
     lines = traffic.lines(MS)
-    assert len(lines) == MAX_KEYS and traffic.keys_left_out == 11
-    assert lines[0].failure == "malformed" and lines[1].writer is None
+    assert len(lines) == MAX_KEYS
+    assert traffic.keys_left_out == 11
+    assert lines[0].failure == "malformed"
+    assert lines[1].writer is None
     text = "\n".join(TrafficSnapshot(lines, [], {}, {}, traffic.keys_left_out).format_table())
-    assert "UNKNOWN" in text and "11 messages on still more keys" in text
+    assert "UNKNOWN" in text
+    assert "11 messages on still more keys" in text
 
 
 def test_a_table_for_scripts_from_a_real_network() -> None:
@@ -74,5 +80,7 @@ def test_a_table_for_scripts_from_a_real_network() -> None:
             over.set()
             teller.join()
     (line,) = json.loads(lines[0])["keys"]
-    assert (line["robot"], line["key"], line["writer"]) == ("worm", "hal/clock", "HAL")
+    assert line["robot"] == "worm"
+    assert line["key"] == "hal/clock"
+    assert line["writer"] == "HAL"
     assert 10 < line["rate_hz"] < 60

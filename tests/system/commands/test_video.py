@@ -31,7 +31,8 @@ def test_a_gif_shows_the_snake_in_every_picture(run: Path) -> None:
     out = run.parent / "film.gif"
     assert film(run, out, "--speed", "2") == ""
     with Image.open(out) as gif:
-        assert gif.size == (96, 64) and 4 <= gif.n_frames <= 6  # pyright: ignore[reportAttributeAccessIssue]
+        assert gif.size == (96, 64)
+        assert 4 <= gif.n_frames <= 6  # pyright: ignore[reportAttributeAccessIssue]
         for frame in range(gif.n_frames):  # pyright: ignore[reportAttributeAccessIssue]
             gif.seek(frame)
             red, _, blue = np.moveaxis(np.asarray(gif.convert("RGB")).astype(int), 2, 0)
@@ -55,7 +56,8 @@ def test_an_mp4_is_one(run: Path) -> None:
 )
 def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) -> None:
     ended = snakesim("recording", "video", str(run), *more, cwd=run.parent)
-    assert ended.code == 2 and said in ended.err
+    assert ended.code == 2
+    assert said in ended.err
 
 
 def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
@@ -66,6 +68,8 @@ def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
     moment = recorded.snapshot_at(begin_s + 0.5)
     row = record.row_at(begin_s + 0.5)
     drawing, nodes = draw(moment, Surroundings(record.config)), record.nodes_w(row)
-    assert drawing is not None and nodes is not None
+    assert drawing is not None
+    assert nodes is not None
     assert drawing.hinges_w == pytest.approx(nodes[1:-1])
-    assert moment.control is not None and abs(moment.control.timestamp_ns * 1e-9 - begin_s - 0.5) < 0.1
+    assert moment.control is not None
+    assert abs(moment.control.timestamp_ns * 1e-9 - begin_s - 0.5) < 0.1

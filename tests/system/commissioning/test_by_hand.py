@@ -22,19 +22,19 @@ def home(tmp_path: Path) -> Path:
     return make_hand_turned_folder(tmp_path)
 
 
-def hold(home: Path, joints_rad: Sequence[float]) -> None:
+def set_joint_angles(home: Path, joints_rad: Sequence[float]) -> None:
     """Hold the joints at angles, which the drives show as they are mounted."""
     drives = ZERO_RAD + SIGN * np.array(joints_rad)
     (home / "new.json").write_text(json.dumps(drives.tolist()))
     (home / "new.json").replace(home / "drives.json")
 
 
-def told(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
+def calibrating(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
     """A command that somebody answers by moving joints and pressing Enter."""
     return background(home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
 
 
-def line(process: subprocess.Popen[str]) -> str:
+def read_output_line(process: subprocess.Popen[str]) -> str:
     """The next that it says."""
     assert process.stdout is not None
     return process.stdout.readline()
@@ -50,31 +50,34 @@ def enter(process: subprocess.Popen[str]) -> str:
 
 def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
     pose_rad = [0.0] * JOINTS
-    hold(home, pose_rad)
+    set_joint_angles(home, pose_rad)
     with host(home, BACKEND) as endpoint:
-        with told(home, endpoint, "direction", "snake.toml") as process:
+        with calibrating(home, endpoint, "direction", "snake.toml") as process:
             for joint in range(JOINTS):
-                assert line(process).startswith(f"joint_{joint + 1}: turn what is ahead of it to the left")
+                assert read_output_line(process).startswith(f"joint_{joint + 1}: turn what is ahead of it to the left")
                 pose_rad[joint] += 0.3
-                hold(home, pose_rad)
-                assert ("the other way round" if SIGN[joint] < 0 else "matches the file") in line(process)
-            assert "1 joints changed" in line(process) and process.wait(20) == 0
+                set_joint_angles(home, pose_rad)
+                assert ("the other way round" if SIGN[joint] < 0 else "matches the file") in read_output_line(process)
+            assert "1 joints changed" in read_output_line(process)
+            assert process.wait(20) == 0
         stale = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
-        assert stale.code == 2 and "restart the host with this file" in stale.err
-    hold(home, [0.0] * JOINTS)
+        assert stale.code == 2
+        assert "restart the host with this file" in stale.err
+    set_joint_angles(home, [0.0] * JOINTS)
     with host(home, BACKEND) as endpoint:
-        with told(home, endpoint, "limits", "snake.toml", "joint_1") as process:
-            assert line(process).startswith("Move each joint")
+        with calibrating(home, endpoint, "limits", "snake.toml", "joint_1") as process:
+            assert read_output_line(process).startswith("Move each joint")
             for angle_rad in (-0.9, 1.2):
-                hold(home, [angle_rad, 0.0, 0.0, 0.0])
+                set_joint_angles(home, [angle_rad, 0.0, 0.0, 0.0])
                 seen(home, endpoint, angle_rad + ZERO_RAD[0])
             assert "1 joints changed" in enter(process)
         assert "joint_2 reports the turn" in swapped(home, endpoint)
-        with told(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
-            assert line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
-            hold(home, [1.2, 0.4, np.pi / 4, 0.0])
-            assert "45 of 45 degrees: matches the file" in line(process) and process.wait(20) == 0
-        hold(home, [0.0] * JOINTS)
+        with calibrating(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
+            assert read_output_line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
+            set_joint_angles(home, [1.2, 0.4, np.pi / 4, 0.0])
+            assert "45 of 45 degrees: matches the file" in read_output_line(process)
+            assert process.wait(20) == 0
+        set_joint_angles(home, [0.0] * JOINTS)
         seen(home, endpoint, ZERO_RAD[0])
         assert snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0
     found = robot(home).joint_table
@@ -83,21 +86,22 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
     ends = found[0].limits
     assert (ends.lower_rad, ends.upper_rad) == pytest.approx((-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3)
     text = (home / "snake.toml").read_text()
-    assert "# paper, section IV-A" in text and "sign = -1 # turned by hand, " in text
+    assert "# paper, section IV-A" in text
+    assert "sign = -1 # turned by hand, " in text
 
 
 def swapped(home: Path, endpoint: str) -> str:
     """Turn joint_2 when joint_1 is asked for."""
-    with told(home, endpoint, "direction", "snake.toml", "joint_1") as process:
-        line(process)
-        hold(home, [1.2, 0.4, 0.0, 0.0])
-        said = line(process)
+    with calibrating(home, endpoint, "direction", "snake.toml", "joint_1") as process:
+        read_output_line(process)
+        set_joint_angles(home, [1.2, 0.4, 0.0, 0.0])
+        said = read_output_line(process)
         assert process.wait(20) == 1
     return said
 
 
 def test_by_hand_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) -> None:
-    hold(home, [0.0] * JOINTS)
+    set_joint_angles(home, [0.0] * JOINTS)
     before = (home / "snake.toml").read_bytes()
     with running(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
         run.wait_for(" of 600 s")  # armed

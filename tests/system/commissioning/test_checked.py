@@ -26,7 +26,8 @@ def moves(home: Path, out: str, *words: str) -> bool:
 @pytest.mark.slow
 def test_checked_robot_can_be_armed_until_file_or_drive_changes(home: Path) -> None:
     refused = run(home, "never", "--duration", "0.1")
-    assert refused.code == 1 and "its joints have not been checked against its file" in refused.out
+    assert refused.code == 1
+    assert "its joints have not been checked against its file" in refused.out
     assert moves(home, "word", "--unchecked")
 
     checking = run(home, "check", "--controller", "joint_check", "--duration", "4")
@@ -34,15 +35,20 @@ def test_checked_robot_can_be_armed_until_file_or_drive_changes(home: Path) -> N
     judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
     assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in judged.out, judged.out
     text = (home / "snake.toml").read_text()
-    assert "[checked]" in text and 'serials = ["A1", "B2", "C3"]' in text
-    assert moves(home, "checked") and moves(home, "slower", "--set", "robot.limits.speed_rad_s=1.0")
+    assert "[checked]" in text
+    assert 'serials = ["A1", "B2", "C3"]' in text
+    assert moves(home, "checked")
+    assert moves(home, "slower", "--set", "robot.limits.speed_rad_s=1.0")
 
     (home / "serials").write_text("A1 B9 C3")
     other = run(home, "other", "--duration", "0.1")
-    assert other.code == 1 and "joint_2 has drive B9, and had B2" in other.out
+    assert other.code == 1
+    assert "joint_2 has drive B9, and had B2" in other.out
     (home / "serials").write_text("A1 B2 C3")
     (home / "snake.toml").write_text(f"{text}\n[joints.joint_2]\nsign = -1\n")
     changed = run(home, "changed", "--duration", "0.1")
-    assert changed.code == 1 and "how its joints are mounted was changed in its file since" in changed.out
+    assert changed.code == 1
+    assert "how its joints are mounted was changed in its file since" in changed.out
     again = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
-    assert again.code == 2 and "the mounting of the joints differs" in again.err
+    assert again.code == 2
+    assert "the mounting of the joints differs" in again.err

@@ -213,7 +213,8 @@ def change_settings(tab: Tab, run: Running) -> None:
         in_force = session.latest(
             keys.PARAMETERS_IN_FORCE, ControlParameters, 10.0, lambda one: one.requester == "viewer 1"
         )
-    assert in_force is not None and '"amplitude_rad":0.4' in in_force.parameters
+    assert in_force is not None
+    assert '"amplitude_rad":0.4' in in_force.parameters
 
 
 def stop_in(tab: Tab, run: Running) -> float:

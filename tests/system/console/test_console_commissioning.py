@@ -52,7 +52,8 @@ async def arm_unchecked(address: str) -> None:
         await viewer.click("Arm it unchecked")  # nothing has been asked and refused yet
         await viewer.choose("Robot", "Arm")
         await until(lambda: viewer.visible("Arm it unchecked"), "the word")
-        assert viewer.shows("its joints have not been checked against its file") and viewer.shows(">DISARMED<")
+        assert viewer.shows("its joints have not been checked against its file")
+        assert viewer.shows(">DISARMED<")
         await viewer.click("Arm it unchecked")
         await until(lambda: viewer.shows(", unchecked, commanded by control"), "a robot armed by the word")
         await until(lambda: not viewer.visible("Arm it unchecked"), "the end of the offer")

@@ -42,7 +42,8 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
                 await until(lambda: driver.has("Release control"), "control")
                 await hold(driver, "Drive: ahead", lambda: any(path.reason for path in paths.drain()), "who drives")
                 asked = intents.drain()
-                assert asked and all(intent.requester == "viewer 2" and (intent.speed_m_s or 0) > 0 for intent in asked)
+                assert asked
+                assert all(intent.requester == "viewer 2" and (intent.speed_m_s or 0) > 0 for intent in asked)
                 before = asked[-1].heading_w_rad
                 assert before is not None
                 await driver.trigger("Drive: left")

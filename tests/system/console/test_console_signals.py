@@ -68,7 +68,8 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
         point(tab, 0.25)  # in the first plot: the cursor of both follows
         wait_until(lambda: cells(tab)[measured] != said[measured], "another instant")
         cursors = tab.value("[...document.querySelectorAll('.cursor')].map(one => one.getBoundingClientRect().left)")
-        assert len(cursors) == 2 and cursors[0] == pytest.approx(cursors[1], abs=2)
+        assert len(cursors) == 2
+        assert cursors[0] == pytest.approx(cursors[1], abs=2)
         point(tab, 0.25, press=True)  # and the snake in the console is there
         wait_until(lambda: now_s(address) == pytest.approx(0.5, abs=0.05), "the time that was pressed")
 
@@ -90,7 +91,8 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
     assert np.array_equal(column, angle)
     drawing = ET.fromstring((tmp_path / "signals.svg").read_text(encoding="utf-8"))
     words = "".join(drawing.itertext())
-    assert measured in words and "torque_nm.joint_6, N·m" in words
+    assert measured in words
+    assert "torque_nm.joint_6, N·m" in words
     assert (tmp_path / "signals.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -104,7 +106,8 @@ def labels_of_the_report_are_read_on_a_phone(browser: Browser, record: RunRecord
         "[...document.querySelectorAll('.figure text.small')]"
         ".filter(label => /^\\d+ (cm|m|N)$/.test(label.textContent)).map(label => label.getBoundingClientRect().height)"
     )
-    assert len(heights) >= 2 and min(heights) >= READABLE_PX
+    assert len(heights) >= 2
+    assert min(heights) >= READABLE_PX
 
 
 AXIS = "document.querySelector('.plot').layout.yaxis.range"

@@ -60,7 +60,8 @@ def test_console_message_delayed_by_a_stall_is_too_old(*, down_stalls: bool, up_
     for _ in range(20):
         fresh += link.turn(now_s, down_stalls=False, up_stalls=False, held=True)
         now_s += 1 / HZ
-    assert len(fresh) == 20 and max(fresh) <= MAX_HOLD_AGE_S
+    assert len(fresh) == 20
+    assert max(fresh) <= MAX_HOLD_AGE_S
     lifted_s = now_s + stall_s - MAX_HOLD_AGE_S - 0.2  # the finger is lifted before the network recovers
     late: list[float] = []
     for _ in range(round(stall_s * HZ)):
@@ -68,7 +69,8 @@ def test_console_message_delayed_by_a_stall_is_too_old(*, down_stalls: bool, up_
         now_s += 1 / HZ
     if up_stalls:
         late = link.turn(now_s, down_stalls=False, up_stalls=False, held=False)
-        assert len(late) >= (stall_s - 1.0) * HZ and min(late) > MAX_HOLD_AGE_S
+        assert len(late) >= (stall_s - 1.0) * HZ
+        assert min(late) > MAX_HOLD_AGE_S
     else:
         assert all(age_s > MAX_HOLD_AGE_S for age_s in late[round(HZ) :]), "no question reaches the page"
     for _ in range(3):
@@ -125,7 +127,8 @@ def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
         for name in raw:
             assert admission.check_message(VIEWER, raw[name], old) is None
         assert done == [f"group {VIEWER}", f"stop {VIEWER}"], "to disarm and to stop"
-        assert len(late) == 1 and late[0] == pytest.approx(14.0, abs=1.0)
+        assert len(late) == 1
+        assert late[0] == pytest.approx(14.0, abs=1.0)
         assert admission.dropped["too old"] == 2
         done.clear()
         for name in raw:
@@ -145,7 +148,8 @@ def test_console_page_without_scene_may_view_and_stop() -> None:
         with Page(address, draws=False) as page:
             page.click("EMERGENCY STOP  (Esc)")
             wait_until(lambda: stopped == [0], "the stop", 10.0)
-            assert server.viewers() == 1 and not server.get_clients()
+            assert server.viewers() == 1
+            assert not server.get_clients()
         wait_until(lambda: server.viewers() == 0, "its end", 10.0)
 
 

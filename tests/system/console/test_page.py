@@ -27,10 +27,11 @@ from snakesim_testing.operator.viewer import watch
 
 def test_page_request_from_other_host_or_port_is_refused():
     for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):  # a tunnel has another port
-        assert explain_refusal(host, f"http://{host}") is None and explain_refusal(host, None) is None
-        assert (
-            explain_refusal(host, "http://evil.example") and explain_refusal(host, "null") and explain_refusal(host, "")
-        )
+        assert explain_refusal(host, f"http://{host}") is None
+        assert explain_refusal(host, None) is None
+        assert explain_refusal(host, "http://evil.example")
+        assert explain_refusal(host, "null")
+        assert explain_refusal(host, "")
     assert "http://localhost:8081" in (explain_refusal("localhost:8080", "http://localhost:8081") or "")
     assert "has to be a name of this computer" in (
         explain_refusal("evil.example:8080", "http://evil.example:8080") or ""
@@ -68,11 +69,16 @@ def test_nobody_can_open_a_tunnel_to_the_internet():
 
 def test_control_is_taken_while_free_and_never_taken_away():
     token = ControlToken()
-    assert token.acquire(1) and token.acquire(1)
-    assert not token.acquire(2) and token.holder == 1
-    assert not token.release(2) and token.holder == 1
-    assert token.release(1) and token.holder is None
-    assert token.acquire(2) and token.holder == 2
+    assert token.acquire(1)
+    assert token.acquire(1)
+    assert not token.acquire(2)
+    assert token.holder == 1
+    assert not token.release(2)
+    assert token.holder == 1
+    assert token.release(1)
+    assert token.holder is None
+    assert token.acquire(2)
+    assert token.holder == 2
 
 
 def test_text_from_the_network_is_no_markup():
@@ -82,12 +88,15 @@ def test_text_from_the_network_is_no_markup():
     reported = status(lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named)
     snapshot = RobotSnapshot(robot=robot, status=reported)
     shown = page_html.format_header(snapshot) + page_html.format_state_table(snapshot) + page_html.format_log([evil])
-    assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
+    assert "<img" not in shown
+    assert "&lt;img" in shown
+    assert "\x1b" not in shown
 
 
 def test_page_says_that_simulator_is_paused_and_by_whom():
     shown = page_html.format_header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
-    assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
+    assert ">PAUSED<" in shown
+    assert "by &lt;b&gt;ada" in shown
     assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=description(), status=status()))
 
 
@@ -99,9 +108,8 @@ def test_page_draws_an_expected_robot_at_its_start():
     start = capsules_at_start(config)
     middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
     assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
-    assert "WAITING FOR THE ROBOT" in page_html.format_header(snapshot) and "SIMULATOR" not in page_html.format_header(
-        snapshot
-    )
+    assert "WAITING FOR THE ROBOT" in page_html.format_header(snapshot)
+    assert "SIMULATOR" not in page_html.format_header(snapshot)
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,11 @@ def test_scene_force_without_contact_is_dashed_until_contact():
             assert drawing is not None
             scene.show(drawing)
             desired = scene._arrows.get("forces/desired")
-            assert scene._dashed_forces.visible is not bool(felt) and (desired is not None and desired.visible) is bool(
-                felt
-            )
+            assert scene._dashed_forces.visible is not bool(felt)
+            assert (desired is not None and desired.visible) is bool(felt)
         ends = scene._dashed_forces.points.reshape(-1, 3)
-        assert len(ends) == 10 and ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
+        assert len(ends) == 10
+        assert ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
 
 
 def test_scene_perceived_shapes_are_drawn_until_forgotten():

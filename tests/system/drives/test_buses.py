@@ -95,11 +95,13 @@ def opened() -> Iterator[Opens]:
 def test_mixed_drive_families_move_as_one_robot(opened: Opens) -> None:
     robot = opened()
     described = robot.backend.describe()
-    assert [joint.serial[:4] for joint in described.joints] == ["3855", "3855", "", ""] and described.emulated
+    assert [joint.serial[:4] for joint in described.joints] == ["3855", "3855", "", ""]
+    assert described.emulated
     assert [joint.supports_mode(Mode.VELOCITY) for joint in described.joints] == [True] * 4, (
         "as its file says; a run narrows it"
     )
-    assert robot.run(30, "disarmed") == [] and robot.run(40, "armed") == []
+    assert robot.run(30, "disarmed") == []
+    assert robot.run(40, "armed") == []
     assert robot.angles([*AXES, *SERVOS]) == pytest.approx([0.1] * 4, abs=0.02)
     assert robot.axes_follow() == robot.servos_follow() == {True}
     robot.run(5, "estop")
@@ -113,13 +115,16 @@ def test_bus_failed_reading_keeps_last_value_and_other_buses(opened: Opens) -> N
     robot.go_wrong("cut:bus_2@0-9")
     robot.target = -0.1
     found = robot.run(4, "armed")
-    assert robot.angles(SERVOS) == before and robot.ages_ms(SERVOS) == [40.0, 40.0]
+    assert robot.angles(SERVOS) == before
+    assert robot.ages_ms(SERVOS) == [40.0, 40.0]
     assert robot.ages_ms(AXES) == [0.0, 0.0]
     assert [fault.what for fault in found] == ["interface_down", "drive_silent", "drive_silent"]
     assert [fault.joint for fault in found[1:]] == ["joint_3", "joint_4"], "named as in the robot"
-    assert robot.joints is not None and robot.joints.valid == [True] * 4
+    assert robot.joints is not None
+    assert robot.joints.valid == [True] * 4
     robot.run(4, "fault")
-    assert robot.joints.valid == [True, True, False, False] and robot.angles(SERVOS) == before
+    assert robot.joints.valid == [True, True, False, False]
+    assert robot.angles(SERVOS) == before
 
 
 def test_bus_drive_fault_is_injected_and_reported_by_joint_number(opened: Opens) -> None:
@@ -139,7 +144,8 @@ def test_bus_at_half_rate_is_polled_every_second_tick(opened: Opens) -> None:
         assert robot.run(1, "armed") == []
         ages.append([*robot.ages_ms([0]), *robot.ages_ms([2])])
     assert ages == [[0.0, 0.0], [0.0, 10.0]] * 3
-    assert robot.run(1, "armed") == [] and robot.run(1, "disarmed") == []
+    assert robot.run(1, "armed") == []
+    assert robot.run(1, "disarmed") == []
     assert robot.axes_follow() == robot.servos_follow() == {False}, "in a tick in which the servos' turn is not"
 
 
@@ -177,7 +183,9 @@ def test_bus_that_blocks_ages_alone_while_others_stop(opened: Opens) -> None:
         time.sleep(0.01)
     assert ages == sorted(ages) and ages[-1] >= 140, "its age grows with each tick"
     assert max(robot.ages_ms(AXES)) < ages[-1], "the other bus is read"
-    assert robot.angles(SERVOS) == before and robot.joints is not None and robot.joints.valid[2:] == [False, False]
+    assert robot.angles(SERVOS) == before
+    assert robot.joints is not None
+    assert robot.joints.valid[2:] == [False, False]
     robot.run(1, "disarmed")
     wait_until(lambda: robot.axes_follow() == {False}, "axes that are let go", 10.0)
     assert robot.servos_follow() == {True}, "nobody can reach them: their own watchdog stops them"
@@ -198,10 +206,12 @@ def test_bus_with_slow_readings_does_not_delay_ticks(opened: Opens) -> None:
     robot.go_wrong("slow:bus_2@0=0.02")
     began = robot.tick
     while readings[0] <= 5:
-        assert robot.run(1, "disarmed") == [] and robot.tick < 100_000
+        assert robot.run(1, "disarmed") == []
+        assert robot.tick < 100_000
     assert robot.tick - began > 3 * readings[0], "if ticks waited for it, they would be as many as its readings"
     robot.go_wrong("slow:bus_2@0=0.02", begins=False)
-    assert readings[0] > 5 and max(robot.ages_ms(SERVOS)) > 0
+    assert readings[0] > 5
+    assert max(robot.ages_ms(SERVOS)) > 0
 
 
 def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(opened: Opens) -> None:
@@ -218,7 +228,8 @@ def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(opened: Op
         return len(found) >= 2
 
     wait_until(both_are_reported, "a fault of each bus", 10.0)
-    assert {fault.what for fault in found} == {"no_setpoints"} and "one lease" in found[0].cause
+    assert {fault.what for fault in found} == {"no_setpoints"}
+    assert "one lease" in found[0].cause
     assert robot.axes_follow() == robot.servos_follow() == {False}, "setpoints of an armed robot enabled them again"
 
 

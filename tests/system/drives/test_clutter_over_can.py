@@ -18,8 +18,9 @@ def over_can(*sets: str) -> Result:
 @pytest.mark.slow
 def test_clutter_run_over_can_continues_without_lost_joint() -> None:
     reported = over_can("duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
-    assert reported.summary.ended == "complete" and list(reported.record.host.isolated) == ["joint_7"]
-    advance = Advance.of(reported.record)
+    assert reported.summary.ended == "complete"
+    assert list(reported.record.host.isolated) == ["joint_7"]
+    advance = Advance.from_run(reported.record)
     assert advance is not None
     before_m = float(np.interp(LOST_S, advance.time_s, advance.along_m))
     assert before_m > 0.4, "it moved before"
@@ -29,4 +30,5 @@ def test_clutter_run_over_can_continues_without_lost_joint() -> None:
 @pytest.mark.slow
 def test_it_crosses() -> None:
     reported = over_can().summary
-    assert reported.crossed is True and not reported.faults
+    assert reported.crossed is True
+    assert not reported.faults

@@ -21,4 +21,5 @@ def test_controller_advances_equally_on_every_drive_family() -> None:
     assert [row[0] for row in rows] == ["sim", "can", "odrive", "moteus", "dynamixel", "mixed"], ended.stdout
     moved_m = [float(row[1]) for row in rows]
     assert min(moved_m) > 0.8 * max(moved_m) > 0.1, ended.stdout
-    assert len({row[2] for row in rows}) == 1 and float(rows[0][3]) == 1.0
+    assert len({row[2] for row in rows}) == 1
+    assert float(rows[0][3]) == 1.0

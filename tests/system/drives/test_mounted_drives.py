@@ -12,14 +12,14 @@ EVERY_SECOND = [f"joint_{i}" for i in range(2, 14, 2)]
 MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5.zero_rad=-0.2"]
 
 
-def ran(*sets: str, backend: str = "can", duration_s: float = 1.2) -> RunSummary:
+def simulate_peg_row(*sets: str, backend: str = "can", duration_s: float = 1.2) -> RunSummary:
     fixed = (f"backend={backend}", f"duration_s={duration_s}")
     return simulate(load("peg_row", [parse_set(text) for text in (*fixed, *sets)]).config).summary
 
 
 @pytest.fixture(scope="module")
 def plain() -> RunSummary:
-    return ran()
+    return simulate_peg_row()
 
 
 @pytest.mark.slow
@@ -32,26 +32,29 @@ def plain() -> RunSummary:
     ],  # a servo that forgets its turns has no room for the gear
 )
 def test_drives_mounted_reversed_move_the_robot_equally(backend: str, others: list[str]) -> None:
-    run = partial(ran, backend=backend, duration_s=1.0)
+    run = partial(simulate_peg_row, backend=backend, duration_s=1.0)
     nominal = run()
     built = (*(f"{joint}.sign=-1" for joint in EVERY_SECOND), "joint_5.zero_rad=0.4", *others)
     in_truth = [f"backend.mounted.{text}" for text in built]
     declared = run(*in_truth, *(f"robot.joints.{text}" for text in built))
     undeclared = run(*in_truth)
-    assert nominal.path_distance_m and nominal.peak_joint_torque_nm and undeclared.peak_joint_torque_nm
+    assert nominal.path_distance_m
+    assert nominal.peak_joint_torque_nm
+    assert undeclared.peak_joint_torque_nm
     assert declared.path_distance_m == pytest.approx(nominal.path_distance_m, rel=0.05)
     assert undeclared.peak_joint_torque_nm > 1.5 * nominal.peak_joint_torque_nm, "it shows at once"
 
 
 def test_every_second_module_reversed_and_declared_is_the_same_run(plain: RunSummary) -> None:
-    declared = ran(*(f"robot.joints.{joint}.sign=-1" for joint in EVERY_SECOND))
+    declared = simulate_peg_row(*(f"robot.joints.{joint}.sign=-1" for joint in EVERY_SECOND))
     assert declared.command_digest == plain.command_digest
     assert declared.path_distance_m == plain.path_distance_m
     in_truth = [f"backend.mounted.{joint}.sign=-1" for joint in EVERY_SECOND]
-    undeclared = ran(*in_truth)
-    assert plain.path_distance_m and undeclared.path_distance_m
+    undeclared = simulate_peg_row(*in_truth)
+    assert plain.path_distance_m
+    assert undeclared.path_distance_m
     assert undeclared.path_distance_m < 0.6 * plain.path_distance_m, "it shows at once"
-    believed = ran(
+    believed = simulate_peg_row(
         *(f"robot.joints.{joint}.sign=-1" for joint in EVERY_SECOND),
         *(f"backend.mounted.{joint}.sign=1" for joint in EVERY_SECOND),
     )
@@ -59,6 +62,6 @@ def test_every_second_module_reversed_and_declared_is_the_same_run(plain: RunSum
 
 
 def test_drives_with_zero_and_gear_change_only_quantization(plain: RunSummary) -> None:
-    mixed = ran(*(f"robot.joints.{text}" for text in MIXED))
+    mixed = simulate_peg_row(*(f"robot.joints.{text}" for text in MIXED))
     assert mixed.path_distance_m == pytest.approx(plain.path_distance_m, rel=0.05)
     assert mixed.command_digest != plain.command_digest, "angles behind a gear are rounded otherwise"

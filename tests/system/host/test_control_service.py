@@ -86,7 +86,8 @@ def test_control_without_streams_withholds_them_until_they_return() -> None:
             assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key)).ok
             wait_until(lambda what=what: blind(made, what), f"observations without a {what}")
             reported, words = made.tells(f"{key} is "), f"at most {limits[key.partition('/')[2] + '_s']:.3g} s"
-            assert reported.state == "NotLocomoting" and words in reported.reason
+            assert reported.state == "NotLocomoting"
+            assert words in reported.reason
             since = len(made.observations)
             assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key, end=True)).ok
             wait_until(lambda since=since: sighted(made, since), "observations with everything again")
@@ -121,7 +122,8 @@ def test_control_after_intent_expired_rests_and_says_why() -> None:
         )
         assert (stopped.tick * PERIOD_NS - now_ns) * 1e-9 == pytest.approx(0.6, abs=0.25)
         reported = made.tells("the intent of ann has expired")
-        assert reported.state == "Idle" and "send a new one to go on" in reported.reason
+        assert reported.state == "Idle"
+        assert "send a new one to go on" in reported.reason
         intents.put(Intent(timestamp_ns=clocks.drain()[-1].timestamp_ns, requester="ann"))
         wait_until(lambda: speed(made) == 0.2, "a new intent")
 
@@ -161,5 +163,6 @@ def test_a_controller_that_answers_wrongly_ends_control_with_its_name(answer, wo
         wait_until(lambda: not control.thread.is_alive(), "the end of control")
         assert isinstance(control.error, ControllerError)
         for text in (str(control.error), made.tells(words).reason):
-            assert "controller showing (class Showing): " in text and words in text
+            assert "controller showing (class Showing): " in text
+            assert words in text
         made.run.reaches("fault")

@@ -29,7 +29,8 @@ def test_backend_error_is_latched_and_joints_are_made_safe(where: str, error: Ex
     with commanded(run_config()) as (run, _):
         run.backend.fails_in, run.backend.fails_with = where, error
         wait_until(run.ended, "the end of the host")
-        assert run.host.ended == "failed" and run.host.authority.state == "fault"
+        assert run.host.ended == "failed"
+        assert run.host.authority.state == "fault"
         causes = {fault.what: fault.cause for fault in run.host.authority.faults_since_start.stored}
         assert causes["backend_failed"] == cause.format(where)
         if where != "enact":
@@ -72,7 +73,8 @@ def test_backend_sample_out_of_bounds_is_a_named_latched_fault(
         backend: Any = run.backend
         backend.wrong = {key: sample}
         wait_until(run.ended, "the end of the host")
-        assert run.host.ended == "failed" and run.host.authority.state == "fault"
+        assert run.host.ended == "failed"
+        assert run.host.authority.state == "fault"
         cause = next(
             fault.cause for fault in run.host.authority.faults_since_start.stored if fault.what == "backend_failed"
         )

@@ -41,7 +41,9 @@ def test_injected_fault_lasts_until_ended_and_impossible_one_is_refused() -> Non
             assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
         assert run.host.faults.notes == []
         answer = ask(run, "mute", "joint_2")
-        assert answer.ok and answer.reason.startswith("mute of joint_2 has begun, at ") and answer.lifecycle == "armed"
+        assert answer.ok
+        assert answer.reason.startswith("mute of joint_2 has begun, at ")
+        assert answer.lifecycle == "armed"
         run.reaches("fault")
         assert "joint_2" in run.status.reason
         (on,) = run.status.injected
@@ -57,7 +59,9 @@ def test_injected_fault_lasts_until_ended_and_impossible_one_is_refused() -> Non
 def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
     with running(run_config(clock_mode="realtime")) as run:
         answer = ask(run, "mute", "joint_1")
-        assert not answer.ok and answer.refusal == "not_allowed" and "allow_fault_injection = true" in answer.reason
+        assert not answer.ok
+        assert answer.refusal == "not_allowed"
+        assert "allow_fault_injection = true" in answer.reason
     config = run_config(faults=["mute:joint_1@1"])
     with (
         meeting("worm") as (own,),
@@ -70,7 +74,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 def test_injected_plan_that_fails_is_a_fault_of_the_run() -> None:
     with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.faults_since_start
-        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.kept), "a word about it")
+        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.stored), "a word about it")
         assert "is refused: backend 'lag' cannot do leak" in run.host.faults.notes[0]
 
 

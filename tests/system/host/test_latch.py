@@ -30,37 +30,43 @@ def asked(latch: EstopLatch, what: str) -> str | None:
 def test_kept_found_and_released(tmp_path: Path) -> None:
     assert asked(EstopLatch(tmp_path / "no stop yet"), "release") is None
     first = EstopLatch(tmp_path)
-    assert first.left_by_earlier_host is None and asked(first, "engage") is None
-    assert (tmp_path / ESTOP).is_file() and [path.name for path in tmp_path.iterdir()] == [ESTOP]
+    assert first.left_by_earlier_host is None
+    assert asked(first, "engage") is None
+    assert (tmp_path / ESTOP).is_file()
+    assert [path.name for path in tmp_path.iterdir()] == [ESTOP]
     second = EstopLatch(tmp_path)
-    assert second.left_by_earlier_host is not None and (
-        second.left_by_earlier_host.requester,
-        second.left_by_earlier_host.tick,
-    ) == ("anna", 7)
-    assert asked(second, "engage") is None and asked(second, "release") is None
+    assert second.left_by_earlier_host is not None
+    assert second.left_by_earlier_host.requester == "anna"
+    assert second.left_by_earlier_host.tick == 7
+    assert asked(second, "engage") is None
+    assert asked(second, "release") is None
     assert EstopLatch(tmp_path).left_by_earlier_host is None
     assert asked(second, "release") is None
-    assert asked(second, "engage") is None and EstopLatch(tmp_path).left_by_earlier_host is not None
+    assert asked(second, "engage") is None
+    assert EstopLatch(tmp_path).left_by_earlier_host is not None
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"requester":1}', b"\xff" * 100])
 def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -> None:
     (tmp_path / ESTOP).write_bytes(content)
     latch = EstopLatch(tmp_path)
-    assert latch.left_by_earlier_host is not None and "cannot be read" in latch.left_by_earlier_host.requester
+    assert latch.left_by_earlier_host is not None
+    assert "cannot be read" in latch.left_by_earlier_host.requester
     assert asked(latch, "engage") is None
     again = EstopLatch(tmp_path)
     assert (
         again.left_by_earlier_host is not None and again.left_by_earlier_host.requester == "anna"
     )  # a good file in its place
-    assert asked(latch, "release") is None and EstopLatch(tmp_path).left_by_earlier_host is None
+    assert asked(latch, "release") is None
+    assert EstopLatch(tmp_path).left_by_earlier_host is None
 
 
 def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
     (tmp_path / "in the way").write_text("a file where the folder belongs")
     latch = EstopLatch(tmp_path / "in the way")
     failure = asked(latch, "engage")
-    assert failure is not None and "will not outlive this host" in failure
+    assert failure is not None
+    assert "will not outlive this host" in failure
 
 
 @pytest.fixture
@@ -86,8 +92,11 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
         latch.engage("anna", 7, answers.put)
     for _ in range(1000):
         said = answers.get(timeout=5)
-        assert said is not None and "not stored yet" in said and str(tmp_path / ESTOP) in said
-    assert time.monotonic() - began < 2.0 and threading.active_count() <= threads + 2
+        assert said is not None
+        assert "not stored yet" in said
+        assert str(tmp_path / ESTOP) in said
+    assert time.monotonic() - began < 2.0
+    assert threading.active_count() <= threads + 2
     latch.close()
     assert time.monotonic() - began < 2.0
     hanging.set()
@@ -99,6 +108,8 @@ def test_latch_on_hanging_disk_stops_at_once_and_ends(tmp_path: Path, hanging: E
     with running(run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
         began = time.monotonic()
         answer = run.ask(keys.ESTOP, EstopRequest(requester="anna"))
-        assert answer.ok and answer.lifecycle == "estop" and "not stored yet" in answer.reason
+        assert answer.ok
+        assert answer.lifecycle == "estop"
+        assert "not stored yet" in answer.reason
         assert time.monotonic() - began < 2.0
         run.reaches("estop")

@@ -92,7 +92,8 @@ def test_recorder_of_restarted_host_keeps_the_earlier_record(tmp_path: Path) -> 
     assert ticks_on_disk(tmp_path) == [200]
     for number in (1, 2):
         _, columns = read_black_box(tmp_path / f"blackbox-{number}.rows")
-        assert columns["tick"].tolist() == [100 * (number - 1)] and (tmp_path / f"host-{number}.json").is_file()
+        assert columns["tick"].tolist() == [100 * (number - 1)]
+        assert (tmp_path / f"host-{number}.json").is_file()
 
 
 class Disk:
@@ -128,7 +129,8 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
     with recorder(box, tmp_path, memory):
         fill(box, *range(20))
         wait_until(lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it")
-        assert ticks_on_disk(tmp_path) == list(range(7)) and remembered(memory).lost_ticks == 0
+        assert ticks_on_disk(tmp_path) == list(range(7))
+        assert remembered(memory).lost_ticks == 0
         disk.space = 2**30
         wait_until(lambda: not remembered(memory).failure, "room")
     assert ticks_on_disk(tmp_path) == list(range(20))
@@ -148,7 +150,8 @@ def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(tmp_path: Path, m
         wait_until(lambda: len(ticks_on_disk(tmp_path)) == 8, "some of the newest")
     assert ticks_on_disk(tmp_path) == [0, 1, 2, 21, 22, 23, 24, 25]
     last = remembered(memory)
-    assert last.lost_ticks == 18 + 4 and last.failure == f"{tmp_path}: No space left on device"
+    assert last.lost_ticks == 18 + 4
+    assert last.failure == f"{tmp_path}: No space left on device"
 
 
 def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memory: int) -> None:
@@ -157,7 +160,8 @@ def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memo
         fill(box, 1, 2)
     assert not (tmp_path / "gone").exists()
     last = remembered(memory)
-    assert last.lost_ticks == 2 and "No such file" in last.failure
+    assert last.lost_ticks == 2
+    assert "No such file" in last.failure
 
 
 def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
@@ -176,10 +180,13 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
             run.arm()
             wait_until(run.ended, "the end of the run")
         assert not disk.goes_on.is_set()  # neither the run nor its recorder's end waited for it
-        assert run.host.ended == "complete" and not run.host.authority.faults
+        assert run.host.ended == "complete"
+        assert not run.host.authority.faults
     last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
-    assert last.ended == "complete" and last.armed_ticks == 75
-    assert 0 < last.lost_ticks < 75 and "has not answered" in last.failure
+    assert last.ended == "complete"
+    assert last.armed_ticks == 75
+    assert 0 < last.lost_ticks < 75
+    assert "has not answered" in last.failure
     disk.goes_on.set()
 
 

@@ -36,7 +36,8 @@ def test_nothing_expires_in_a_pause_and_steps_are_exact(clock_mode: ClockMode) -
         assert "paused by ada" in ask(run, "pause")
         tick = stands_at(run)
         time.sleep(MANY_LEASES_S)
-        assert run.backend.advanced == tick and run.status.lifecycle == "armed"
+        assert run.backend.advanced == tick
+        assert run.status.lifecycle == "armed"
         for ticks in (1, 4):
             ask(run, "step", ticks=ticks)
             tick += ticks
@@ -69,18 +70,21 @@ def test_pause_emergency_stop_is_immediate_and_outlasts_it() -> None:
         assert run.backend.advanced == tick
         ask(run, "resume")
         wait_until(lambda: run.backend.advanced > tick + 3, "ticks")
-        assert run.status.lifecycle == "estop" and not run.lifecycle("arm").ok
+        assert run.status.lifecycle == "estop"
+        assert not run.lifecycle("arm").ok
 
 
 def test_simulated_speed_scales_real_time_and_reset_ends_disarmed() -> None:
     with commanded(run_config(clock_mode="realtime", **PATIENT)) as (run, _):
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")
-        assert run.status.speed == 0.2 and run.status.real_time_factor == pytest.approx(0.2, rel=0.3)
+        assert run.status.speed == 0.2
+        assert run.status.real_time_factor == pytest.approx(0.2, rel=0.3)
         assert run.status.lifecycle == "armed", run.status.reason
         ask(run, "reset")
         wait_until(run.ended, "the host's end")
-        assert run.host.ended == "reset" and run.host.authority.state == "disarmed"
+        assert run.host.ended == "reset"
+        assert run.host.authority.state == "disarmed"
 
 
 @pytest.mark.parametrize(
@@ -97,7 +101,8 @@ def test_what_cannot_be_is_refused_in_words(
 ) -> None:
     made = SimulatedTime(description(simulated_time=simulated), clock_mode, lambda: 0)
     outcome = made.carry_out(SimulatorRequest(**asked), 0)
-    assert isinstance(outcome, Refusal) and outcome.word == word
+    assert isinstance(outcome, Refusal)
+    assert outcome.word == word
     assert not made.is_paused
 
 
@@ -125,4 +130,5 @@ def test_safety_time_neither_jumps_nor_goes_back() -> None:
             wall[0] += period_ns
             made.tick_done(tick)
             seen.append(made.safety_ns(tick))
-    assert seen == sorted(seen) and seen[-1] - seen[0] <= wall[0]
+    assert seen == sorted(seen)
+    assert seen[-1] - seen[0] <= wall[0]

@@ -63,13 +63,15 @@ def test_snapshot_shows_past_scene_and_arrives_after_delay(delay_s, ticks):
     run.sim.data.qvel[0] = 1.0  # slides towards the wall on ice, by 1 cm a tick
     before_m = 3.75 - (float(run.sim.data.qpos[0]) + 13 * 0.11 + 0.04)
     (sensor,) = (s for s in run.sim.describe().sensors if s.key == HEAD)
-    assert sensor.rate_hz == 20.0 and sensor.delay_s == pytest.approx(ticks * 0.01)
+    assert sensor.rate_hz == 20.0
+    assert sensor.delay_s == pytest.approx(ticks * 0.01)
     found = arrivals(run, 30)
     assert [tick for tick, _ in found] == [tick + ticks for tick in range(0, 30, 5) if tick + ticks < 30]
     for tick, image in found:
         assert isinstance(image, DepthImage)
         taken = tick - ticks
-        assert (image.tick, image.timestamp_ns) == (tick, taken * 10_000_000)
+        assert image.tick == tick
+        assert image.timestamp_ns == taken * 10_000_000
         middle_m = np.frombuffer(image.depth, "<u2").reshape(30, 40)[10, 20] * image.scale_m
         assert middle_m == pytest.approx(before_m - 0.01 * taken, abs=0.001)
 
@@ -92,7 +94,9 @@ def test_snapshot_depends_only_on_seed_and_changes_nothing_else():
     first, again, other = (bytes_of_a_run("planar13_camera", seed) for seed in (3, 3, 4))
     assert first == again
     image = first.pop(HEAD)
-    assert image and image != other[HEAD] and first["joints"] != other["joints"]
+    assert image
+    assert image != other[HEAD]
+    assert first["joints"] != other["joints"]
     assert first == bytes_of_a_run("planar13")
 
 

@@ -43,4 +43,5 @@ def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: SmallLab) -> 
             return bool(found)
 
         wait_until(arrived, "the image")
-        assert {image.tick for image in found} == {1} and found[0].depth == IMAGE.depth
+        assert {image.tick for image in found} == {1}
+        assert found[0].depth == IMAGE.depth

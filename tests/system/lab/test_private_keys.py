@@ -27,11 +27,14 @@ def test_a_folder_that_is_there_keeps_its_mode(tmp_path: Path, capsys: pytest.Ca
     shared.mkdir()
     shared.chmod(0o755)
     assert certs(tmp_path / "lab", "--authority", str(shared)) == 2
-    assert mode(shared) == 0o755 and not list(shared.iterdir())
+    assert mode(shared) == 0o755
+    assert not list(shared.iterdir())
     said = capsys.readouterr().err
-    assert "others may look or write into this folder (mode 755)" in said and f"chmod 700 {shared}" in said
+    assert "others may look or write into this folder (mode 755)" in said
+    assert f"chmod 700 {shared}" in said
     shared.chmod(0o700)
-    assert certs(tmp_path / "lab", "--authority", str(shared)) == 0 and mode(shared) == 0o700
+    assert certs(tmp_path / "lab", "--authority", str(shared)) == 0
+    assert mode(shared) == 0o700
     assert certs(tmp_path / "lab", "--authority", str(tmp_path / "a" / "new")) == 0
     assert mode(tmp_path / "a" / "new") == 0o700
 
@@ -60,9 +63,11 @@ def test_private_key_readable_by_all_is_named_in_warning(tmp_path: Path, capsys:
     assert not capsys.readouterr().err
     key.chmod(0o644)
     _warn.cache_clear()
-    assert read_session(path).endpoints and read_session(path).endpoints
+    assert read_session(path).endpoints
+    assert read_session(path).endpoints
     said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and f"warning: {key}: every user of this computer may read this private key" in said[0]
+    assert len(said) == 1
+    assert f"warning: {key}: every user of this computer may read this private key" in said[0]
 
 
 def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
@@ -73,7 +78,8 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
     assert not found.wrong
     (tmp_path / identity.machine / "tls" / f"{identity.label}.key").chmod(0o604)
     _check_certificate(identity, tmp_path, found)
-    assert found.wrong == 1 and "every user of this computer may read this private key (mode 604)" in said[-1]
+    assert found.wrong == 1
+    assert "every user of this computer may read this private key (mode 604)" in said[-1]
 
 
 @pytest.mark.parametrize("max_mb", [20, 30, 40, 100])

@@ -80,16 +80,23 @@ def test_every_number_has_a_name_a_unit_and_bounds() -> None:
     env = made()
     seen, _ = env.reset(seed=1)
     space, actions = env.observation_space, env.action_space
-    assert isinstance(space, gymnasium.spaces.Box) and isinstance(actions, gymnasium.spaces.Box)
+    assert isinstance(space, gymnasium.spaces.Box)
+    assert isinstance(actions, gymnasium.spaces.Box)
     assert len(env.observation_names) == len(env.observation_units) == len(seen) == len(space.low)
-    assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
+    assert np.isfinite(space.low).all()
+    assert np.isfinite(space.high).all()
     units = dict(zip(env.observation_names, env.observation_units, strict=True))
-    assert units["angle_rad.joint_1"] == "rad" and units["contact_n.link_0"] == "N"
-    assert env.action_names[0] == "joint_1" and env.action_units[0] == "rad" and actions.shape == (13,)
+    assert units["angle_rad.joint_1"] == "rad"
+    assert units["contact_n.link_0"] == "N"
+    assert env.action_names[0] == "joint_1"
+    assert env.action_units[0] == "rad"
+    assert actions.shape == (13,)
     parts, _ = made(flat=False).reset(seed=1)
-    assert isinstance(parts, dict) and np.concatenate(list(parts.values())).tolist() == list(seen)
+    assert isinstance(parts, dict)
+    assert np.concatenate(list(parts.values())).tolist() == list(seen)
     torque = made(action="torque")
-    assert torque.action_units[0] == "N·m" and made(action="velocity").action_units[0] == "rad/s"
+    assert torque.action_units[0] == "N·m"
+    assert made(action="velocity").action_units[0] == "rad/s"
 
 
 @pytest.mark.parametrize(
@@ -102,7 +109,8 @@ def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
     info = episode(made(frame_skip=1, **more), action=lambda time_s: 8.0 * wave(time_s))
     run = snakesim.run("triplet", controller=lambda time_s, _: 8.0 * wave(time_s), duration=1, seed=1, **more)
     assert "limited" in info
-    assert info["ended"] == "time" and info["digest"] == run.digest
+    assert info["ended"] == "time"
+    assert info["digest"] == run.digest
 
 
 def test_a_residual_of_nothing_is_the_shipped_controller(tmp_path) -> None:
@@ -119,7 +127,8 @@ def test_environment_digest_depends_only_on_seed_and_actions() -> None:
     digest = episode(first, seed=5)["digest"]
     assert digest == episode(second, seed=5)["digest"]
     drawn = [episode(env, seed=None)["digest"] for env in (first, second)]
-    assert drawn[0] == drawn[1] and first.config.seed == second.config.seed != 5
+    assert drawn[0] == drawn[1]
+    assert first.config.seed == second.config.seed != 5
     fields = [made("surveyed_clutter", new_field=new) for new in (True, False)]
     for env in fields:
         env.reset(seed=5)
@@ -129,7 +138,8 @@ def test_environment_digest_depends_only_on_seed_and_actions() -> None:
 def test_environment_unspecified_choices_are_drawn_per_seed() -> None:
     env = made("surveyed_clutter", randomize={"scene.ground.friction": (0.1, 0.4)}, duration=0.1)
     found = [env.reset(seed=seed) and env.config.scene.ground.friction for seed in (7, 8, 7)]
-    assert found[0] == found[2] != found[1] and all(0.1 <= one <= 0.4 for one in found)
+    assert found[0] == found[2] != found[1]
+    assert all(0.1 <= one <= 0.4 for one in found)
     of_suite = Randomization(set=["scene.ground.friction"], low=0.1, high=0.4)
     assert found[0] == of_suite.overrides_for_scene(7)[0].value
     for wrong, code in (
@@ -149,12 +159,15 @@ def test_the_gate_is_inside_and_says_so() -> None:
         one.reset(seed=1)
     _, _, _, _, info = env.step(far)
     _, _, _, _, unlimited = free.step(far)
-    assert set(info["limited"].values()) == {"angle_rate"} and info["reward_terms"]["limited"] < 0
-    assert "limited" not in unlimited and free.digest != env.digest
+    assert set(info["limited"].values()) == {"angle_rate"}
+    assert info["reward_terms"]["limited"] < 0
+    assert "limited" not in unlimited
+    assert free.digest != env.digest
     beyond = made(action="torque", frame_skip=10)
     beyond.reset(seed=1)
     _, _, _, _, info = beyond.step(np.full(13, 1e9))
-    assert set(info["limited"].values()) <= {"torque", "torque_rate", "angle"} and info["lifecycle"] == "armed"
+    assert set(info["limited"].values()) <= {"torque", "torque_rate", "angle"}
+    assert info["lifecycle"] == "armed"
 
 
 @pytest.mark.parametrize("action", ["position", "residual:hold"])
@@ -162,9 +175,10 @@ def test_the_gate_is_inside_and_says_so() -> None:
 def test_environment_episode_of_stopped_robot_ends_with_reason(action: str, fault: str, why: str) -> None:
     env = made(set={"faults": [fault]}, action=action)
     info = episode(env, action=lambda time_s: 0.1 * wave(time_s))
-    assert (
-        info["ended"] == "stopped" and info["lifecycle"] == "fault" and why in info["reason"] and info["time_s"] < 0.4
-    )
+    assert info["ended"] == "stopped"
+    assert info["lifecycle"] == "fault"
+    assert why in info["reason"]
+    assert info["time_s"] < 0.4
     assert info["reward_terms"]["stopped"] == -1.0
 
 
@@ -180,7 +194,8 @@ def test_reward_terms_have_names_and_sum_to_the_reward() -> None:
     advance_m = 0.0
     for _ in range(10):
         _, reward, _, _, info = env.step(wave(info["time_s"]))
-        assert list(info["reward_terms"]) == list(TERMS) and reward == sum(info["reward_terms"].values())
+        assert list(info["reward_terms"]) == list(TERMS)
+        assert reward == sum(info["reward_terms"].values())
         advance_m += info["reward_terms"]["advance"] / 3.0
         assert info["reward_terms"]["energy"] == 0.0
     assert advance_m == pytest.approx(info["advance_m"]) != 0.0
@@ -189,7 +204,9 @@ def test_reward_terms_have_names_and_sum_to_the_reward() -> None:
 def test_the_goal_ends_the_episode() -> None:
     goal = {"mission.goal.kind": "heading", "mission.goal.distance_m": 0.02}
     info = episode(made("surveyed_clutter", set=goal, new_field=False, duration=5))
-    assert info["ended"] == "goal" and info["reward_terms"]["goal"] == 1.0 and info["time_s"] < 5
+    assert info["ended"] == "goal"
+    assert info["reward_terms"]["goal"] == 1.0
+    assert info["time_s"] < 5
 
 
 def test_waypoints_lead_to_a_goal() -> None:
@@ -197,7 +214,9 @@ def test_waypoints_lead_to_a_goal() -> None:
     env = made("surveyed_clutter", set=goal, new_field=False, observe=["goal_m", "goal_bearing"])
     seen, _ = env.reset(seed=1)
     info = episode(env)
-    assert isinstance(seen, np.ndarray) and seen[0] > 1.5 and abs(np.hypot(*seen[1:]) - 1) < 1e-6
+    assert isinstance(seen, np.ndarray)
+    assert seen[0] > 1.5
+    assert abs(np.hypot(*seen[1:]) - 1) < 1e-6
     assert -0.5 < info["advance_m"] < 1.0
 
 
@@ -211,11 +230,17 @@ def test_many_at_once_are_what_each_is_alone(mode: str | None) -> None:
     seen, rewards, _, truncated, infos = envs.step(np.zeros((3, 13)))
     again, nothing, _, truncated_again, after = envs.step(np.zeros((3, 13)))
     envs.close()
-    assert seen.shape == (3, 56) and envs.observation_space.contains(seen)
-    assert rewards.shape == (3,) and rewards.all() and truncated.all()
+    assert seen.shape == (3, 56)
+    assert envs.observation_space.contains(seen)
+    assert rewards.shape == (3,)
+    assert rewards.all()
+    assert truncated.all()
     alone = [episode(made(duration=0.1), seed=seed, action=lambda _: np.zeros(13))["digest"] for seed in (1, 2, 3)]
-    assert list(infos["digest"]) == alone and len({*alone}) == 3
-    assert not truncated_again.any() and not nothing.any() and not after["time_s"].any()  # reset, as by Gymnasium's own
+    assert list(infos["digest"]) == alone
+    assert len({*alone}) == 3
+    assert not truncated_again.any()
+    assert not nothing.any()
+    assert not after["time_s"].any()  # reset, as by Gymnasium's own
     assert again.shape == seen.shape
 
 
@@ -256,7 +281,8 @@ def test_an_interrupted_step_of_many_delays_no_later_answer() -> None:
     _, at_reset = envs.reset(seed=1)
     _, _, _, _, after = envs.step(still)
     envs.close()
-    assert at_reset["time_s"].tolist() == [0.0, 0.0] and after["time_s"].tolist() == [6.0, 6.0]
+    assert at_reset["time_s"].tolist() == [0.0, 0.0]
+    assert after["time_s"].tolist() == [6.0, 6.0]
 
 
 def test_seeds_are_read_as_by_gymnasium() -> None:
@@ -275,7 +301,8 @@ def test_a_pickle_is_a_new_environment_of_the_same_arguments() -> None:
     env.reset(seed=1)
     again = pickle.loads(pickle.dumps(env))
     assert isinstance(env.unwrapped, SnakeEnv)
-    assert again.spec == env.spec and again.observation_space == env.observation_space
+    assert again.spec == env.spec
+    assert again.observation_space == env.observation_space
     with pytest.raises(gymnasium.error.ResetNeeded):
         again.unwrapped.step(np.zeros(13))
     assert episode(again.unwrapped)["digest"] == episode(env.unwrapped)["digest"]
@@ -303,7 +330,9 @@ def test_a_picture_of_it() -> None:
     env.reset(seed=1)
     picture = env.render()
     env.close()
-    assert picture is not None and picture.shape == (48, 64, 3) and picture.std() > 5
+    assert picture is not None
+    assert picture.shape == (48, 64, 3)
+    assert picture.std() > 5
 
 
 WRONG = [

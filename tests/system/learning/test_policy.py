@@ -88,7 +88,8 @@ def driven(model: Path, scenario: str = "triplet", duration: float = 0.1) -> sna
 def test_a_policy_commands_what_the_same_arithmetic_in_python_does(tmp_path: Path, rows: int | str) -> None:
     found = driven(saved(tmp_path / "model.onnx", rows=rows), duration=2)
     same = snakesim.run("triplet", controller=Same, duration=2)
-    assert found.complete and found.digest == same.digest
+    assert found.complete
+    assert found.digest == same.digest
     assert np.ptp(found["target.joint_5"]) > 0.1
 
 
@@ -125,7 +126,8 @@ def test_policy_controller_gets_observations_of_its_environment(tmp_path: Path, 
     given = {**EPISODES[case], "control.model": str(file)}
     run = snakesim.run("surveyed_clutter", controller="policy", duration=2, seed=1, set=given)
     assert told == set(EVERYTHING.split(","))  # nothing in it stands still
-    assert run.complete and info["digest"] == run.digest
+    assert run.complete
+    assert info["digest"] == run.digest
 
 
 def linear(file: Path, width: int) -> Path:
@@ -150,8 +152,10 @@ def test_policy_with_silent_sensor_holds_robot_and_says_why(tmp_path: Path) -> N
     given = {"control.model": str(linear(tmp_path / "model.onnx", width)), **slow}
     run = snakesim.run("surveyed_clutter", controller="policy", duration=1, set=given)
     target, time_s = run["target.joint_5"], run.time_s - run.time_s[0]
-    assert run.complete and np.ptp(target[time_s < 0.1]) > 0
-    assert np.ptp(target[(time_s > 0.25) & (time_s < 0.48)]) == 0 and np.ptp(target[time_s > 0.48]) > 0
+    assert run.complete
+    assert np.ptp(target[time_s < 0.1]) > 0
+    assert np.ptp(target[(time_s > 0.25) & (time_s < 0.48)]) == 0
+    assert np.ptp(target[time_s > 0.48]) > 0
 
 
 @pytest.mark.parametrize("command", [("run", "--out", "run"), ("config",)])
@@ -165,7 +169,8 @@ def test_a_robot_without_the_sensor_is_refused_before_anything_starts(tmp_path: 
     (tmp_path / "blind.toml").write_text(scenario)
     given = ("--controller", "policy", "--set", "control.model=model.onnx")
     done = command_line(command[0], "./blind.toml", *command[1:], *given, cwd=tmp_path)
-    assert done.code == 2 and "model.onnx: metadata `snakesim.observations`" in done.err
+    assert done.code == 2
+    assert "model.onnx: metadata `snakesim.observations`" in done.err
     assert "'contact_n' needs sensor/contacts, which robot 'planar13' has not" in done.err, done.err
     assert not (tmp_path / "run").exists()
 

@@ -60,22 +60,27 @@ def result() -> snakesim.Result:
 
 def test_a_run_is_that_of_the_command(result: snakesim.Result) -> None:
     same = simulate(load("triplet", [parse_set("duration_s=1")]).config)
-    assert result.digest == same.summary.command_digest and result.complete
+    assert result.digest == same.summary.command_digest
+    assert result.complete
     assert result.metrics["path_distance_m"] == same.summary.path_distance_m
 
 
 def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
-    assert result["angle_rad"].shape == (100, 13) and result.time_s.shape == (100,)
+    assert result["angle_rad"].shape == (100, 13)
+    assert result.time_s.shape == (100,)
     assert np.array_equal(result["angle_rad.joint_3"], result["angle_rad"][:, result.joints.index("joint_3")])
-    assert result.units["torque_nm.joint_1"] == "N·m" and result.units["position_w_m.x"] == "m"
-    assert set(result.arrays) <= set(UNITS) and set(result.units) == set(result.signal_names)
+    assert result.units["torque_nm.joint_1"] == "N·m"
+    assert result.units["position_w_m.x"] == "m"
+    assert set(result.arrays) <= set(UNITS)
+    assert set(result.units) == set(result.signal_names)
     with raises_error(snakesim.ConfigError, code="recording/unknown-signal", field="angle_rd"):
         result["angle_rd"]
 
 
 def test_a_function_is_a_controller() -> None:  # a lambda, too: tests/system/learning/test_environments.py
     found = snakesim.run("triplet", controller=wave, duration=1)
-    assert found.complete and found.summary.controller.startswith("program:")
+    assert found.complete
+    assert found.summary.controller.startswith("program:")
     assert np.ptp(found["target.joint_5"]) > 0.1
 
 
@@ -199,9 +204,8 @@ def test_python_controller_too_slow_for_real_time_is_reported() -> None:
         return joints.angle_rad
 
     run = snakesim.run("triplet", controller=slow, duration=0.03)
-    assert run.complete and re.match(
-        r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0]
-    )
+    assert run.complete
+    assert re.match(r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0])
     assert "update() took" in repr(run)
 
 
@@ -209,7 +213,9 @@ def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path:
     report = result.report(tmp_path / "report.html").read_text()
     assert "Save the effective configuration below as <code>config.json</code>" in report
     shown = result._repr_html_()
-    assert shown.startswith("<iframe") and "class=&quot;player card&quot;" in shown and len(shown) < 500_000
+    assert shown.startswith("<iframe")
+    assert "class=&quot;player card&quot;" in shown
+    assert len(shown) < 500_000
     plot = result.plot("angle_rad", "torque_nm.joint_3")
     assert "torque_nm.joint_3, N·m" in plot.save(tmp_path / "plot.html").read_text()
     assert plot._repr_html_().startswith("<iframe")
@@ -226,14 +232,16 @@ def test_without_pandas_it_says_what_to_install(result: snakesim.Result, monkeyp
 @needs_pandas
 def test_a_data_frame_has_the_columns_and_their_units(result: snakesim.Result) -> None:
     frame = result.to_pandas()
-    assert frame.index.name == "time_s" and np.array_equal(frame["angle_rad.joint_3"], result["angle_rad.joint_3"])
+    assert frame.index.name == "time_s"
+    assert np.array_equal(frame["angle_rad.joint_3"], result["angle_rad.joint_3"])
     assert frame.attrs["units"]["angle_rad.joint_3"] == "rad"
 
 
 @pytest.mark.e2e
 def test_in_processes_it_is_the_same_run(result: snakesim.Result, tmp_path: Path) -> None:
     apart = snakesim.run("triplet", duration=1, processes=True, out=tmp_path / "run")
-    assert apart.complete and apart.digest == result.digest
+    assert apart.complete
+    assert apart.digest == result.digest
     assert (tmp_path / "run" / "report.html").is_file()
 
 
@@ -269,7 +277,8 @@ def test_python_process_computes_like_snakesim_run_after_one_call() -> None:
 def test_a_call_that_comes_too_late_is_an_error() -> None:
     code = "import numpy, snakesim\nsnakesim.is_pinned = lambda: False\nsnakesim.use_common_arithmetic()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
-    assert done.returncode == 1 and "before NumPy is imported" in done.stderr
+    assert done.returncode == 1
+    assert "before NumPy is imported" in done.stderr
 
 
 FIRST_EXAMPLES = [
@@ -343,5 +352,8 @@ def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     (tmp_path / "study.py").write_text(study)
     done = call([sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
     assert done.code == 0, done.err
-    assert (tmp_path / "first.html").is_file() and "incomplete" not in done.out
-    assert "0.5 rad: " in done.out and "sim -> can" in done.out and "A moved" in done.out
+    assert (tmp_path / "first.html").is_file()
+    assert "incomplete" not in done.out
+    assert "0.5 rad: " in done.out
+    assert "sim -> can" in done.out
+    assert "A moved" in done.out

@@ -34,7 +34,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     rows = list(csv.DictReader((trained / "curve.csv").open()))
     assert [row["episodes"] for row in rows] == ["4", "8", "8"]
-    assert rows[0]["check_reward"] and not rows[1]["check_reward"] and rows[2]["check_reward"]
+    assert rows[0]["check_reward"]
+    assert not rows[1]["check_reward"]
+    assert rows[2]["check_reward"]
     assert (trained / "curve.png").read_bytes().startswith(b"\x89PNG")
     told = {one.key: one.value for one in onnx.load(trained / "policy.onnx").metadata_props}
     assert told["snakesim.trained_by"].startswith(
@@ -104,7 +106,8 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
 def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, backend: str) -> None:
     name = f"policy:{trained / 'policy.onnx'}"
     run = snakesim.run("surveyed_clutter", controller=name, duration=1, backend=backend)
-    assert run.complete and np.ptp(run["target.joint_5"]) > 0.05
+    assert run.complete
+    assert np.ptp(run["target.joint_5"]) > 0.05
 
 
 @pytest.mark.parametrize(("name", "out"), [("clutter", "trained"), ("free", "free"), ("lab", "lab")])
@@ -125,7 +128,8 @@ def test_training_shipped_policy_names_its_documented_command(name: str, out: st
 def test_training_shipped_policy_crosses_an_unseen_field() -> None:
     given = {"scene.random_field.0.seed": 5400}
     run = snakesim.run("surveyed_clutter", controller="policy:clutter", duration=4, seed=5400, set=given)
-    assert run.complete and (run.metrics["advance_m"] or 0.0) > 2.95
+    assert run.complete
+    assert (run.metrics["advance_m"] or 0.0) > 2.95
 
 
 def test_training_policy_of_other_robot_or_missing_is_refused(trained: Path) -> None:

@@ -59,7 +59,9 @@ def test_client_in_lockstep_ignores_sample_of_a_later_tick(
 def test_in_real_time_only_the_newest_counts(sessions: tuple[Session, Session]) -> None:
     ticks = shown(sessions, [clock(tick, clock_mode="realtime") for tick in range(5)])
     newest, nothing = next(ticks), next(ticks)
-    assert newest is not None and newest.tick == 4 and nothing is None
+    assert newest is not None
+    assert newest.tick == 4
+    assert nothing is None
 
 
 def test_client_reports_done_for_a_tick_shown_again(

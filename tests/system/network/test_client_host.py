@@ -54,8 +54,10 @@ def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]
         assert (statistics.ticks, statistics.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
         assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
         assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
-        assert not run.host.authority.faults and not run.host.authority.rejected_counts
-        assert run.host.authority.state == "disarmed" and passive(run.backend.enacted[-1])
+        assert not run.host.authority.faults
+        assert not run.host.authority.rejected_counts
+        assert run.host.authority.state == "disarmed"
+        assert passive(run.backend.enacted[-1])
         return box.command_digest, box.layout.arrays(box.read_rows(0)[1])
 
 
@@ -92,7 +94,8 @@ def test_a_slow_participant_is_waited_for() -> None:
                     due += 5
             if run.ended():
                 break
-        assert run.host.black_box.ticks == 40 and not run.host.authority.faults
+        assert run.host.black_box.ticks == 40
+        assert not run.host.authority.faults
         assert all(counted == max(tick - 5, 0) // 5 * 5 for tick, counted in newest.items())
 
 
@@ -102,8 +105,10 @@ def test_client_that_stalls_loses_lease_and_joints_are_damped() -> None:
         control.silent.set()
         wait_until(run.ended, "the end of the run")
         stalled, expired = run.host.authority.faults
-        assert stalled.what == "service_stalled" and "control is" in stalled.cause
-        assert expired.what == "lease_expired" and expired.cause.startswith("lease of control expired")
+        assert stalled.what == "service_stalled"
+        assert "control is" in stalled.cause
+        assert expired.what == "lease_expired"
+        assert expired.cause.startswith("lease of control expired")
         assert expired.tick - stalled.tick in (4, 5, 6)  # one term of 50 ms in the robot's time
         assert run.host.authority.state == "fault"
         after = run.backend.enacted[-3:]
@@ -117,13 +122,15 @@ def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
             wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
         run.reaches("fault")
         faults = {fault.what: fault.cause for fault in run.status.faults}
-        assert "control is gone" in faults["service_lost"] and "lease of control" in faults["lease_expired"]
+        assert "control is gone" in faults["service_lost"]
+        assert "lease of control" in faults["lease_expired"]
         assert not run.lifecycle("arm").ok
         assert run.lifecycle("reset").ok
         with following(run.link, Follower()) as control:
             run.arm()
             wait_until(lambda: len(control.armed_ticks) > 5, "five more ticks")
-            assert run.status.lifecycle == "armed" and not run.status.faults
+            assert run.status.lifecycle == "armed"
+            assert not run.status.faults
 
 
 # --- stops and refusals ----------------------------------------------------------------------------------------
@@ -132,11 +139,13 @@ def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
 def test_client_estop_by_anyone_lasts_until_reset_and_arming() -> None:
     with commanded(run_config(clock_mode="realtime")) as (run, _):
         answer = run.ask(keys.ESTOP, EstopRequest(requester="passer-by"))
-        assert answer.ok and answer.lifecycle == "estop"
+        assert answer.ok
+        assert answer.lifecycle == "estop"
         at = len(run.backend.enacted)
         wait_until(lambda: len(run.backend.enacted) > at + 5, "five ticks more")
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
-        assert "passer-by" in run.status.reason and run.status.faults[-1].what == "estop"
+        assert "passer-by" in run.status.reason
+        assert run.status.faults[-1].what == "estop"
         assert "must be disarmed" in run.lifecycle("arm").reason
         assert run.lifecycle("reset").lifecycle == "disarmed"
         run.arm()
@@ -150,14 +159,16 @@ def test_client_second_holder_needs_higher_priority() -> None:
         run.arm()
         request = LeaseRequest(action="acquire", holder="teleop")
         answer = run.ask(keys.LEASE, request)
-        assert not answer.ok and answer.reason.startswith("held by control (epoch ")
+        assert not answer.ok
+        assert answer.reason.startswith("held by control (epoch ")
         assert "priority 100" in answer.reason
         held = answer.epoch
         assert answer.lifecycle == "armed"
         assert answer.host == run.host.description.host
         wait_until(lambda: len(control.armed_ticks) > 5, "the robot going on undisturbed")
         answer = run.ask(keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200))
-        assert answer.ok and answer.lifecycle == "disarmed"
+        assert answer.ok
+        assert answer.lifecycle == "disarmed"
         at = len(run.backend.enacted)
         late = command(run.host.description, 0.2, lease_epoch=held, sequence=10**6)  # the old holder has not heard yet
         run.session.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
@@ -169,13 +180,18 @@ def test_client_second_holder_needs_higher_priority() -> None:
 
 def test_arming_waits_for_all_services_with_time_paused() -> None:
     with running(run_config()) as run:
-        assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.reason
+        assert run.status.waiting_for == ["control"]
+        assert "waiting for control" in run.status.reason
         answer = run.lifecycle("arm")
-        assert not answer.ok and answer.reason == "waiting for control"
+        assert not answer.ok
+        assert answer.reason == "waiting for control"
         with following(run.link, Follower()) as control:
             wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
-            assert set(control.ticks_seen) == {0} and run.backend.advanced == 0 and not run.backend.enacted
-            assert run.status.tick == 0 and run.host.black_box.ticks == 0
+            assert set(control.ticks_seen) == {0}
+            assert run.backend.advanced == 0
+            assert not run.backend.enacted
+            assert run.status.tick == 0
+            assert run.host.black_box.ticks == 0
             run.arm()
         assert run.status.alive == ["control"] or run.host.authority.faults
 
@@ -219,12 +235,14 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
                 (reply,) = get(key, payload=payload, encoding=encoding, timeout=5.0)
                 assert reply.ok is not None
                 answer = Decoder(Answer).decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
-                assert not answer.ok and answer.lifecycle == "armed"
+                assert not answer.ok
+                assert answer.lifecycle == "armed"
         for pattern in ("hal/*", "**"):  # a tool that looks what is there
             assert all(reply.ok is not None for reply in get(pattern, timeout=1.0))
         seen = len(control.armed_ticks)
         wait_until(lambda: len(control.armed_ticks) > seen + 5, "the robot going on undisturbed")
-        assert run.host.authority.state == "armed" and not run.host.authority.faults
+        assert run.host.authority.state == "armed"
+        assert not run.host.authority.faults
         wait_until(lambda: run.status.commands_rejected == dict(counted), "the counts in the status")
 
 
@@ -262,7 +280,8 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
         asking.join(15.0)
         host.stop()
         thread.join(15.0)
-        assert answers[0].ok and answers[0].lifecycle == "estop"
+        assert answers[0].ok
+        assert answers[0].lifecycle == "estop"
         assert host.requests[0].startswith("tick 0: estop by 'a person', done")
 
 
@@ -282,7 +301,8 @@ def test_realtime_keeps_its_deadlines_on_average() -> None:
         latency = found.state_to_command
         median_us = latency.percentile_us(50)
         assert latency.count >= found.answered_ticks > 0  # late answers count, too
-        assert median_us is not None and 0 < median_us < 20_000
+        assert median_us is not None
+        assert 0 < median_us < 20_000
 
 
 def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
@@ -291,7 +311,8 @@ def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
         run.backend.read_s = 0.03
         slow = "backend 'lag' takes 3"
         wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
-        assert "ms to read" in run.status.reason and "of a tick of 20 ms; it would hold 2" in run.status.reason
+        assert "ms to read" in run.status.reason
+        assert "of a tick of 20 ms; it would hold 2" in run.status.reason
         run.backend.read_s = 0.0
         wait_until(lambda: not run.status.realtime_warnings, "no warning")
 
@@ -299,7 +320,8 @@ def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
 def test_free_waits_for_nobody() -> None:
     with running(run_config(clock_mode="free")) as run:
         wait_until(lambda: run.backend.advanced > 200, "two hundred ticks without anybody")
-        assert run.host.authority.state == "disarmed" and all(passive(points) for points in run.backend.enacted)
+        assert run.host.authority.state == "disarmed"
+        assert all(passive(points) for points in run.backend.enacted)
 
 
 # --- what readers see ------------------------------------------------------------------------------------------

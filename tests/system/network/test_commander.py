@@ -20,17 +20,22 @@ def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
     robot, network = description(), LocalNetwork()
     feed = Feed(network.session().reader(keys.JOINTS, JointState), keys.JOINTS)
     joints = network.session().publisher(keys.JOINTS, JointState)
-    assert feed.newest() is None and feed.at(0) is None
+    assert feed.newest() is None
+    assert feed.at(0) is None
     for tick in range(100):
         joints.put(state(robot, 0.1 * tick, tick=tick))
         feed.store_arrived()
     newest, kept = feed.newest(), feed.at(99)
-    assert newest is not None and newest.tick == 99 and kept is newest
-    assert feed.at(50) is None and feed.at(90) is not None
+    assert newest is not None
+    assert newest.tick == 99
+    assert kept is newest
+    assert feed.at(50) is None
+    assert feed.at(90) is not None
     joints.put(state(robot, 0.0, tick=90))  # shown again: it came last
     feed.store_arrived()
     newest = feed.newest()
-    assert newest is not None and newest.tick == 90
+    assert newest is not None
+    assert newest.tick == 90
     feed.clear()
     assert feed.newest() is None
 
@@ -57,13 +62,15 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
         assert client.read(feed) is None  # no clock yet
         assert next(ticks) == naming(5, 3)
         found = client.read(feed)
-        assert found is not None and found.tick == 3  # what is named, not what is newest
+        assert found is not None
+        assert found.tick == 3  # what is named, not what is newest
         clocks.put(naming(6, 6))
         next(ticks)
         late = threading.Timer(0.03, lambda: joints.put(state(robot, tick=6)))
         late.start()
         found = client.read(feed)
-        assert found is not None and found.tick == 6
+        assert found is not None
+        assert found.tick == 6
         clocks.put(naming(7, 7))
         next(ticks)
         with raises_error(StalledError, code="network/no-ticks"):
@@ -71,7 +78,9 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
         hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
         clocks.put(naming(0, 0, arm_session=0))  # the HAL started over
         again = next(ticks)
-        assert again is not None and again.tick == 0 and client.read(feed) is None
+        assert again is not None
+        assert again.tick == 0
+        assert client.read(feed) is None
         wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
 
 
@@ -83,8 +92,11 @@ def test_commander_requests_free_lease_and_releases_passed_one() -> None:
         assert run.ask(keys.LEASE, other).ok
         ticks = (found for found in client.ticks(silence_s=1.0) if found is not None)
         held = [commander.ensure_lease(next(ticks)) for _ in range(2)]
-        assert held[0] is False and commander.refusal is not None and "held by teleop" in commander.refusal
+        assert held[0] is False
+        assert commander.refusal is not None
+        assert "held by teleop" in commander.refusal
         wait_until(lambda: commander.ensure_lease(next(ticks)), "the end of teleop's lease", 10.0)
-        assert commander.refusal is None and run.host.authority.lease.holder == "pilot"
+        assert commander.refusal is None
+        assert run.host.authority.lease.holder == "pilot"
         assert run.ask(keys.LEASE, other).ok
         wait_until(lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on")

@@ -86,7 +86,9 @@ def test_endpoint_on_loopback_that_is_down_is_named(tmp_path: Path) -> None:
     ended = subprocess.run(
         command, cwd=tmp_path, env=child_environment(), capture_output=True, text=True, timeout=60, check=False
     )
-    assert ended.returncode == 1 and "loopback interface" in ended.stderr and "ip link set lo up" in ended.stderr
+    assert ended.returncode == 1
+    assert "loopback interface" in ended.stderr
+    assert "ip link set lo up" in ended.stderr
     assert not (tmp_path / "run").exists()
     check_loopback("tcp/127.0.0.1:7447")
     check_loopback("tcp/192.0.2.1:7447")  # not on loopback: whether it answers is another question

@@ -28,8 +28,10 @@ from snakesim_testing.messages import raises_error
 def test_a_description_is_proven_by_the_runs_key_alone() -> None:
     described, key = description(), new_run_key()
     ours = add_proof(described, key)
-    assert is_proven(ours, key) and is_proven(described, None)
-    assert not is_proven(described, key) and not is_proven(ours, new_run_key())
+    assert is_proven(ours, key)
+    assert is_proven(described, None)
+    assert not is_proven(described, key)
+    assert not is_proven(ours, new_run_key())
     assert not is_proven(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
 
 
@@ -55,12 +57,14 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
 
         wait_until(ready, "a status that is ready")
         robot = starter.description
-        assert robot == run.host.description and robot is not None
+        assert robot == run.host.description
+        assert robot is not None
         arm = make_arm_request(robot, "the run")
         starter.send_request(msgspec.structs.replace(arm, host="another"))
         wait_until(lambda: starter.receive() or starter.answers, "an answer")
         refused = starter.answers.pop()
-        assert not refused.ok and refused.refusal == "wrong_host"
+        assert not refused.ok
+        assert refused.refusal == "wrong_host"
         starter.send_request(arm)
         wait_until(lambda: starter.receive() or starter.answers, "an answer")
         assert starter.answers.pop().ok
@@ -89,7 +93,8 @@ def test_identity_robots_of_this_computer_are_listed_while_alive(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert local_robots() == []
     with registered(a_robot()) as failure:
-        assert failure is None and local_robots() == [a_robot()]
+        assert failure is None
+        assert local_robots() == [a_robot()]
     assert local_robots() == []
 
 
@@ -104,18 +109,21 @@ def test_a_run_that_was_killed_is_not_found_any_more(tmp_path: Path, monkeypatch
             time.sleep(60)
     """
     with subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE) as run:
-        assert run.stdout is not None and run.stdout.readline()
+        assert run.stdout is not None
+        assert run.stdout.readline()
         assert [robot.pid for robot in local_robots()] == [run.pid]
         os.kill(run.pid, signal.SIGKILL)
         run.wait()
-        assert local_robots() == [] and not list((tmp_path / "snakesim" / "live").iterdir())
+        assert local_robots() == []
+        assert not list((tmp_path / "snakesim" / "live").iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "snakesim").write_text("a file where the folder belongs")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with registered(a_robot()) as failure:
-        assert failure is not None and "--endpoint" in failure
+        assert failure is not None
+        assert "--endpoint" in failure
     assert local_robots() == []
 
 

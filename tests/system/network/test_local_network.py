@@ -19,7 +19,8 @@ def test_local_network_delivers_matching_keys_and_latched_values_later() -> None
     publisher.put(Done(tick=1))
     publisher.put(Done(tick=2))
     one.publisher(keys.done_key("guidance"), Done).put(Done(tick=3))
-    assert [done.tick for done in reader.drain()] == [1, 2] and [done.tick for done in every.drain()] == [1, 2, 3]
+    assert [done.tick for done in reader.drain()] == [1, 2]
+    assert [done.tick for done in every.drain()] == [1, 2, 3]
     assert other.latest(keys.done_key("control"), Done, 0.0) == Done(tick=2)
     other.close()
     assert not publisher.has_subscriber()

@@ -13,10 +13,12 @@ TIMES = 20_000
 
 def test_items_come_in_order_and_nothing_is_empty() -> None:
     box: Mailbox[int] = Mailbox()
-    assert box.empty() and box.qsize() == 0
+    assert box.empty()
+    assert box.qsize() == 0
     for item in range(3):
         box.put(item)
-    assert not box.empty() and box.qsize() == 3
+    assert not box.empty()
+    assert box.qsize() == 3
     assert [box.get(), box.get(timeout=1.0), box.get_nowait()] == [0, 1, 2]
     for wait_s in (0.0, -1.0, 1e-9, 0.01):
         with pytest.raises(Empty):
@@ -42,7 +44,8 @@ def test_waiting_for_an_item_takes_none() -> None:
     assert box.qsize() == 1
     timer.join()
     box.wait(10.0)
-    assert box.get(timeout=10.0) == 1 and box.empty()
+    assert box.get(timeout=10.0) == 1
+    assert box.empty()
 
 
 def test_a_wait_that_is_shorter_than_a_hiccup_ends() -> None:
@@ -70,4 +73,5 @@ def test_nothing_is_lost_between_threads() -> None:
     got = [box.get(timeout=10.0) for _ in range(3 * TIMES)]
     for thread in threads:
         thread.join()
-    assert sorted(got) == list(range(3 * TIMES)) and box.empty()
+    assert sorted(got) == list(range(3 * TIMES))
+    assert box.empty()

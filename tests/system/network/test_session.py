@@ -36,7 +36,8 @@ def test_session_latched_value_reaches_later_readers_once() -> None:
             late.on_latched_arrival(keys.JOINTS, arrived.append)
             found = received(reader, "the latched value")
             wait_until(lambda: arrived, "the latched arrival")
-            assert [joints.tick for joints in found] == [2] and arrived[0].key == keys.JOINTS
+            assert [joints.tick for joints in found] == [2]
+            assert arrived[0].key == keys.JOINTS
             publisher.put(state(ROBOT, tick=3))
             assert [joints.tick for joints in received(reader, "the next value")] == [3]
 
@@ -71,7 +72,8 @@ def test_session_reader_keeps_newest_and_counts_dropped_samples() -> None:
             publisher.put(state(ROBOT, tick=tick))
         end.put(Done(tick=0))
         wait_until(lambda: arrived, "the last sample")
-        assert [joints.tick for joints in reader.drain()] == [16, 17, 18, 19] and reader.drain() == []
+        assert [joints.tick for joints in reader.drain()] == [16, 17, 18, 19]
+        assert reader.drain() == []
         good = encode(state(ROBOT, tick=20))
         bad = [
             (good, ENCODING_PREFIX + "JointState/2"),
@@ -131,10 +133,12 @@ def test_session_query_by_pattern_concerns_the_declared_key() -> None:
         for pattern in ("**", "worm/hal/*"):
             replies = tool._zenoh.get(pattern, timeout=5.0)
             wait_until(lambda: questions, "the question")
-            assert questions[0].key == keys.ESTOP and questions[0].payload == b""
+            assert questions[0].key == keys.ESTOP
+            assert questions[0].payload == b""
             questions.pop().reply(Answer(ok=True, reason=""))
             (reply,) = replies
-            assert reply.ok is not None and str(reply.ok.key_expr) == "worm/hal/estop"
+            assert reply.ok is not None
+            assert str(reply.ok.key_expr) == "worm/hal/estop"
 
 
 def test_an_answer_to_somebody_who_has_gone_hurts_nobody() -> None:

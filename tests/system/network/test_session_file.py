@@ -29,7 +29,8 @@ def test_session_file_connects_sessions_and_stock_zenoh_at_router(tmp_path: Path
     router.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
     path = written(tmp_path, f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
     link = Link.from_session_file(read_session(path), "worm")
-    assert link.endpoint == endpoint and link.namespace == "worm"
+    assert link.endpoint == endpoint
+    assert link.namespace == "worm"
     with (
         raises_error(NotConnectedError, code="certificate/rejected", field="lab.json5"),
         open_session(link, connect_timeout_s=0.1),

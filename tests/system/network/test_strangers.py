@@ -137,8 +137,10 @@ def test_stranger_invalid_intent_is_counted_and_ignored() -> None:
 
         wait_until(all_there, "the wrong state counted, and an intent")
         intent, newest = intents.newest(), joints.newest()
-        assert intent is not None and intent.speed_m_s == 0.2
-        assert newest is not None and newest.tick == 3
+        assert intent is not None
+        assert intent.speed_m_s == 0.2
+        assert newest is not None
+        assert newest.tick == 3
 
 
 def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
@@ -153,7 +155,8 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
         commander = Commander(Client(session, "control"), ROBOT)
         time.sleep(0.3)  # it asks at most so often
         assert not commander.ensure_lease(CLOCK)
-        assert commander.refusal is not None and "cannot be decoded" in commander.refusal
+        assert commander.refusal is not None
+        assert "cannot be decoded" in commander.refusal
         assert session.rejected == {"unknown_message": 2}
         stranger.undeclare()
 
@@ -199,7 +202,8 @@ def test_expired_lease_is_a_fault_despite_simultaneous_request() -> None:
         time.sleep(1.5e-9 * host.description.lease_ns)
         host.on_request(LeaseRequest(action="acquire", holder="stranger"), answers.append)
     assert [answer.ok for answer in answers] == [True, True]
-    assert host.authority.state == "fault" and host.authority.faults[-1].what == "lease_expired"
+    assert host.authority.state == "fault"
+    assert host.authority.faults[-1].what == "lease_expired"
 
 
 def test_stranger_flood_is_dropped_except_newest_wanted_sample() -> None:
@@ -218,5 +222,8 @@ def test_stranger_flood_is_dropped_except_newest_wanted_sample() -> None:
             return message.tick < 100
 
         newest = reader.newest(wanted)
-        assert newest is not None and newest.tick == 99 and asked == [100, 99]
-        assert reader.newest(wanted) is None and reader.drain() == []
+        assert newest is not None
+        assert newest.tick == 99
+        assert asked == [100, 99]
+        assert reader.newest(wanted) is None
+        assert reader.drain() == []

@@ -55,7 +55,8 @@ def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
     nothing = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     for samples, true in seen:
         imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
-        assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
+        assert isinstance(imu, Imu)
+        assert isinstance(pose, Pose | None)
         felt = estimate_pushes(
             robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
         )
@@ -134,4 +135,5 @@ def test_the_median_error_of_a_push_is_below_15_percent(scenario: str, with_pose
 def test_without_imus_three_of_four_pushes_are_still_found() -> None:
     found = score("triplet", "-robot.sensors.imu", "-robot.sensors.contacts", with_pose=False)
     assert len(found.place_m) > 0.75 * len(found.share) > 75
-    assert np.median(found.share) < 0.4 and np.median(found.place_m) < 0.05
+    assert np.median(found.share) < 0.4
+    assert np.median(found.place_m) < 0.05

@@ -32,7 +32,8 @@ def test_requested_obstacle_forces_are_reached_while_moving(
 ):
     result = snakesim.run(scenario, controller="obstacle_aided", duration=6, set=also)
     found = force_tracking(result.record.control)
-    assert found is not None and found.correlation is not None
+    assert found is not None
+    assert found.correlation is not None
     assert found.correlation > correlation
     assert found.median_error < error
     assert found.empty < empty

@@ -46,7 +46,8 @@ def test_triplet_with_35_newtons_moves_half_a_meter(noise: tuple[str, ...]):
 def test_it_ends_when_the_obstacle_at_the_tail_is_lost():
     whole = triplet()
     assert [state for state, _ in groupby(whole.states)] == ["NotLocomoting", "Locomoting", "NotLocomoting"]
-    assert whole.reasons[0].startswith("standing still") and whole.states[50] == "Locomoting"
+    assert whole.reasons[0].startswith("standing still")
+    assert whole.states[50] == "Locomoting"
     assert "2 usable push-points, 3 are needed" in whole.reasons[-1]
 
 
@@ -56,8 +57,11 @@ def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     blind, lost = (gap, ()) if what == "blind" else ((), gap)
     whole = run(configure("triplet"), duration_s=8.0, blind=blind, lost=lost)
     where, pushes = whole.path_s_m, (whole.record.mode == Mode.TORQUE).any(axis=1)
-    assert pushes[150:200].all() and not pushes[gap.start + 2 : gap.stop].any() and pushes[450:500].all()
-    assert np.ptp(where[250:400]) < 0.01 and where[500] - where[400] > 0.05
+    assert pushes[150:200].all()
+    assert not pushes[gap.start + 2 : gap.stop].any()
+    assert pushes[450:500].all()
+    assert np.ptp(where[250:400]) < 0.01
+    assert where[500] - where[400] > 0.05
     held = np.abs(whole.record.torque_nm[280:400]).max(axis=1)
     assert held.max() < 0.5 * np.abs(whole.record.torque_nm[150:200]).max()
     steps = np.abs(np.diff(whole.record.target, axis=0))[190:460]
@@ -145,7 +149,8 @@ def test_braking_obstacles_between_push_points_do_not_stop_pushing(clearance_m: 
 def test_steep_wave_pushes_with_contacts_further_apart():
     whole = run(configure("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
     assert whole.moved_m > 1.0
-    assert set(whole.states[STARTED:]) == {"Locomoting"} and not any(report.jammed for report in whole.reports)
+    assert set(whole.states[STARTED:]) == {"Locomoting"}
+    assert not any(report.jammed for report in whole.reports)
     turns = propelled(whole)
     assert len(turns) < 2 * whole.moved_m / whole.record.config.robot.module.length_m
     assert not whole.record.host.limited_commands
@@ -166,10 +171,12 @@ def test_two_newtons_are_too_little_and_said_to_be():
 def test_push_report_contains_measured_not_requested_forces():
     """Of 8 N, twice the drag of 3.9 N: a push-point that is not touched keeps a part away."""
     whole = run(configure("peg_row", f"{TRIPLET}.propulsion_n=8"), duration_s=5.0)
-    assert whole.states[-1] == "NotLocomoting" and not any(report.jammed for report in whole.reports)
+    assert whole.states[-1] == "NotLocomoting"
+    assert not any(report.jammed for report in whole.reports)
     carried, missing = whole.reasons[-1].split("contacts push it on with ")[1].split(" N ", 1)
     assert 1.0 <= float(carried) <= 3.9
-    assert missing.startswith("(no contact at peg_0_") and "too little against the friction of the ground" in missing
+    assert missing.startswith("(no contact at peg_0_")
+    assert "too little against the friction of the ground" in missing
 
 
 def test_body_clear_of_every_peg_is_not_jammed():
@@ -178,7 +185,8 @@ def test_body_clear_of_every_peg_is_not_jammed():
     whole = run(configure("peg_row", *thin, row), duration_s=4.0)
     assert not any(report.jammed for report in whole.reports)
     assert whole.states[-1] == "NotLocomoting"
-    assert "no obstacle touches the body" in whole.reasons[-1] and "has swung out" in whole.reasons[-1]
+    assert "no obstacle touches the body" in whole.reasons[-1]
+    assert "has swung out" in whole.reasons[-1]
 
 
 # --- long rows, other bodies ----------------------------------------------------------------------------------

@@ -28,7 +28,8 @@ def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
     computer.write_text(INTEL)
     wanted = arithmetic.common_environment()
-    assert wanted["OPENBLAS_CORETYPE"] == "Haswell" and "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
+    assert wanted["OPENBLAS_CORETYPE"] == "Haswell"
+    assert "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
@@ -43,7 +44,8 @@ def test_arithmetic_of_unknown_processor_is_not_pinned(computer: Path, flags: st
     """Code for AVX2 would crash there."""
     if flags is not None:
         computer.write_text(flags)
-    assert arithmetic.common_environment() == {} and arithmetic.is_pinned()
+    assert arithmetic.common_environment() == {}
+    assert arithmetic.is_pinned()
 
 
 def measured_with(code: str, **more: str) -> dict[str, str]:
@@ -95,7 +97,8 @@ def test_numpy_is_given_only_names_that_its_version_knows(
     )
     computer.write_text(INTEL)
     names = arithmetic.common_environment()["NPY_DISABLE_CPU_FEATURES"].split()
-    assert (names[0], names[-1]) == (first, last)
+    assert names[0] == first
+    assert names[-1] == last
 
 
 def test_numpy_can_be_imported_where_warnings_are_errors() -> None:

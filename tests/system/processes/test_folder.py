@@ -37,10 +37,12 @@ def leave(folder: Path, **files: str) -> None:
 def test_a_folder_is_held_and_let_go(tmp_path: Path) -> None:
     out, said = tmp_path / "deep" / "run", list[str]()
     with locked_folder(out, said.append) as held:
-        assert held == out and content(out) == {LOCK: str(os.getpid())}
+        assert held == out
+        assert content(out) == {LOCK: str(os.getpid())}
         with raises_error(ConfigError, code="file/in-use"):
             locked_folder(out, said.append).__enter__()
-    assert content(out) == {} and said == []
+    assert content(out) == {}
+    assert said == []
 
 
 def test_an_earlier_run_is_moved_aside_every_time(tmp_path: Path) -> None:
@@ -82,12 +84,14 @@ def test_run_folder_in_use_refuses_second_process_until_killed(tmp_path: Path) -
     out = tmp_path / "run"
     holder = subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True)
     try:
-        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
         leave(out, config_json="of the holder")
         before = content(out)
         with raises_error(ConfigError, code="file/in-use", field="--out"):
             locked_folder(out, pytest.fail).__enter__()
-        assert content(out) == before and list(tmp_path.iterdir()) == [out]
+        assert content(out) == before
+        assert list(tmp_path.iterdir()) == [out]
         holder.send_signal(signal.SIGKILL)
         holder.wait(10)
         said: list[str] = []
@@ -131,7 +135,8 @@ def test_run_folder_moved_aside_is_not_written_to(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(os, "open", late)
     with locked_folder(out, pytest.fail):
-        assert content(out) == {LOCK: str(os.getpid())} and content(aside) == {"notes.txt": "mine"}
+        assert content(out) == {LOCK: str(os.getpid())}
+        assert content(aside) == {"notes.txt": "mine"}
 
 
 @pytest.mark.parametrize("out", ["file", "file/run", "/proc/run"])
@@ -154,4 +159,5 @@ def test_run_folder_is_new_when_none_is_given(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     first = default_folder("triplet")
     first.mkdir(parents=True)
-    assert re.fullmatch(r"runs/triplet-\d{8}-\d{6}", str(first)) and not default_folder("triplet").exists()
+    assert re.fullmatch(r"runs/triplet-\d{8}-\d{6}", str(first))
+    assert not default_folder("triplet").exists()

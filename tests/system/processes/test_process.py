@@ -10,7 +10,7 @@ LOCK = "import resource; resource.setrlimit(resource.RLIMIT_MEMLOCK, ({0}, {0}))
 PRINT = "from snakesim_hal.base.process import {0}; print({0}({1}))"
 
 
-def said(code: str, *, drop: str = "") -> str:
+def run_python(code: str, *, drop: str = "") -> str:
     """What a process of its own prints; drop: a capability that it must not have (an ordinary user's has none)."""
     bounded = ["setpriv", f"--bounding-set=-{drop}", f"--inh-caps=-{drop}"] if drop and os.geteuid() == 0 else []
     done = subprocess.run(
@@ -20,13 +20,14 @@ def said(code: str, *, drop: str = "") -> str:
 
 
 def test_memory_is_not_locked_under_a_limit() -> None:
-    words = said(LOCK.format(1 << 20) + PRINT.format("lock_memory", ""), drop="ipc_lock")
-    assert "the limit is 1024 KiB" in words and "ulimit -l" in words
+    words = run_python(LOCK.format(1 << 20) + PRINT.format("lock_memory", ""), drop="ipc_lock")
+    assert "the limit is 1024 KiB" in words
+    assert "ulimit -l" in words
 
 
 def test_memory_is_locked_where_that_is_allowed() -> None:
     code = PRINT.format("lock_memory", "") + "; print(open('/proc/self/status').read().split('VmLck:')[1].split()[0])"
-    verdict, *locked = said(code).splitlines()
+    verdict, *locked = run_python(code).splitlines()
     if verdict != "None":
         pytest.skip(verdict)
     assert int(locked[0]) > 1000
@@ -34,13 +35,14 @@ def test_memory_is_locked_where_that_is_allowed() -> None:
 
 def test_what_is_refused_is_returned_and_printed() -> None:
     code = "from snakesim_hal.base.process import enter_realtime; r = enter_realtime(20); print(len(r), r)"
-    words = said(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
+    words = run_python(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
     assert words.startswith("2 [") and words.count("no real-time priority") == 2, words
 
 
 def test_the_clock_is_not_stepped_without_permission() -> None:
-    words = said(PRINT.format("step_wall_clock", "0.0"), drop="sys_time")
-    assert "CAP_SYS_TIME" in words and "RefusedError" in words
+    words = run_python(PRINT.format("step_wall_clock", "0.0"), drop="sys_time")
+    assert "CAP_SYS_TIME" in words
+    assert "RefusedError" in words
 
 
 def test_a_thread_that_never_pauses_gives_up_its_priority() -> None:
@@ -61,7 +63,7 @@ print(os.sched_getscheduler(0) == os.SCHED_FIFO)
 compute(0.5)
 print(os.sched_getscheduler(0) == os.SCHED_OTHER)
 """
-    words = said(code)
+    words = run_python(code)
     if "refused" in words:
         pytest.skip("real-time priority is refused here")
     assert words.startswith("True\nTrue\n"), words
@@ -76,4 +78,5 @@ def test_a_closed_terminal_is_a_stop_but_under_nohup() -> None:
         for prefix in (in_a_terminal, ["nohup"])
     )
     assert "SIGHUP" in words
-    assert "SIGTERM" in under_nohup and "SIGHUP" not in under_nohup
+    assert "SIGTERM" in under_nohup
+    assert "SIGHUP" not in under_nohup

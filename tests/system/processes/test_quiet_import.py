@@ -17,7 +17,7 @@ print(os.environ.get("MUJOCO_GL"))
 CONTEXT = "print(gl_context.GLContext.__module__, mujoco.GLContext is gl_context.GLContext)"
 
 
-def said(code: str, mujoco_gl: str | None) -> list[str]:
+def run_python(code: str, mujoco_gl: str | None) -> list[str]:
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     if mujoco_gl is not None:
         environment["MUJOCO_GL"] = mujoco_gl
@@ -28,13 +28,13 @@ def said(code: str, mujoco_gl: str | None) -> list[str]:
 
 @pytest.mark.parametrize(("mujoco_gl", "context"), [(None, "mujoco.glfw True"), ("egl", "mujoco.egl True")])
 def test_the_choice_of_opengl_stays_that_of_the_program(mujoco_gl: str | None, context: str) -> None:
-    assert said(IMPORTED + CONTEXT, mujoco_gl) == [str(mujoco_gl), context]
+    assert run_python(IMPORTED + CONTEXT, mujoco_gl) == [str(mujoco_gl), context]
 
 
 def test_a_library_that_is_missing_keeps_no_simulator_from_running() -> None:
-    assert said(IMPORTED, "osmesa") == ["osmesa"]
+    assert run_python(IMPORTED, "osmesa") == ["osmesa"]
 
 
 def test_off_stays_off() -> None:
     asked = "print(hasattr(mujoco, 'GLContext'), hasattr(mujoco, 'Renderer'))"
-    assert said(IMPORTED + asked, "off") == ["off", "False True"]
+    assert run_python(IMPORTED + asked, "off") == ["off", "False True"]

@@ -51,5 +51,6 @@ def test_another_process_can_see_when_a_step_began() -> None:
         assert pulse.read_step_times() is None
         with limit:
             step_s = pulse.read_step_times()
-            assert step_s is not None and step_s[1] - step_s[0] == pytest.approx(60.0)
+            assert step_s is not None
+            assert step_s[1] - step_s[0] == pytest.approx(60.0)
         assert pulse.read_step_times() is None

@@ -32,7 +32,8 @@ def test_worker_restarts_after_error_and_reports_it_once(capfd: pytest.CaptureFi
             raise BrokenError("no file is left")
 
     start_worker("bellows", work, on_error=dropped.append).join(10.0)
-    assert len(attempts) == 3 and len(dropped) == 2
+    assert len(attempts) == 3
+    assert len(dropped) == 2
     assert capfd.readouterr().err.count("bellows: unexpected error, going on: BrokenError: no file is left") == 1
 
 

@@ -36,7 +36,8 @@ def test_the_log_gives_the_recorded_states(run: Path, suffix: str) -> None:
                 other(frame)
         log = run.with_name(f"other{suffix}")
     ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=run)
-    assert ended.code == 0 and "joint states of 50 ticks are those of the record, to the bit" in ended.out
+    assert ended.code == 0
+    assert "joint states of 50 ticks are those of the record, to the bit" in ended.out
     assert "did not answer" not in ended.out
 
 
@@ -47,8 +48,10 @@ def test_a_lost_answer_is_found(run: Path, tmp_path: Path) -> None:
     log = tmp_path / "lost.log"
     log.write_text("".join(lines))
     ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
-    assert ended.code == 1 and "joint_4 did not answer 1 Syncs in time" in ended.out
-    assert "joint_4, " in ended.out and "1 of 50 ticks differ" in ended.out
+    assert ended.code == 1
+    assert "joint_4 did not answer 1 Syncs in time" in ended.out
+    assert "joint_4, " in ended.out
+    assert "1 of 50 ticks differ" in ended.out
 
 
 def test_bus_replay_of_cut_log_compares_up_to_the_cut(run: Path, tmp_path: Path) -> None:
@@ -90,7 +93,8 @@ def test_bus_replay_refuses_log_of_another_drive_type(run: Path, tmp_path: Path)
     config = json.loads((other / "config.json").read_text())
     (other / "config.json").write_text(json.dumps(config | {"backend": "odrive"}))
     ended = snakesim("drive", "replay", "can", str(other), str(log), cwd=tmp_path)
-    assert ended.code == 2 and "is a run with the backend 'odrive', and `snakesim drive replay can` reads" in ended.err
+    assert ended.code == 2
+    assert "is a run with the backend 'odrive', and `snakesim drive replay can` reads" in ended.err
 
 
 @pytest.mark.parametrize(
@@ -101,4 +105,5 @@ def test_what_is_no_log_is_refused(run: Path, tmp_path: Path, name: str, content
     if content is not None:
         log.write_text(content)
     ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
-    assert ended.code == 2 and "cannot be read as a log of a CAN bus (.log, .asc, .blf)" in ended.err
+    assert ended.code == 2
+    assert "cannot be read as a log of a CAN bus (.log, .asc, .blf)" in ended.err

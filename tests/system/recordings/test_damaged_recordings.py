@@ -53,13 +53,16 @@ def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(run: Path, whole: b
     reader = RecordingReader(path)
     kept = list(reader.read_messages())
     truth = lost(run / RECORDING, path)
-    assert truth[keys.JOINTS] >= 2 and len(kept) > 500
+    assert truth[keys.JOINTS] >= 2
+    assert len(kept) > 500
     assert {key: count for key, count in reader.losses.lost_by_key.items() if not key.startswith("/")} == truth
     (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
     clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
     hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
-    assert gap.end_ns is not None and hole[0] <= gap.begin_ns < gap.end_ns <= hole[1]
-    assert reader.finished and following.begin  # what follows was read
+    assert gap.end_ns is not None
+    assert hole[0] <= gap.begin_ns < gap.end_ns <= hole[1]
+    assert reader.finished
+    assert following.begin  # what follows was read
 
 
 @pytest.mark.slow  # one flipped bit in one of them below
@@ -103,10 +106,12 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
     ended = snakesim(*command, cwd=tmp_path)
     assert ended.code == INCOMPLETE, ended
     said = [line for line in ended.err.splitlines() if "update() took" not in line]  # a busy computer
-    assert len(said) == 1 and said[0].startswith("snakesim: a.mcap is incomplete: ")
+    assert len(said) == 1
+    assert said[0].startswith("snakesim: a.mcap is incomplete: ")
     assert ("breaks off at" if damage == "halved" else "actuator/joints") in ended.err
     if "--json" in command:
-        assert json.loads(ended.out)["missing"]["a"] and not json.loads(ended.out)["missing"]["b"]
+        assert json.loads(ended.out)["missing"]["a"]
+        assert not json.loads(ended.out)["missing"]["b"]
 
 
 @pytest.mark.slow
@@ -118,9 +123,11 @@ def test_undamaged_recording_is_not_reported_and_names_its_command(whole: bytes,
         errors = [line for line in ended.err.splitlines() if "update() took" not in line]  # by a busy computer
         assert ended.code == 0 and not errors, ended
     page = (tmp_path / "a.html").read_text()
-    assert "The run ended early" not in page and "The record is incomplete" not in page
+    assert "The run ended early" not in page
+    assert "The record is incomplete" not in page
     # What repeats the run names a file that can be.
-    assert "snakesim run config.json --backend sim" in page and "a.mcap/config.json" not in page
+    assert "snakesim run config.json --backend sim" in page
+    assert "a.mcap/config.json" not in page
     assert "Save the effective configuration below as <code>config.json</code>" in page
 
 
@@ -129,11 +136,14 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(run: Path, who
     written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
     ended = snakesim("recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
     count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
-    assert ended.code == INCOMPLETE and int(ended.out.split()[0]) > count > 500  # and those for Foxglove
+    assert ended.code == INCOMPLETE
+    assert int(ended.out.split()[0]) > count > 500  # and those for Foxglove
     reader = RecordingReader(tmp_path / "copy.mcap")
-    assert len(list(reader.read_messages())) == count and reader.finished
+    assert len(list(reader.read_messages())) == count
+    assert reader.finished
     told = snakesim("recording", "info", "copy.mcap", cwd=tmp_path)
-    assert told.code == INCOMPLETE and "before it was copied: damaged in 1 place" in told.err
+    assert told.code == INCOMPLETE
+    assert "before it was copied: damaged in 1 place" in told.err
     assert "sensor/joints" in told.err
 
 
@@ -145,7 +155,8 @@ def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> N
         assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
         rows = list(csv.DictReader(file))
     with np.load(tmp_path / "a.npz") as arrays:
-        assert "its end" in str(arrays["missing"][0]) and len(arrays["time_s"]) == len(rows) > 20
+        assert "its end" in str(arrays["missing"][0])
+        assert len(arrays["time_s"]) == len(rows) > 20
 
 
 def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Path) -> None:
@@ -221,11 +232,13 @@ def test_truncated_recording_says_nothing_about_end_of_run(whole: bytes, tmp_pat
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     snakesim("recording", "report", "a.mcap", cwd=tmp_path)
     page = (tmp_path / "a.html").read_text()
-    assert "How the run ended is not known: the recording breaks off after 0." in page and "ended early" not in page
+    assert "How the run ended is not known: the recording breaks off after 0." in page
+    assert "ended early" not in page
     assert "The record is incomplete. recording: its end" in page
     compared = snakesim("study", "compare", "whole.mcap", "a.mcap", cwd=tmp_path)
     assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
-    assert "in what both records hold: " in compared.out and "for all of their" not in compared.out
+    assert "in what both records hold: " in compared.out
+    assert "for all of their" not in compared.out
 
 
 def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
@@ -235,7 +248,8 @@ def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
         out.symlink_to(tmp_path / "elsewhere")
         wanted = ["--out", "b.mcap"] if form == "mcap" else []
         ended = snakesim("recording", "export", "a.mcap", "--format", form, *wanted, cwd=tmp_path)
-        assert ended.code == 2 and "there is a symbolic link already; choose another one with --out" in ended.err
+        assert ended.code == 2
+        assert "there is a symbolic link already; choose another one with --out" in ended.err
         assert not (tmp_path / "elsewhere").exists()
 
 
@@ -243,18 +257,22 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
     end = next(span for span in spans(whole) if span.opcode == Opcode.METADATA)
     path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
     reader = RecordingReader(path)
-    assert list(reader.read_messages()) and reader.finished and not reader.missing
+    assert list(reader.read_messages())
+    assert reader.finished
+    assert not reader.missing
 
 
 def test_damaged_lz4_chunk_and_impossible_time_are_reported(whole: bytes, tmp_path: Path) -> None:
     first, second = chunks(whole)[:2]
     bad = packed(b"abc", "lz4", data=b"no lz4 at all")
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :]))
-    assert len(list(reader.read_messages())) > 500 and "a chunk that cannot be unpacked" in reader.missing[0]
+    assert len(list(reader.read_messages())) > 500
+    assert "a chunk that cannot be unpacked" in reader.missing[0]
     (channel,) = struct.unpack("<H", b"\x01\x00")
     late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
-    assert max(one.time_ns for one in reader.read_messages()) < 2**62 and reader.missing
+    assert max(one.time_ns for one in reader.read_messages()) < 2**62
+    assert reader.missing
     assert snakesim("recording", "info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
 
 
@@ -264,7 +282,9 @@ def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> No
         absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
         reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :]))
         list(reader.read_messages())
-        assert reader.finished and not reader.losses.lost_by_key and reader.losses.damage_count == 1
+        assert reader.finished
+        assert not reader.losses.lost_by_key
+        assert reader.losses.damage_count == 1
 
 
 def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -277,7 +297,8 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
     ):
         ended = snakesim(*command, cwd=tmp_path)
         assert ended.code == 2 and len(ended.err.splitlines()) == 1, ended
-        assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
+        assert "bomb.mcap is not a recording" in ended.err
+        assert "which no messages of a robot do" in ended.err
 
 
 NAVIGATION = "services.navigation.plugin="
@@ -313,8 +334,10 @@ def test_recording_runs_named_files_only_on_request(tmp_path: Path, kind: str) -
         assert snakesim(*words.split(), cwd=tmp_path).code == 0
     more = () if kind == "controller" else ("--controller", "hold")  # which says nothing of a service
     refused = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
-    assert refused.code == 2 and f"the recording names './mine.py:Mine' as its {kind}" in refused.err
-    assert "--run-recorded-code" in refused.err and " ".join(own) in refused.err
+    assert refused.code == 2
+    assert f"the recording names './mine.py:Mine' as its {kind}" in refused.err
+    assert "--run-recorded-code" in refused.err
+    assert " ".join(own) in refused.err
     assert not (tmp_path / "ran").exists()
     for flags, runs in ((shipped, False), (own, True), (("--run-recorded-code",), True)):
         replayed = snakesim("replay", "run", "--control", *flags, cwd=tmp_path)
@@ -329,5 +352,6 @@ def test_damaged_recording_is_reported_for_its_run_folder(run: Path, whole: byte
             written(tmp_path / path.name, path.read_bytes())
     written(tmp_path / RECORDING, whole[: len(whole) // 2])
     ended = snakesim("recording", "report", ".", cwd=tmp_path)
-    assert ended.code == INCOMPLETE and "its end: it breaks off" in ended.err
+    assert ended.code == INCOMPLETE
+    assert "its end: it breaks off" in ended.err
     assert len(RunRecord.load(tmp_path).time_s) == 150  # the rows are the black box's

@@ -112,20 +112,25 @@ def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     given = ("recording", "export", str(demos / "demos"), "--format", "lerobot", "--images")
     refused = snakesim(*given, "--fps", "7", "--out", "no", cwd=tmp_path)
-    assert refused.code == 2 and "--fps 7: of a robot at 50 Hz give one of 1, 2, 5, 10" in refused.err
+    assert refused.code == 2
+    assert "--fps 7: of a robot at 50 Hz give one of 1, 2, 5, 10" in refused.err
     ended = snakesim(*given, "--fps", "10", "--out", "set", cwd=tmp_path)
     assert "2 episodes" in ended.out, ended.said
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
-    assert (info["fps"], info["total_episodes"], info["total_tasks"]) == (10, 2, 1)
+    assert info["fps"] == 10
+    assert info["total_episodes"] == 2
+    assert info["total_tasks"] == 1
     assert info["features"]["observation.images.head_depth"]["shape"] == [120, 160, 3]
     first, second = (
         parquet.read_table(tmp_path / "set" / info["data_path"].format(chunk_index=0, file_index=i)).to_pydict()
         for i in (0, 1)
     )
-    assert first["next.success"][-1] and not any(first["next.success"][:-1] + second["next.success"])
+    assert first["next.success"][-1]
+    assert not any(first["next.success"][:-1] + second["next.success"])
     assert first["next.done"] == [False] * (len(first["index"]) - 1) + [True]
     assert first["observation.images.head_depth"][0]["bytes"].startswith(b"\x89PNG")
-    assert len(first["next.reward"]) == len(first["index"]) and min(first["next.reward"]) >= 0.0
+    assert len(first["next.reward"]) == len(first["index"])
+    assert min(first["next.reward"]) >= 0.0
 
 
 @pytest.mark.slow
@@ -155,7 +160,13 @@ def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
     loaded = call([python, "-c", LOADED], tmp_path, offline, 600.0)
     assert loaded.code == 0, loaded.err[-3000:]
     seen = json.loads(loaded.out.splitlines()[-1])
-    assert (seen["episodes"], seen["fps"], seen["task"]) == (2, 10, "through the field")
-    assert seen["image"] == [3, 120, 160] and 0 < seen["brightest"] <= 1 and seen["mean"] == [3, 1, 1]
-    assert seen["done"] and seen["success"] == [False, False]
-    assert seen["around"] == [[2, 26], [2, 3, 120, 160]] and seen["batch"] == [4, 3, 120, 160]
+    assert seen["episodes"] == 2
+    assert seen["fps"] == 10
+    assert seen["task"] == "through the field"
+    assert seen["image"] == [3, 120, 160]
+    assert 0 < seen["brightest"] <= 1
+    assert seen["mean"] == [3, 1, 1]
+    assert seen["done"]
+    assert seen["success"] == [False, False]
+    assert seen["around"] == [[2, 26], [2, 3, 120, 160]]
+    assert seen["batch"] == [4, 3, 120, 160]

@@ -55,12 +55,17 @@ def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> No
         os.kill(host, signal.SIGKILL)
         assert run.end() == 1, run.said()
         said = run.said()
-    assert "host was ended by SIGKILL" in said and "may lack the last second" in said and "Traceback" not in said
+    assert "host was ended by SIGKILL" in said
+    assert "may lack the last second" in said
+    assert "Traceback" not in said
     record, summary = RunRecord.load(tmp_path / "run"), summary_of(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ
-    assert summary.ticks == len(record.time_s) and summary.duration_s == pytest.approx(len(record.time_s) / RATE_HZ)
-    assert "host was ended by SIGKILL" in summary.ended and any("last second" in lack for lack in summary.missing)
-    assert summary.command_digest == record.host.command_digest and record.control
+    assert summary.ticks == len(record.time_s)
+    assert summary.duration_s == pytest.approx(len(record.time_s) / RATE_HZ)
+    assert "host was ended by SIGKILL" in summary.ended
+    assert any("last second" in lack for lack in summary.missing)
+    assert summary.command_digest == record.host.command_digest
+    assert record.control
     assert "last second" in (tmp_path / "run" / REPORT).read_text()
 
 
@@ -73,11 +78,16 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
     record = RunRecord.load(tmp_path / "run")
-    assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ and record.host.ended == "running" and record.control
+    assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ
+    assert record.host.ended == "running"
+    assert record.control
     result = command.snakesim("study", "compare", "run", "run", cwd=tmp_path)
-    assert result.code == 3 and "last second may be missing" in result.out and "its end: it breaks off" in result.err
+    assert result.code == 3
+    assert "last second may be missing" in result.out
+    assert "its end: it breaks off" in result.err
     ended, _ = command.run_to_summary(tmp_path / "run", *SHORT)  # and its folder can be used again
-    assert ended.code == 0 and "held an earlier run: moved to" in ended.out
+    assert ended.code == 0
+    assert "held an earlier run: moved to" in ended.out
 
 
 # --- complete, or not ------------------------------------------------------------------------------------------
@@ -94,7 +104,8 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
         os.kill(host, signal.SIGTERM)
         assert run.end() == 1, run.said()
     summary = summary_of(tmp_path / "run")
-    assert summary.ended.startswith("the host was stopped by a signal after ") and " of 30 s" in summary.ended
+    assert summary.ended.startswith("the host was stopped by a signal after ")
+    assert " of 30 s" in summary.ended
     assert f"fault: {summary.ended}" in run.said()
     nothing_left(tmp_path / "run")
 
@@ -105,7 +116,8 @@ def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
         assert command.tell(run, "robot", "disarm").code == 0
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
-    assert "of 2 s" in ended and "the time was over before the requested armed time was reached" in ended
+    assert "of 2 s" in ended
+    assert "the time was over before the requested armed time was reached" in ended
 
 
 # --- the disk --------------------------------------------------------------------------------------------------
@@ -133,8 +145,10 @@ def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str
 def orderly(ended: Ended, left: Path, *, code: int, warning: str) -> None:
     """One warning, no traceback, no empty or half-written file, the right exit code."""
     assert ended.code == code, ended.out + ended.err
-    assert "Traceback" not in ended.out + ended.err and ended.err == ""
-    assert ended.out.count("warning:") == 1 and warning in ended.out
+    assert "Traceback" not in ended.out + ended.err
+    assert ended.err == ""
+    assert ended.out.count("warning:") == 1
+    assert warning in ended.out
     assert "\nrecord: incomplete: " in ended.out
     files = [path for path in left.rglob("*") if path.is_file()]
     assert all(path.stat().st_size > 0 and path.suffix != ".partial" for path in files), files
@@ -228,8 +242,11 @@ def hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", *LONG, "--duration", "4")
     assert ended.code == 0 and "warning:" not in ended.out, ended.out
-    assert summary.wall_s == pytest.approx(4.0, abs=0.1) and summary.overruns < 10 and summary.missing == []
-    assert len(RunRecord.load(tmp_path / "run").time_s) == 200 and not hangs.exists()
+    assert summary.wall_s == pytest.approx(4.0, abs=0.1)
+    assert summary.overruns < 10
+    assert summary.missing == []
+    assert len(RunRecord.load(tmp_path / "run").time_s) == 200
+    assert not hangs.exists()
 
 
 @pytest.mark.slow
@@ -243,8 +260,11 @@ def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hangs: Path) -> N
             assert newest_status(session).tick - before >= 0.8 * RATE_HZ
             began = time.monotonic()
             answer = session.request(keys.ESTOP, EstopRequest(requester="anna"))
-            assert answer.ok and answer.lifecycle == "estop" and time.monotonic() - began < 3.0
+            assert answer.ok
+            assert answer.lifecycle == "estop"
+            assert time.monotonic() - began < 3.0
             assert "not stored yet" in answer.reason or (tmp_path / "run" / ESTOP).exists()
             assert session.request(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
         assert run.end(30.0) == 1, run.said()
-        assert "the disk has not answered" in run.said() and "Traceback" not in run.said()
+        assert "the disk has not answered" in run.said()
+        assert "Traceback" not in run.said()

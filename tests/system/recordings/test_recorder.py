@@ -46,7 +46,8 @@ def sighted_live(address: str, origin: str | None = None) -> list[str]:
         while isinstance(reported := viewer.recv(10.0), str):
             pass
         operation, _, time_ns = struct.unpack("<BIQ", reported[:13])
-        assert operation == 1 and 0 < time_ns < 60e9  # robot time
+        assert operation == 1
+        assert 0 < time_ns < 60e9  # robot time
         return [frame.child_frame_id for frame in FrameTransforms.FromString(reported[13:]).transforms]
 
 
@@ -69,15 +70,18 @@ def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> N
             time.sleep(1.0)
             beside.send_signal(signal.SIGINT)
             said = beside.stdout.read()
-            assert "messages in" in said and beside.wait(20) == 0
+            assert "messages in" in said
+            assert beside.wait(20) == 0
             assert said.count("refused a viewer") == 4 and "http://evil.example" in said, said
         assert links == [f"link_{i}" for i in range(14)]
         assert run.end() == 3, run.said()  # complete, but the record is incomplete
-    assert run.said().count("warning:") == 1 and "recorder was ended by SIGKILL" in run.said()
+    assert run.said().count("warning:") == 1
+    assert "recorder was ended by SIGKILL" in run.said()
     kept = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages([keys.JOINTS]))
     assert len(kept) > 10
     alone = RunRecord.load(tmp_path / "beside.mcap")
-    assert alone.config.name == "triplet" and len(alone.time_s) > 40
+    assert alone.config.name == "triplet"
+    assert len(alone.time_s) > 40
     assert command.snakesim("recording", "report", "beside.mcap", cwd=tmp_path).code == 0
 
 
@@ -85,7 +89,8 @@ def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
     ended = command.snakesim(
         "run", "triplet", "--in-process", "--no-record", "--duration", "0.1", "--out", "bare", cwd=tmp_path
     )
-    assert ended.code == 0 and not (tmp_path / "bare" / RECORDING).exists()
+    assert ended.code == 0
+    assert not (tmp_path / "bare" / RECORDING).exists()
     command.snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", "run", cwd=tmp_path)
     endpoint, said = free_endpoint(), list[str]()
     how = {"endpoint": endpoint, "namespace": "again", "rate": 0.5, "step": False}
@@ -97,7 +102,8 @@ def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
         clocks, began = session.reader(keys.CLOCK, Clock), time.monotonic()
         found = list[Clock]()
         wait_until(lambda: bool(found.extend(clocks.drain())) or bool(found and found[-1].tick == 99), "the last tick")
-        assert time.monotonic() - began > 1.0 and len(found) > 50
+        assert time.monotonic() - began > 1.0
+        assert len(found) > 50
         assert robots.drain()[-1].robot == "planar13"
     player.join(10)
     assert "messages played" in said[-1]

@@ -63,7 +63,9 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
     # A tick that cannot be true, or none: the time of the newest clock.
     assert [one.time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
     assert all(abs(one.wall_ns - time.time_ns()) < 60e9 for one in found)
-    assert reader.finished and reader.metadata == {"dropped": {}} and not reader.missing
+    assert reader.finished
+    assert reader.metadata == {"dropped": {}}
+    assert not reader.missing
 
 
 def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
@@ -78,13 +80,21 @@ def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
         found = list(reader.iter_messages())
         late = [message.log_time for *_, message in reader.iter_messages(starting_at=25 * PERIOD_NS)]
         summary, about = reader.get_summary(), list(reader.iter_metadata())
-    assert summary is not None and summary.statistics is not None and summary.statistics.message_count == 50
-    assert len(summary.chunk_indexes) == 3 and late == [tick * PERIOD_NS for tick in range(25, 50)]
-    assert summary.statistics.message_start_time == 0 and summary.statistics.message_end_time == 49 * PERIOD_NS
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == 50
+    assert len(summary.chunk_indexes) == 3
+    assert late == [tick * PERIOD_NS for tick in range(25, 50)]
+    assert summary.statistics.message_start_time == 0
+    assert summary.statistics.message_end_time == 49 * PERIOD_NS
     assert [(one.name, one.metadata) for one in about] == [("snakesim", {"version": '"1"'})]
     schema, channel, message = found[-1]
-    assert schema is not None and (schema.name, schema.encoding) == ("snakesim.Clock", "jsonschema")
-    assert (channel.topic, channel.message_encoding, message.log_time) == (keys.CLOCK, "msgpack", 49 * PERIOD_NS)
+    assert schema is not None
+    assert schema.name == "snakesim.Clock"
+    assert schema.encoding == "jsonschema"
+    assert channel.topic == keys.CLOCK
+    assert channel.message_encoding == "msgpack"
+    assert message.log_time == 49 * PERIOD_NS
 
 
 KILLED = """
@@ -117,7 +127,9 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
     reader = RecordingReader(path)
     kept = len(list(reader.read_messages()))
     a_second_before = [tick for at, tick in ticks if at < ticks[-1][0] - 1.0]
-    assert kept > a_second_before[-1] and not reader.finished and "its end: it breaks off" in reader.missing[0]
+    assert kept > a_second_before[-1]
+    assert not reader.finished
+    assert "its end: it breaks off" in reader.missing[0]
     with path.open("rb") as file, contextlib.suppress(Exception):  # the stock reader, as far as it goes
         stock = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
         assert len(stock) == kept
@@ -134,9 +146,10 @@ def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
     assert "File too large" in recording.failure
     reader = RecordingReader(tmp_path / "a.mcap")
     ticks = [one.time_ns // PERIOD_NS for one in reader.read_messages()]
-    assert (
-        len(ticks) > 200 and ticks == list(range(len(ticks))) and not reader.losses.damage_count and not reader.finished
-    )
+    assert len(ticks) > 200
+    assert ticks == list(range(len(ticks)))
+    assert not reader.losses.damage_count
+    assert not reader.finished
 
 
 def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,4 +219,5 @@ def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) ->
     recording.close({})
     with path.open("rb") as file:
         schemas = {schema.name for schema, channel, _ in make_reader(file).iter_messages(topics=[own]) if schema}
-    assert schemas == {"snakesim.custom.Whisker"} and recording.counts[own] == 2
+    assert schemas == {"snakesim.custom.Whisker"}
+    assert recording.counts[own] == 2

@@ -33,11 +33,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
     whole, alone = RunRecord.load(run), RunRecord.load(run / RECORDING)
     arrays = {name: value for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
-    assert len(arrays) > 8 and len(whole.time_s) == 200
+    assert len(arrays) > 8
+    assert len(whole.time_s) == 200
     for name, value in arrays.items():
         assert np.array_equal(value, getattr(alone, name), equal_nan=True), name
-    assert alone.host.command_digest == whole.host.command_digest and alone.config == whole.config
-    assert (alone.control, alone.worlds, alone.trajectories) == (whole.control, whole.worlds, whole.trajectories)
+    assert alone.host.command_digest == whole.host.command_digest
+    assert alone.config == whole.config
+    assert alone.control == whole.control
+    assert alone.worlds == whole.worlds
+    assert alone.trajectories == whole.trajectories
     assert alone.missing == whole.missing == []
 
 
@@ -45,7 +49,8 @@ def test_recordings_without_black_box_keep_numbers_of_host(run: Path, tmp_path: 
     content, host = (run / RECORDING).read_bytes(), RunRecord.load(run).host
     (tmp_path / RECORDING).write_bytes(content[: len(content) * 2 // 3])
     record = RunRecord.load(tmp_path, host)
-    assert 0 < len(record.time_s) < 200 and record.host.command_digest == host.command_digest
+    assert 0 < len(record.time_s) < 200
+    assert record.host.command_digest == host.command_digest
     assert f"{200 - len(record.time_s)} of 200 ticks are missing in the black box" in record.missing
 
 
@@ -67,14 +72,20 @@ def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_
 def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:
     ended = snakesim("recording", "info", str(run), "--json", cwd=tmp_path)
     info = json.loads(ended.out)
-    assert ended.code == 0 and info["finished"] and info["duration_s"] == pytest.approx(2.0)
-    assert (info["robot"], info["scenario"], info["ticks"]) == ("planar13_camera", "clutter", 200)
+    assert ended.code == 0
+    assert info["finished"]
+    assert info["duration_s"] == pytest.approx(2.0)
+    assert info["robot"] == "planar13_camera"
+    assert info["scenario"] == "clutter"
+    assert info["ticks"] == 200
     assert info["command_digest"] == RunRecord.load(run).host.command_digest
-    assert info["keys"]["sensor/joints"]["rate_hz"] == pytest.approx(100.0) and "sensor/depth/head" in info["keys"]
+    assert info["keys"]["sensor/joints"]["rate_hz"] == pytest.approx(100.0)
+    assert "sensor/depth/head" in info["keys"]
     content = (run / RECORDING).read_bytes()
     (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
     result = snakesim("recording", "info", "torn.mcap", cwd=tmp_path)
-    assert result.code == 3 and "missing: its end: it breaks off at " in result.out
+    assert result.code == 3
+    assert "missing: its end: it breaks off at " in result.out
 
 
 def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
@@ -83,14 +94,16 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
         ended = snakesim("recording", "export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path)
         assert ended.code == 0, ended.err
     with np.load(tmp_path / "a.npz") as arrays:
-        assert np.array_equal(arrays["angle_rad"], record.angle_rad) and arrays["joints"][0] == "joint_1"
+        assert np.array_equal(arrays["angle_rad"], record.angle_rad)
+        assert arrays["joints"][0] == "joint_1"
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["target.joint_3"]) for row in rows] == record.target[:, 2].tolist()
-    assert [float(row["position_w_m.y"]) for row in rows] == record.position_w[:, 1].tolist()
+    assert [float(row["position_w_m.y"]) for row in rows] == record.position_w_m[:, 1].tolist()
     assert np.array_equal(RunRecord.load(tmp_path / "a.mcap").angle_rad, record.angle_rad)
     again = snakesim("recording", "export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path)
-    assert again.code == 2 and "there is such a file already" in again.err
+    assert again.code == 2
+    assert "there is such a file already" in again.err
 
 
 def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
@@ -103,17 +116,22 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
     assert info.items() >= wanted.items(), info
     n = 200
     episode, second = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [episode[f"dataset_{end}_index"] for end in ("from", "to")] == [0, n] and second["dataset_from_index"] == n
-    assert second["tasks"] == ["clutter"] and second["length"] == n and second["stats/index/min"] == [n]
+    assert [episode[f"dataset_{end}_index"] for end in ("from", "to")] == [0, n]
+    assert second["dataset_from_index"] == n
+    assert second["tasks"] == ["clutter"]
+    assert second["length"] == n
+    assert second["stats/index/min"] == [n]
     at = {"chunk_index": second["data/chunk_index"], "file_index": second["data/file_index"]}
     rows = parquet.read_table(tmp_path / "set" / info["data_path"].format(**at)).to_pydict()
-    assert sorted(rows) == sorted(info["features"]) and rows["index"] == list(range(n, 2 * n))
+    assert sorted(rows) == sorted(info["features"])
+    assert rows["index"] == list(range(n, 2 * n))
     state, names = np.array(rows["observation.state"]), info["features"]["observation.state"]["names"]
     assert info["features"]["observation.state"]["shape"] == [state.shape[1]]
     assert np.allclose(state[:, names.index("angle_rad.joint_5")], record.angle_rad[:, 4], atol=1e-6)
     assert rows["timestamp"][1] == pytest.approx(0.01)
     stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
-    assert sorted(stats) == sorted(info["features"]) and stats["action"]["count"] == [400]
+    assert sorted(stats) == sorted(info["features"])
+    assert stats["action"]["count"] == [400]
     assert np.allclose(stats["observation.state"]["q50"], np.median(state, axis=0), atol=1e-5)
     tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet")  # pandas reads the names as the index
     assert tasks.to_pydict() == {"task_index": [0], "__index_level_0__": ["clutter"]}
@@ -141,5 +159,6 @@ def test_recordings_with_later_message_version_are_decoded_as_stored() -> None:
     later = DecoderFactory().decoder_for(
         "msgpack", Schema(id=1, name="snakesim.Whisker", encoding="jsonschema", data=b"{}")
     )
-    assert later is not None and later(msgspec.msgpack.encode({"bend_rad": 0.1})) == {"bend_rad": 0.1}
+    assert later is not None
+    assert later(msgspec.msgpack.encode({"bend_rad": 0.1})) == {"bend_rad": 0.1}
     assert DecoderFactory().decoder_for("msgpack", None) is None

@@ -33,7 +33,8 @@ def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str
     assert ended.code == 0, ended.said
     replayed = snakesim("replay", "run", "--control", cwd=tmp_path)
     ticks = round(DURATION_S * load(scenario).config.rate_hz)
-    assert replayed.code == 0 and replayed.out == f"{ticks} commands, the same to the bit\n"
+    assert replayed.code == 0
+    assert replayed.out == f"{ticks} commands, the same to the bit\n"
 
 
 def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) -> None:
@@ -41,7 +42,8 @@ def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) 
     assert ended.code == 0, ended.err
     before, again = RunRecord.load(recorded), RunRecord.load(tmp_path / "again" / RECORDING)
     assert again.host.command_digest == before.host.command_digest
-    assert (again.control, again.worlds) == (before.control, before.worlds)
+    assert again.control == before.control
+    assert again.worlds == before.worlds
 
 
 def test_replay_allows_only_last_answer_to_be_missing(recorded: Path) -> None:
@@ -55,15 +57,19 @@ def test_replay_allows_only_last_answer_to_be_missing(recorded: Path) -> None:
 def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None:
     changed = ["--set", "control.propulsion_n=20", "--out", "weaker"]
     ended = snakesim("replay", str(recorded), "--control", *changed, cwd=tmp_path)
-    assert ended.code == 0 and "commands differ, the first answers tick " in ended.out
+    assert ended.code == 0
+    assert "commands differ, the first answers tick " in ended.out
     before, weaker = RunRecord.load(recorded), RunRecord.load(tmp_path / "weaker")
     assert np.array_equal(before.angle_rad, weaker.angle_rad)  # the robot moved as it did
     assert not np.array_equal(before.target, weaker.target)
     compared = snakesim("study", "compare", str(recorded), "weaker", cwd=tmp_path)
-    assert compared.code == 0 and "propulsion_n" in compared.out and "torque target" in compared.out
+    assert compared.code == 0
+    assert "propulsion_n" in compared.out
+    assert "torque target" in compared.out
     assert "B is a replay: its robot moves as in" in compared.out
 
 
 def test_changes_that_need_the_services_are_refused_without_them(recorded: Path, tmp_path: Path) -> None:
     ended = snakesim("replay", str(recorded), "--set", "control.propulsion_n=20", cwd=tmp_path)
-    assert ended.code == 2 and "--set, --controller, --run-recorded-code and --out are for --control" in ended.err
+    assert ended.code == 2
+    assert "--set, --controller, --run-recorded-code and --out are for --control" in ended.err

@@ -61,7 +61,8 @@ def test_one_clear_error_and_nothing_started(folder: Path, wrong: str, messages:
     ended = snakesim(*WRONG[wrong], cwd=folder)
     assert ended.code == 2, ended.out + ended.err
     assert ended.out == ""
-    assert ended.err.startswith("snakesim") and "Traceback" not in ended.err
+    assert ended.err.startswith("snakesim")
+    assert "Traceback" not in ended.err
     assert ended.err.count("\n") == 1 or wrong in HAS_A_LIST, ended.err
     messages.check(ended.err.rstrip("\n"))
     assert list_files(folder) == before

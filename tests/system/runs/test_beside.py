@@ -22,7 +22,8 @@ def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
     arguments = ("triplet", "--duration", "2", "--clock-mode", "lockstep")
     _, apart = command.run_to_summary(tmp_path / "apart", *arguments)
     ended, beside = run_to_summary(tmp_path / "beside", *arguments, *BESIDE)
-    assert ended.code == 0 and beside.command_digest == apart.command_digest
+    assert ended.code == 0
+    assert beside.command_digest == apart.command_digest
 
 
 @pytest.mark.slow  # tests/unit/gnc/test_guarded.py, and a stop while it hangs below

@@ -17,7 +17,8 @@ SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 def test_position_servos_without_measurements_run_undemanding_controllers() -> None:
     sets = ("controller=lateral_undulation", "duration_s=2", *SERVOS)
     result = simulate(load("peg_row", [parse_set(text) for text in sets]).config)
-    assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0.0) > 0.1
+    assert result.summary.ended == "complete"
+    assert (result.summary.path_distance_m or 0.0) > 0.1
     assert not result.record.torque_nm.any(), "what is not measured is not told"
     assert set(result.record.mode.flat) <= {Mode.PASSIVE, Mode.POSITION}
 

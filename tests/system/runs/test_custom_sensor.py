@@ -53,7 +53,9 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
         with snakesim.Robot.connect(started.endpoint) as live:
             wait_until(lambda: live.read(LEFT) is not None, "a whisker")
             bent = live.read(LEFT)
-            assert type(bent).__name__ == "Whisker" and bent.link == 13 and abs(bent.bend_rad) <= bent.bend_max_rad
+            assert type(bent).__name__ == "Whisker"
+            assert bent.link == 13
+            assert abs(bent.bend_rad) <= bent.bend_max_rad
             assert 0 <= live.age_s(bent) < 1.0
             namespace = live.description.robot
         with open_session(Link(endpoint=started.endpoint, namespace=namespace)) as session:
@@ -67,7 +69,10 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             snapshot = watch.take_snapshot()
             assert snapshot is not None
             text = format_sensor_table(snapshot)
-            assert LEFT in text and "Whisker on link 13" in text and "bend_rad" in text and " rad" in text
+            assert LEFT in text
+            assert "Whisker on link 13" in text
+            assert "bend_rad" in text
+            assert " rad" in text
         echoed = started.tell("topic", "echo", LEFT, "--count", "1")
         assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.said
         started.interrupt()  # in order: a killed recorder lacks its last half second, here that is all
@@ -83,12 +88,11 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
         schema, _, _, whisker = next(found.iter_decoded_messages([LEFT]))
         _, _, _, plotted = next(found.iter_decoded_messages([f"/{namespace}/custom/left"]))
     assert plotted["bend_max_rad"] == 1.4
-    assert (
-        schema is not None
-        and schema.name == "snakesim.custom.Whisker"
-        and "bend_rad" in json.loads(schema.data)["properties"]
-    )
-    assert type(whisker).__name__ == "Whisker" and whisker.bend_max_rad == 1.4
+    assert schema is not None
+    assert schema.name == "snakesim.custom.Whisker"
+    assert "bend_rad" in json.loads(schema.data)["properties"]
+    assert type(whisker).__name__ == "Whisker"
+    assert whisker.bend_max_rad == 1.4
 
 
 BENT = "bend_rad=float(np.clip(bend_rad, -upper_rad, upper_rad))"

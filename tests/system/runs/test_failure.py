@@ -38,9 +38,11 @@ def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, c
     last_commanded = int(np.flatnonzero((record.mode == Mode.POSITION).any(axis=1))[-1])
     after = record.mode[last_commanded + 1 :]
     assert len(after) > 50
-    assert (after == Mode.VELOCITY).all() and (record.target[last_commanded + 1 :] == 0).all()  # damped
+    assert (after == Mode.VELOCITY).all()
+    assert (record.target[last_commanded + 1 :] == 0).all()  # damped
     told_later = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
-    assert told_later.code == 1 and "lease of control expired" in told_later.out
+    assert told_later.code == 1
+    assert "lease of control expired" in told_later.out
 
 
 @pytest.mark.slow  # tests/unit/gnc/test_guarded.py has each wrong answer
@@ -64,10 +66,12 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, cloc
         "controller ./wave.py:Wave (class Wave): RequestedSetpoints.mode has 12 values, must have 13: one a joint, "
         "joint_1 to joint_13"
     )
-    assert ended.code == 1 and summary.duration_s < 5.0  # not after the time that a stalled service is given
+    assert ended.code == 1
+    assert summary.duration_s < 5.0  # not after the time that a stalled service is given
     assert summary.ended.startswith(f"control ended with exit code 1: {said}")
     assert f"fault: control ended with exit code 1: {said}" in ended.out
-    assert summary.last_reason is not None and summary.last_reason.startswith(said)
+    assert summary.last_reason is not None
+    assert summary.last_reason.startswith(said)
     assert (tmp_path / "run" / "control.log").read_text().splitlines()[-1].startswith(f"snakesim control: {said}")
 
 

@@ -45,8 +45,10 @@ def test_planned_fault_occurs_at_its_tick_and_ends_run(tmp_path: Path, backend: 
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault)
     record = RunRecord.load(tmp_path / "run").host
     by = 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
-    assert ended.code == 1 and summary.faults[0].what == what
-    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= by
+    assert ended.code == 1
+    assert summary.faults[0].what == what
+    assert record.injected[0].startswith(f"tick 100: {fault} ")
+    assert 100 <= record.faults[0].tick <= by
     assert record.lifecycle == "fault"
 
 
@@ -55,15 +57,19 @@ def test_isolated_joint_is_passive_while_run_continues(tmp_path: Path, backend: 
     flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "1.5", "--set", MAY_LOSE_ONE]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 1.5, ended.out
-    assert summary.isolated == ["joint_5"] and summary.faults[0].joint == "joint_5"
+    assert summary.isolated == ["joint_5"]
+    assert summary.faults[0].joint == "joint_5"
     assert "isolated              joint_5: failed, and passive since" in ended.out
     left = RunRecord.load(tmp_path / "run")
     modes, limits = left.mode, left.torque_limit_nm
     before, after = slice(50, 95), slice(106, 150)
-    assert (modes[before, 4] == Mode.POSITION).all() and (modes[after, 4] == Mode.PASSIVE).all()
-    assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
+    assert (modes[before, 4] == Mode.POSITION).all()
+    assert (modes[after, 4] == Mode.PASSIVE).all()
+    assert (limits[after, 4] == 0.0).all()
+    assert (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
 
 
 def test_the_list_is_there_without_a_robot(tmp_path: Path) -> None:
     ended = snakesim("fault", "list", cwd=tmp_path)
-    assert ended.code == 0 and "undervoltage" in ended.out
+    assert ended.code == 0
+    assert "undervoltage" in ended.out

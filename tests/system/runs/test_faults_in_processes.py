@@ -25,7 +25,8 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str
         tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--clock-mode", clock_mode, *flags
     )
     record = RunRecord.load(tmp_path / "run").host
-    assert ended.code == 0 and record.armed_ticks == 200
+    assert ended.code == 0
+    assert record.armed_ticks == 200
     replayed = record.rejected_commands["replayed"]
     assert replayed == 100 if clock_mode == "lockstep" else 90 <= replayed <= 110
     assert [text.partition(": ")[2] for text in record.injected] == [
@@ -51,26 +52,31 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     ]
     with armed_run(tmp_path / "run", *arguments) as run:
         result = tell(run, "fault", "inject", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
-        assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
+        assert result.code == 1
+        assert f"backend '{backend}' cannot do" in result.err
         result = tell(run, "fault", "inject", "mute", "joint_99")
-        assert result.code == 1 and "no joint_99" in result.err
+        assert result.code == 1
+        assert "no joint_99" in result.err
         result = tell(run, "fault", "inject", "drop", "guidance/world", "--amount", "0.2", "--duration", "0.5")
         assert result.code == 0 and result.out.startswith("drop of guidance/world has begun, at "), result.err
         result = tell(run, "fault", "inject", "mute", "joint_3", "--duration", "30")
         assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), result.err
         assert run.end() == 1
     record = RunRecord.load(tmp_path / "run").host
-    assert record.faults[0].joint in (None, "joint_3") and "joint_3" in record.faults[0].cause
+    assert record.faults[0].joint in (None, "joint_3")
+    assert "joint_3" in record.faults[0].cause
     assert "mute:joint_3@" in record.injected[0]
     said = (tmp_path / "run" / "guidance.log").read_text()
-    assert "drop:guidance/world@" in said and "begins" in said
+    assert "drop:guidance/world@" in said
+    assert "begins" in said
 
 
 @pytest.mark.slow  # a row of the fault table
 def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
     flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
+    assert ended.code == 1
+    assert [fault.what for fault in summary.faults] == ["lease_expired"]
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
 
 
@@ -102,7 +108,8 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
             result = tell(run, "fault", "inject", *words)
-            assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err
+            assert result.code == 1
+            assert "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()
     assert [file.read_text() for file in loaded] == ["", ""], "no process has the code that carries them out"
@@ -110,5 +117,6 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     snakesim("run", *arguments, *allowed, "--endpoint", free_endpoint(), cwd=tmp_path)
     assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
     ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)
-    assert ended.code == 1 and "`faults` are planned, and something real moves here" in ended.out
+    assert ended.code == 1
+    assert "`faults` are planned, and something real moves here" in ended.out
     wait_until(lambda: not list((tmp_path / "other").glob("host.json")), "no record of it")

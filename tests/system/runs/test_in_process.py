@@ -27,7 +27,9 @@ def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
     ended = snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     assert {path.name for path in out.iterdir()} == LEFT | {LOG_FILE}
-    assert "in one process" in ended.out and str(out / REPORT) in ended.out and not ended.err
+    assert "in one process" in ended.out
+    assert str(out / REPORT) in ended.out
+    assert not ended.err
 
 
 FAILING = """
@@ -45,7 +47,8 @@ class Failing(Hold):
 def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(FAILING)
     result = simulate(load("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config)
-    assert "control ended: controller" in result.summary.ended and "no idea" in result.summary.ended
+    assert "control ended: controller" in result.summary.ended
+    assert "no idea" in result.summary.ended
     assert [fault.what for fault in result.summary.faults] == ["service_lost", "lease_expired"]
     assert result.record.host.lifecycle == "fault"
 
@@ -108,7 +111,8 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, 
     assert process.returncode == 130, said
     assert time.monotonic() - began < 30
     if controller == "Endless":
-        assert "The run ended early: interrupted." in said and (tmp_path / "run" / REPORT).is_file()
+        assert "The run ended early: interrupted." in said
+        assert (tmp_path / "run" / REPORT).is_file()
     else:
         assert "had not returned 3 s after it received the signal to stop; its process was killed" in said
 
@@ -128,4 +132,5 @@ def test_in_process_run_with_fault_is_repeatable() -> None:
     config = load("peg_row", [parse_set("duration_s=3"), parse_set('faults=["mute:joint_3@0.5"]')]).config
     first, second = (simulate(config).summary for _ in range(2))
     assert "joint_3" in first.ended
-    assert (first.ticks, first.command_digest) == (second.ticks, second.command_digest)
+    assert first.ticks == second.ticks
+    assert first.command_digest == second.command_digest

@@ -67,7 +67,8 @@ def test_in_process_digest_of_robot_is_unchanged_by_camera(tmp_path: Path) -> No
                 image = client.read(images)
                 if image is not None and clock.newest[keys.depth_key("head")] == clock.tick:
                     read.append((clock.tick, image.tick))
-    assert len(read) == 10 and all(tick == of for tick, of in read)
+    assert len(read) == 10
+    assert all(tick == of for tick, of in read)
 
 
 @pytest.mark.slow

@@ -36,14 +36,17 @@ def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], 
     config = load("peg_row", [parse_set(text) for text in (*HOW, f'mission.map="{map_}"', *more)]).config
     with offer_plugin(SERVICES, "guidance", Deceived if deceived else Guidance):
         result = simulate(config)
-    assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0) > 0.3
+    assert result.summary.ended == "complete"
+    assert (result.summary.path_distance_m or 0) > 0.3
     record, last = result.record, result.record.worlds[-1]
     nodes = record.nodes_w(record.row_at(last.timestamp_ns * 1e-9))
     assert nodes is not None
     truth, along = [placed.obstacle for placed in record.placed], nodes[-1] - nodes[-2]
     found = score(last.obstacles, truth, nodes[-1], float(np.arctan2(along[1], along[0])))
     if map_ == "perceived":
-        assert len(found.position_m) >= 4 and not found.ghosts and not found.misses
+        assert len(found.position_m) >= 4
+        assert not found.ghosts
+        assert not found.misses
         assert np.median(found.position_m) < 0.02
     return record.worlds, config
 
@@ -52,19 +55,22 @@ def test_perceived_map_is_independent_of_scene_file():
     honest, _ = worlds("perceived")
     deceived, _ = worlds("perceived", deceived=True)
     common = min(len(honest), len(deceived))
-    assert common > 20 and honest[1:common] == deceived[1:common]  # how often tick 0 is shown is chance
+    assert common > 20
+    assert honest[1:common] == deceived[1:common]  # how often tick 0 is shown is chance
 
 
 def test_dead_reckoning_localizes_without_pose_sensor() -> None:
     reported, _ = worlds("perceived", "mission.localization=dead_reckoning")
     assert all(world.pose_timestamp_ns is None for world in reported)
     sd_m = reported[-1].base_position_sd_m
-    assert sd_m is not None and 0.0 < sd_m < 0.05
+    assert sd_m is not None
+    assert 0.0 < sd_m < 0.05
 
 
 def test_known_is_what_the_scene_file_says():
     reported, _ = worlds("known", deceived=True)
     obstacles = [o for world in reported for o in world.obstacles]
-    assert obstacles and all(o.name.startswith("lie_") for o in obstacles)
+    assert obstacles
+    assert all(o.name.startswith("lie_") for o in obstacles)
     assert all(o.last_seen_ns is None for o in obstacles)
     assert outline_distance_m(obstacles[0], np.array(LIES[0].position_m)) < 0

@@ -100,9 +100,12 @@ def only_one_is_armed_when_one_is_named(lab: Lab) -> None:
     """A command that names no robot goes to none of two; one that names the wrong robot is refused by the right one."""
     for arguments in (("robot", "arm", "planar13", "sim"), ("robot", "disarm")):
         ended = lab.tell(*arguments)
-        assert ended.code == 1 and "several robots found" in ended.err and "--namespace lab/second" in ended.err
+        assert ended.code == 1
+        assert "several robots found" in ended.err
+        assert "--namespace lab/second" in ended.err
     wrong = lab.tell("robot", "arm", "planar13", "sim", "--namespace", "lab/second")
-    assert wrong.code == 1 and "the robot here is 'mamba', not 'planar13'" in wrong.err
+    assert wrong.code == 1
+    assert "the robot here is 'mamba', not 'planar13'" in wrong.err
     assert lab.tell("robot", "disarm", "--namespace", "la").code == 1
     assert lab.tell("robot", "disarm", "--namespace", "lab*").code == 2
     assert lab.tell("robot", "arm", "planar13", "sim", "--namespace", "lab").code == 0

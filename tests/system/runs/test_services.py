@@ -61,7 +61,8 @@ def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]
     ended, summary = run(home / out, *SHORT, "--set", NAMED)
     assert ended.code == 0, ended.out + ended.err
     recorded = read_recording(home / out / RECORDING, (keys.POSE, keys.WORLD))
-    assert set(range(50)) <= recorded.messages_by_tick[keys.POSE].keys() and recorded.streams[keys.WORLD]
+    assert set(range(50)) <= recorded.messages_by_tick[keys.POSE].keys()
+    assert recorded.streams[keys.WORLD]
     return summary.command_digest
 
 
@@ -86,13 +87,15 @@ def test_a_file_without_that_service_is_refused_before_anything_starts(home: Pat
     name, *words = WRONG[wrong]
     code = f"services.sensor.plugin=./lab/mocap.py:{name}"
     ended = in_process.snakesim("run", *SHORT, "--set", code, "--out", "run", cwd=home)
-    assert ended.code == 2 and not (home / "run").exists()
+    assert ended.code == 2
+    assert not (home / "run").exists()
     assert all(word in ended.err for word in ("./lab/mocap.py", *words)), ended.err
 
 
 def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
     shown = in_process.snakesim("config", "triplet", "--set", NAMED, cwd=home)
-    assert shown.code == 0 and not (home / "lab" / "ran").exists()
+    assert shown.code == 0
+    assert not (home / "lab" / "ran").exists()
     assert "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture" in shown.out
 
 
@@ -144,7 +147,8 @@ def test_malformed_message_is_named_in_log_and_run(home: Path, clock_mode: str, 
     else:
         ended, summary = run_to_summary(home / "run", *code, "--clock-mode", clock_mode)
         log = (home / "run" / "sensor.log").read_text()
-    assert ended.code == 1 and summary.duration_s < 5.0  # it ends at once
+    assert ended.code == 1
+    assert summary.duration_s < 5.0  # it ends at once
     said = re.compile(
         r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*" + re.escape(words)
     )
@@ -158,7 +162,9 @@ def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
     code = [*SHORT, "--set", "services.sensor.plugin=./lab/lost.py:Lost"]
     ended, summary = in_process.run_to_summary(home / "run", *code)
     said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
-    assert ended.code == 1 and said in summary.ended and said in (home / "run" / LOG_FILE).read_text()
+    assert ended.code == 1
+    assert said in summary.ended
+    assert said in (home / "run" / LOG_FILE).read_text()
 
 
 SILENT = """
@@ -178,7 +184,8 @@ def test_run_names_missing_stream_and_stops_after_stated_time(home: Path) -> Non
     given_up = "not ready to arm within 3 s"
     for said in (summary.ended, ended.out):
         assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out
-    assert ended.code == 1 and summary.duration_s == 0.0
+    assert ended.code == 1
+    assert summary.duration_s == 0.0
     alone = in_process.snakesim("run", *flags, "--in-process", "--out", "one", cwd=home)
     assert alone.code != 0 and given_up in alone.err and why in alone.err, alone
 
@@ -198,9 +205,8 @@ def test_control_holds_while_service_repeats_an_old_pose(home: Path) -> None:
     code = ["--set", "services.sensor.plugin=./lab/frozen.py:Frozen", "--duration", "1"]
     ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
     assert ended.code == 0 and summary.pose_from == "sensor", ended.out
-    assert summary.reported_state == "NotLocomoting" and re.search(
-        r"sensor/pose is 0\.\d+ s old", summary.reported_reason or ""
-    )
+    assert summary.reported_state == "NotLocomoting"
+    assert re.search(r"sensor/pose is 0\.\d+ s old", summary.reported_reason or "")
 
 
 def test_pose_service_alone_makes_no_one_wait_for_contacts(home: Path) -> None:

@@ -60,11 +60,14 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
         assert run.end() == 0, run.said()
     nothing_left(out)
     said = run.said()
-    assert "the simulator was reset" in said and "host" in said
+    assert "the simulator was reset" in said
+    assert "host" in said
     assert f"command digest        {plain.command_digest[:16]}" in said
-    assert (out / "recording-1.mcap").is_file() and (out / "blackbox-1.rows").is_file()
+    assert (out / "recording-1.mcap").is_file()
+    assert (out / "blackbox-1.rows").is_file()
     recorded = RunRecord.load(out / "recording.mcap").host
-    assert recorded.command_digest == plain.command_digest and recorded.ticks == 100
+    assert recorded.command_digest == plain.command_digest
+    assert recorded.ticks == 100
     told = snakesim("recording", "info", str(out), cwd=tmp_path)
     assert told.code == 0 and "missing" not in told.out, told.said
     replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)

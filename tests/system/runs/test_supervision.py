@@ -88,14 +88,17 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
             os.kill(run.part("host"), signal.SIGKILL)
             wait_until(lambda: robot.status().lease_epoch > first.lease_epoch + 1, "another host's lease", BACK_S)
             robot.is_ready()
-            assert robot.status().lifecycle == "disarmed" and robot.status().commands_accepted == 0
+            assert robot.status().lifecycle == "disarmed"
+            assert robot.status().commands_accepted == 0
             assert robot.status().tick == 0 or clock_mode == "realtime"
             assert pids(run, *SERVICES) == services  # they found the new host by themselves
             wait_until(lambda: robot.is_commanded(20), "commands to the new host")
         summary = interrupt(run)
-    assert summary.hosts == 2 and [restart.name for restart in summary.restarts] == ["host"]
+    assert summary.hosts == 2
+    assert [restart.name for restart in summary.restarts] == ["host"]
     assert (tmp_path / "run" / "recording-1.mcap").is_file()
-    assert summary.ticks > 0 and "host was ended by SIGKILL; restart in 0.5 s" in run.said()
+    assert summary.ticks > 0
+    assert "host was ended by SIGKILL; restart in 0.5 s" in run.said()
 
 
 def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
@@ -108,14 +111,16 @@ def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -
             wait_until(
                 lambda: "control" in robot.status().alive and robot.status().lease_holder == "control", "control"
             )
-            assert robot.status().lifecycle == "fault" and not robot.tell("arm").ok
+            assert robot.status().lifecycle == "fault"
+            assert not robot.tell("arm").ok
             assert robot.tell("reset").ok
             robot.is_ready()
             robot.arm()
             robot.reaches("armed")
         summary = interrupt(run)
     assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
-    assert summary.ended == "interrupted" and "continue with `snakesim robot reset`" in run.said()
+    assert summary.ended == "interrupted"
+    assert "continue with `snakesim robot reset`" in run.said()
 
 
 @pytest.mark.slow  # a row of the fault table
@@ -128,7 +133,8 @@ def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
             os.kill(run.part("router"), signal.SIGKILL)
             robot.reaches("fault")  # told by the host as soon as there is a router again
             wait_until(lambda: not robot.status().waiting_for, "everybody back", BACK_S)
-            assert robot.status().lifecycle == "fault" and pids(run, "host", *SERVICES) == before
+            assert robot.status().lifecycle == "fault"
+            assert pids(run, "host", *SERVICES) == before
             assert "lease_expired" in [fault.what for fault in robot.status().faults]
             for command in (["robot", "reset"], ["robot", "arm", "planar13", "sim"]):
                 result = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
@@ -143,7 +149,8 @@ def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
 def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
-        assert run.end() == 1 and "guidance was ended by SIGKILL" in run.said()
+        assert run.end() == 1
+        assert "guidance was ended by SIGKILL" in run.said()
 
 
 @pytest.mark.slow  # rows of the fault table

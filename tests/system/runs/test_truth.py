@@ -29,8 +29,10 @@ STILL = (
 def test_silent_standing_controller_does_not_locomote(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(STILL)
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
-    assert ended.code == 0 and summary.locomoting_fraction == 0.0
-    assert (summary.last_state, summary.last_reason) == ("NotLocomoting", "standing still: less than 20 mm in 1 s")
+    assert ended.code == 0
+    assert summary.locomoting_fraction == 0.0
+    assert summary.last_state == "NotLocomoting"
+    assert summary.last_reason == "standing still: less than 20 mm in 1 s"
     assert "locomoting            0 %" in ended.out
     assert "Did not locomote: standing still: less than 20 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
 
@@ -38,10 +40,14 @@ def test_silent_standing_controller_does_not_locomote(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_moving_snake_locomotes_from_first_measured_motion(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
-    assert ended.code == 0 and summary.path_distance_m is not None and summary.path_distance_m > 0.5
-    assert summary.locomoting_fraction is not None and summary.locomoting_fraction > 0.95
+    assert ended.code == 0
+    assert summary.path_distance_m is not None
+    assert summary.path_distance_m > 0.5
+    assert summary.locomoting_fraction is not None
+    assert summary.locomoting_fraction > 0.95
     states = [state.state for state in RunRecord.load(tmp_path / "run").control if state.state != "Idle"]
-    assert states[0] == "NotLocomoting" and states[-1] == "Locomoting"
+    assert states[0] == "NotLocomoting"
+    assert states[-1] == "Locomoting"
 
 
 def test_missing_clock_after_end_of_run_is_ignored(tmp_path: Path) -> None:
@@ -58,4 +64,5 @@ def test_missing_clock_after_end_of_run_is_ignored(tmp_path: Path) -> None:
     recording.write_arrival(reported)  # as control reports it while a host writes a long record
     recording.close({})
     again = summarise(RunRecord.load(tmp_path / "run"), "complete")
-    assert (again.last_state, again.last_reason) == (summary.last_state, summary.last_reason)
+    assert again.last_state == summary.last_state
+    assert again.last_reason == summary.last_reason

@@ -113,6 +113,7 @@ def test_run_states_emulation_at_start_and_end(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", "odrive", "--duration", "0.1")
     assert summary.emulated
     first, second, *others = ended.out.splitlines()
-    assert first.startswith("triplet: planar13") and second == "EMULATED: nothing real moves (backend odrive)"
+    assert first.startswith("triplet: planar13")
+    assert second == "EMULATED: nothing real moves (backend odrive)"
     assert "  EMULATED              nothing real moved (backend odrive)" in others
     assert "EMULATED: nothing real moved" in (tmp_path / "run" / "report.html").read_text()

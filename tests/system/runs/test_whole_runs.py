@@ -17,8 +17,10 @@ from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 def test_the_control_experiment_stays_where_it_is(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--controller", "hold")
     assert ended.code == 0, ended.out + ended.err
-    assert summary.path_distance_m is not None and abs(summary.path_distance_m) < 0.02
-    assert summary.net_displacement_m is not None and summary.net_displacement_m < 0.02
+    assert summary.path_distance_m is not None
+    assert abs(summary.path_distance_m) < 0.02
+    assert summary.net_displacement_m is not None
+    assert summary.net_displacement_m < 0.02
 
 
 @pytest.mark.slow
@@ -58,8 +60,10 @@ def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
     assert (said["locomoting"], said["last state"]) == ("100 % of the time", "Locomoting: moving"), "they are measured"
     assert said["not known"] == UNRECORDED
     compared = snakesim("study", "compare", "told", "untold", cwd=tmp_path)
-    assert "propulsion joints" in compared.out and "nothing that control reported in B was recorded" in compared.out
-    assert "with none" not in compared.out and UNRECORDED in compared.out + compared.err
+    assert "propulsion joints" in compared.out
+    assert "nothing that control reported in B was recorded" in compared.out
+    assert "with none" not in compared.out
+    assert UNRECORDED in compared.out + compared.err
 
 
 def test_run_without_pose_sensor_uses_joints_or_dead_reckoning(
@@ -70,20 +74,24 @@ def test_run_without_pose_sensor_uses_joints_or_dead_reckoning(
     assert ended.code == 0 and summary.pose_from is None, ended.err
     ended, summary = run_to_summary(tmp_path / "pushed", *short)
     assert ended.code == 0 and summary.pose_from == "dead_reckoning" and summary.contacts_from == "sensor", ended.err
-    assert summary.path_distance_m is None and (summary.dead_reckoned_distance_m or 0.0) > 0.03
+    assert summary.path_distance_m is None
+    assert (summary.dead_reckoned_distance_m or 0.0) > 0.03
     wrong = snakesim("run", *short, "--unset", "robot.sensors.contact", "--out", "wrong", cwd=tmp_path)
-    assert wrong.code == 2 and "contact" in wrong.err and not (tmp_path / "wrong").exists()
+    assert wrong.code == 2
+    assert "contact" in wrong.err
+    assert not (tmp_path / "wrong").exists()
 
 
 @pytest.mark.slow
 def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) -> None:
     near = ["--set", "mission.goal.distance_m=0.4", "--duration", "6"]
     ended, _ = run_to_summary(tmp_path / "run", "surveyed_clutter", *near)
-    assert ended.code == 0 and "reached after" in ended.out
+    assert ended.code == 0
+    assert "reached after" in ended.out
     record = RunRecord.load(tmp_path / "run")
     reached_s = next(state.timestamp_ns * 1e-9 for state in record.control if "the goal is reached" in state.reason)
     assert 1.0 < reached_s < 4.0
-    after = record.position_w[record.time_s > reached_s + 0.5, :2]
+    after = record.position_w_m[record.time_s > reached_s + 0.5, :2]
     assert np.ptp(after, axis=0).max() < 0.005
     assert np.abs(record.torque_nm[-1]).max() < 0.5
 
@@ -91,7 +99,10 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
 @pytest.mark.slow
 def test_report_shows_perceived_map_and_paths_beside_truth(tmp_path: Path) -> None:
     film = playback(simulate(load("clutter", [parse_set("duration_s=1")]).config, tmp_path / "run").record)
-    assert film is not None and film.data["maps"] and film.data["paths"]
+    assert film is not None
+    assert film.data["maps"]
+    assert film.data["paths"]
     maps, paths, last = film.data["maps"], film.data["paths"], film.data["frames"][-1]
-    assert len(maps[last[6]]) >= 6 and len(paths[last[7]]) >= 20  # the launch row, and what lies ahead
+    assert len(maps[last[6]]) >= 6
+    assert len(paths[last[7]]) >= 20  # the launch row, and what lies ahead
     assert "as guidance perceived it" in (tmp_path / "run" / "report.html").read_text()

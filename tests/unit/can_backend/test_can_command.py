@@ -35,7 +35,9 @@ def test_load_prints_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
     said = capsys.readouterr().out
     assert "one bus: 13 joints at 100 Hz" in said
     assert "JointState       1300 frames/s x 135 bits (8 bytes) =  17.6 %" in said
-    assert "together 56.7 %" in said and "5.24 of 10.00 ms" in said and "Refused" not in said
+    assert "together 56.7 %" in said
+    assert "5.24 of 10.00 ms" in said
+    assert "Refused" not in said
 
 
 def test_load_says_what_is_refused_and_what_would_fit(capsys: pytest.CaptureFixture[str]) -> None:
@@ -47,7 +49,9 @@ def test_load_takes_the_settings_of_the_backend(capsys: pytest.CaptureFixture[st
     flags = ["--set", 'backend.channels=["can0", "can1"]', "--set", "backend.contact_rate_hz=0"]
     assert run(["drive", "load", "can", "triplet", *flags]) == 0
     said = capsys.readouterr().out
-    assert "can0: 7 joints" in said and "can1: 6 joints" in said and "Contact" not in said
+    assert "can0: 7 joints" in said
+    assert "can1: 6 joints" in said
+    assert "Contact" not in said
     with raises_error(ConfigError, code="config/out-of-range"):
         run(["drive", "load", "can", "triplet", "--set", "backend.imu_rate_hz=-1"])
 
@@ -78,7 +82,8 @@ def test_a_table_of_several_buses_is_of_the_fullest(capsys: pytest.CaptureFixtur
 def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         run(["drive", "load", "can", "triplet", *flags])
-    assert caught.value.code == 2 and flags[1] in capsys.readouterr().err
+    assert caught.value.code == 2
+    assert flags[1] in capsys.readouterr().err
 
 
 # --- dbc ---------------------------------------------------------------------------------------------------
@@ -120,14 +125,23 @@ def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
         heartbeat(62, 1.0),
     )
     assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
-    assert rows[0]["state"] == "fault" and rows[0]["faults"] == "leak+voltage" and rows[0]["uptime"] == "12.3 s"
-    assert (rows[0]["voltage"], rows[0]["motor"], rows[0]["board"]) == ("23.9 V", "41 °C", "33 °C")
-    assert rows[0]["shaft"] == "-1.250 N·m" and rows[0]["emulated"] == "yes" and rows[0]["firmware"] == "1.0"
-    assert rows[2]["state"] == "disarmed" and rows[2]["faults"] == "none"
+    assert rows[0]["state"] == "fault"
+    assert rows[0]["faults"] == "leak+voltage"
+    assert rows[0]["uptime"] == "12.3 s"
+    assert rows[0]["voltage"] == "23.9 V"
+    assert rows[0]["motor"] == "41 °C"
+    assert rows[0]["board"] == "33 °C"
+    assert rows[0]["shaft"] == "-1.250 N·m"
+    assert rows[0]["emulated"] == "yes"
+    assert rows[0]["firmware"] == "1.0"
+    assert rows[2]["state"] == "disarmed"
+    assert rows[2]["faults"] == "none"
     assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
-    assert heard and set(heard) == {make_command(CommandAction.IDENTIFY)}
+    assert heard
+    assert set(heard) == {make_command(CommandAction.IDENTIFY)}
     heading, *lines = align_columns(COLUMNS, rows)
-    assert heading.split() == list(COLUMNS) and len(lines) == 3
+    assert heading.split() == list(COLUMNS)
+    assert len(lines) == 3
 
 
 def test_can_scan_of_minimal_module_invents_no_values() -> None:
@@ -164,7 +178,8 @@ def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(capsys: pytest.Captu
         heard = [bus.recv(0.5)]
         for task in chatter:
             task.stop()
-    assert said_no == 1 and heard[0] is not None
+    assert said_no == 1
+    assert heard[0] is not None
     said = capsys.readouterr().out
     for line in (
         r"virtual:\S+: others use this bus, and nothing was sent; .*--anyway",

@@ -24,7 +24,7 @@ def read(section: dict[str, Any]) -> CanSettings:
         ({"channels": ["can0"], "emulators": "process"}, "process"),
     ],
 )
-def test_where_twins_run(section: dict[str, Any], where: str) -> None:
+def test_can_settings_choose_where_emulators_run(section: dict[str, Any], where: str) -> None:
     assert read(section).emulators_run == where
 
 

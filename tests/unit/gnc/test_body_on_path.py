@@ -18,7 +18,7 @@ BODY = BodyOnPath(ROUTE, SEGMENTS)
 
 
 @given(st.floats(-1.0, 7.0))
-def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
+def test_body_on_path_lies_as_the_start_pose_is_laid(tail_s_m):
     lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.pose_at(tail_s_m)
     assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=5e-3)
     assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=3e-4)
@@ -49,7 +49,7 @@ def test_nodes_are_those_of_the_3d_kinematics():
 
 
 @given(st.floats(-3.1, 3.1))
-def test_heading_of_a_quaternion(yaw_rad):
+def test_heading_is_computed_from_a_quaternion(yaw_rad):
     assert compute_heading_rad(quaternion_from_yaw(yaw_rad)) == pytest.approx(yaw_rad)
 
 
@@ -100,7 +100,8 @@ def test_body_on_path_repeated_pose_is_not_standing_still():
         located = progress.update(
             stage.observe(tick, 0.3 + 0.2 * tick * PERIOD_S, world_tail_s_m=0.3 + 0.2 * 0.58, pose_age_ticks=tick - 58)
         )
-        assert isinstance(located, Located) and located.fresh
+        assert isinstance(located, Located)
+        assert located.fresh
         assert located.speed_m_s == pytest.approx(0.2, abs=0.01)
         assert located.tail_s_m == pytest.approx(0.3 + 0.2 * tick * PERIOD_S, abs=2e-3)
 
@@ -111,8 +112,10 @@ def test_body_on_path_lost_body_is_located_again():
     for tick in range(61, 161):
         progress.update(stage.observe(tick, 0.5, without="world"))
     found = progress.update(stage.observe(161, 0.55))
-    assert isinstance(found, Located) and found.restarted
-    assert found.tail_s_m == pytest.approx(0.55, abs=2e-3) and found.speed_m_s == 0.0
+    assert isinstance(found, Located)
+    assert found.restarted
+    assert found.tail_s_m == pytest.approx(0.55, abs=2e-3)
+    assert found.speed_m_s == 0.0
 
 
 def test_a_new_path_is_noticed():

@@ -22,7 +22,7 @@ def bumpless(mode: Mode, angle, velocity, torque):
 
 
 @given(values, values, values, values)
-def test_it_starts_from_what_the_motors_do(angle, velocity, torque, reference):
+def test_bumpless_starts_from_present_motor_targets(angle, velocity, torque, reference):
     hand_over = HandOver(ROBOT)
     hand_over.start(state(ROBOT, angle, velocity, torque), np.array(reference))
     targets = hand_over.positions_rad(np.array(reference))

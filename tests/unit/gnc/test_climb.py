@@ -31,7 +31,8 @@ def test_a_path_rises_where_it_leads_over_a_platform(yaw_rad: float) -> None:
     first, second = rises.find_rises(1, STRAIGHT)
     half_m = 0.3 / math.cos(yaw_rad)
     assert (first.from_s_m, first.to_s_m) == pytest.approx((1.3 - half_m, 1.3 + half_m), abs=0.011)
-    assert first.height_m == pytest.approx(0.1) and second.from_s_m == pytest.approx(2.9, abs=0.011)
+    assert first.height_m == pytest.approx(0.1)
+    assert second.from_s_m == pytest.approx(2.9, abs=0.011)
     assert rises.find_rises(2, [(0.0, 2.0), (4.0, 2.0)]) == []
 
 
@@ -48,12 +49,13 @@ def test_climb_every_body_part_has_height_of_path(tail_s_m: float) -> None:
     assert np.abs(heights - wanted[:-1]).max() < ABOVE_M
 
 
-def test_who_only_turns_left_and_right_does_not_climb() -> None:
+def test_climb_needs_pitch_joints() -> None:
     assert not Climb(make_robot(13)).angles_rad([RISE], 0.5).any()
 
 
 def test_seen_from_above_a_body_on_a_ramp_is_shorter() -> None:
     segments = [0.1, *[0.2] * 8, 0.1]
     level, climbing = (BodyOnPath(Route(STRAIGHT), segments, rises).pose_at(0.0).nodes_w[0] for rises in ([], [RISE]))
-    assert np.all(level[:4] == climbing[:4]) and level[-1] == pytest.approx(1.8)
+    assert np.all(level[:4] == climbing[:4])
+    assert level[-1] == pytest.approx(1.8)
     assert 0.005 < level[-1] - climbing[-1] < 0.05

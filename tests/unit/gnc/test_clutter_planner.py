@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.geometry.body_on_path import chain_nodes
-from snakesim_gnc.navigation.beam import BeamSearch, PathSearch, SearchedPath
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, ObstacleGrid
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, find_start_pose, load, parse_set, place_obstacles
@@ -86,7 +87,8 @@ def test_planner_path_avoids_obstacles_and_allows_pushing(density: float) -> Non
     obstacles, body = field(density)
     made = ObstacleGrid(obstacles)
     found = path_of(BeamSearch(made, SEARCH).search_ahead(body, 0.0, 60))
-    assert found is not None and len(found.points_w) == 61
+    assert found is not None
+    assert len(found.points_w) == 61
     near = made.find_nearest(found.points_w[1:, 0], found.points_w[1:, 1])
     assert near.distance_m.min() >= SEARCH.radius_m + SEARCH.clearance_m
     assert found.points_w[-1, 0] - found.points_w[0, 0] > 2.0
@@ -137,7 +139,9 @@ def test_a_goal_is_reached() -> None:
     made = planner(obstacles, HeadingGoal(distance_m=0.5))
     assert not planned(made, body).finished
     there = planned(made, body + np.array([0.6, 0.0]), 1.0)
-    assert there.finished and there.speed_m_s == 0.0 and there.reason == "the goal is reached"
+    assert there.finished
+    assert there.speed_m_s == 0.0
+    assert there.reason == "the goal is reached"
     assert planned(made, body + np.array([0.495, 0.0]), 2.0).finished  # noise
     assert not planned(made, body + np.array([0.45, 0.0]), 3.0).finished  # it was measured wrong, or slid back
     head = body[-1]
@@ -154,7 +158,8 @@ def test_planner_requested_heading_overrides_mission(heading_rad: float) -> None
     ahead = planned(made, body)
     moved = body + np.array([0.3, 0.0])
     turned = planned(made, moved, 0.2, heading_rad=heading_rad)
-    assert turned.path_id != ahead.path_id and not turned.finished
+    assert turned.path_id != ahead.path_id
+    assert not turned.finished
     way = np.array(turned.path_w[-1]) - moved[-1]
     reached = np.clip(heading_rad, -1.2, 1.2)  # one path turns the head by no more
     assert np.arctan2(way[1], way[0]) == pytest.approx(reached, abs=0.45)  # as obstacles let it
@@ -180,10 +185,13 @@ def test_planner_follows_old_path_while_work_per_turn_is_bounded() -> None:
     for one in waiting:
         assert one.searching == "the direction has changed"
         assert one.searched_nodes > 0.5 * TURN_S * NODES_PER_S
-        assert (one.path_id, one.speed_m_s, one.push_points) == (0, 0.2, ["peg"])
+        assert one.path_id == 0
+        assert one.speed_m_s == 0.2
+        assert one.push_points == ["peg"]
         assert np.array_equal(one.path_w, route.points_w)
     after = seen[len(waiting) :]
-    assert {one.path_id for one in after} == {1} and after[1].searched_nodes == 0
+    assert {one.path_id for one in after} == {1}
+    assert after[1].searched_nodes == 0
     begin = np.array(after[0].path_w)
     ahead = route.position_w(route.length_m - 6.0 + np.arange(0.02, 0.1, 0.02))
     assert max(np.hypot(*(begin - point).T).min() for point in ahead) < 0.01  # it begins with the path before
@@ -193,7 +201,8 @@ def test_a_plan_is_the_same_in_however_many_slices() -> None:
     obstacles, body = field()
     made = [ClutterPlanner(HeadingGoal(), obstacles, search=SEARCH, turn_s=turn_s) for turn_s in (0.08, 0.5)]
     few, many = (turns(one, body, 40)[-1] for one in made)
-    assert few.path_id == 1 and few.path_w == many.path_w
+    assert few.path_id == 1
+    assert few.path_w == many.path_w
 
 
 def test_nothing_moves_before_the_first_path_is_there() -> None:
@@ -201,10 +210,14 @@ def test_nothing_moves_before_the_first_path_is_there() -> None:
     made = planner(obstacles)
     first = turns(made, body, 1)[0]
     assert not made.ready
-    assert (first.speed_m_s, first.searching) == (0.0, "the first path")
+    assert first.speed_m_s == 0.0
+    assert first.searching == "the first path"
     assert first.reason == "the first path: a path is being searched"
     moving = turns(made, body, 30)[-1]
-    assert made.ready and (moving.speed_m_s, moving.searching, moving.reason) == (0.2, "", "")
+    assert made.ready
+    assert moving.speed_m_s == 0.2
+    assert moving.searching == ""
+    assert moving.reason == ""
 
 
 def test_a_tick_that_is_shown_again_is_one_turn() -> None:
@@ -212,7 +225,8 @@ def test_a_tick_that_is_shown_again_is_one_turn() -> None:
     made, desired = planner(None), DesiredMotion(0.2)
     assert planned(made, body).path_id == 1
     shown = [made.update(400, world(4.0, obstacles), body, desired) for _ in range(20)]
-    assert shown[0].searching == "the map has changed" and shown[-1] == shown[0]
+    assert shown[0].searching == "the map has changed"
+    assert shown[-1] == shown[0]
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,8 @@ def test_contact_estimate_locates_side_and_force_of_accelerating_pushes(side):
     wanted = pushes(turning[0] / (turning[0] - turning[1]))
     sum_n = readings(wanted)[2]
     torques, imu, left_n, left_nm = readings(wanted, acceleration=tuple(sum_n[:2] / MASS_KG))
-    assert np.abs(left_n).max() < 1e-9 and abs(left_nm) < 1e-9
+    assert np.abs(left_n).max() < 1e-9
+    assert abs(left_nm) < 1e-9
     found = estimated(torques, imu)
     for link, side_of_it, along_m, force_n in wanted:
         place_m = STARTS_M[link] + along_m

@@ -49,7 +49,8 @@ def test_contact_search_of_standing_body_ends_with_path_retried() -> None:
     stage, controller = searching(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
     alone = stands(controller, stage, range(300))
     searches = [SEARCHES in command.telemetry.reason for command in alone]
-    assert not any(searches[:115]) and all(searches[125:])
+    assert not any(searches[:115])
+    assert all(searches[125:])
     assert np.ptp(targets(alone[125:])[:, -1]) > 0.5  # of the head
     stage.pegs = make_stage().pegs
     beside = stands(controller, stage, range(300, 400))
@@ -95,7 +96,7 @@ def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
     assert any(SEARCHES in controller.update(observation).telemetry.reason for observation in observations)
 
 
-def test_nobody_searches_when_told_not_to() -> None:
+def test_contact_search_can_be_disabled() -> None:
     stage, never = searching(search_after_s=0.0)
     assert not any(SEARCHES in command.telemetry.reason for command in stands(never, stage, range(500)))
 
@@ -103,7 +104,8 @@ def test_nobody_searches_when_told_not_to() -> None:
 def test_the_wave_is_that_of_the_shipped_policy() -> None:
     stage, passed_s, draw = make_stage(), 2.3, np.random.default_rng(3)
     observation = stage.observe(0, TAIL_S_M)
-    assert observation.world is not None and observation.trajectory is not None
+    assert observation.world is not None
+    assert observation.trajectory is not None
     contacts = [
         make_contact("peg", (3.0, force_n, 4.0), link) for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
     ]
@@ -141,13 +143,15 @@ def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
 
 def test_contact_search_bends_along_same_curve_for_any_joint_spacing() -> None:
     near, apart = felt_by(make_stage(13)), felt_by(make_stage(14, ("yaw", "pitch")))
-    assert apart[::2] == pytest.approx(2.0 * near[::2]) and np.ptp(near) > 0.5
+    assert apart[::2] == pytest.approx(2.0 * near[::2])
+    assert np.ptp(near) > 0.5
     assert not apart[1::2].any()
 
 
 def test_contact_search_scales_torque_by_its_limit() -> None:
     weak, strong = (felt_by(make_stage(torque_nm=limit_nm), 0.2 * limit_nm) for limit_nm in (3.5, 7.0))
-    assert weak == pytest.approx(strong) and weak != pytest.approx(felt_by(make_stage()))
+    assert weak == pytest.approx(strong)
+    assert weak != pytest.approx(felt_by(make_stage()))
 
 
 def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
@@ -160,7 +164,9 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     apart = [
         np.ptp([calm.reference_rad(observation, 0.01), struck.reference_rad(knocked, 0.01)], axis=0) for _ in range(20)
     ]
-    assert np.max(np.diff(apart, axis=0)) < 0.11 and np.max(apart[0]) < 0.11 and np.max(apart[-1]) > 0.3  # rad
+    assert np.max(np.diff(apart, axis=0)) < 0.11
+    assert np.max(apart[0]) < 0.11
+    assert np.max(apart[-1]) > 0.3  # rad
 
 
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])

@@ -33,4 +33,5 @@ def test_it_adds_corrections_to_targets_in_position_mode_alone() -> None:
     added = [
         target - angle for target, angle in zip(command.setpoints.target, observation.joints.angle_rad, strict=True)
     ]
-    assert added == pytest.approx(residual_rad) and command.telemetry.reason == "holding"
+    assert added == pytest.approx(residual_rad)
+    assert command.telemetry.reason == "holding"

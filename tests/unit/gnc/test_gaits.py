@@ -23,14 +23,16 @@ def moved_m(record: RunRecord) -> np.ndarray:
     """Of the middle of the body, x and y; it lies along x at first."""
     rows = np.flatnonzero(record.posed)[[0, -1]]
     first, last = (record.nodes_w(int(row)) for row in rows)
-    assert first is not None and last is not None
+    assert first is not None
+    assert last is not None
     return (last - first).mean(axis=0)[:2]
 
 
 @pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), pytest.param(-0.2, 1.0, marks=pytest.mark.slow)])
 def test_sidewinding_travels_sideways_to_the_requested_side(pitch_rad: float, side: float) -> None:
     along, across = moved_m(on_flat_ground("duration_s=5", f"control.pitch_rad={pitch_rad}").record)
-    assert side * across > 0.8 and abs(along) < 0.6 * abs(across)
+    assert side * across > 0.8
+    assert abs(along) < 0.6 * abs(across)
 
 
 def test_rolling_travels_sideways() -> None:
@@ -61,4 +63,5 @@ def test_gait_of_bent_robot_keeps_shape_and_states_reason(gait: type[Controller[
     commands = [controller.update(stage.observe(tick, 0.3)) for tick in range(200)]
     targets = [command.setpoints.target for command in commands]
     assert all("no joints that turn up and down" in command.telemetry.reason for command in commands)
-    assert np.abs(targets[0]).max() > 0.2 and np.abs(np.array(targets) - targets[0]).max() < 1e-9
+    assert np.abs(targets[0]).max() > 0.2
+    assert np.abs(np.array(targets) - targets[0]).max() < 1e-9

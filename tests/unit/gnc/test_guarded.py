@@ -51,7 +51,7 @@ def made_of(setpoints: Any, telemetry: Any = None) -> ControllerCommand:
     return ControllerCommand(setpoints, telemetry or Telemetry())
 
 
-def test_a_good_answer_passes_as_it_is() -> None:
+def test_guarded_valid_answer_passes_unchanged() -> None:
     for answer in (ControllerCommand(GOOD), points(target=[1, 0.5, -2]), points(mode=list(Mode)[:3])):
         assert update(answer) is answer
 
@@ -84,7 +84,7 @@ def test_a_good_answer_passes_as_it_is() -> None:
         ValueError("no such robot"),
     ],
 )
-def test_a_wrong_one_is_named(answer: Any) -> None:
+def test_guarded_invalid_answer_is_named(answer: Any) -> None:
     with raises_error(ControllerError, code="controller/failed"):
         update(answer)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.push import Touches, find_touches, push_forward
 from snakesim_gnc.geometry.planar import wrenches
-from snakesim_gnc.navigation.margin import MAX_CONTACT_FORCE_N, compute_margins_n
+from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, compute_margins_n
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
@@ -61,7 +61,8 @@ def test_contacts_on_one_side_cannot_push() -> None:
 def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
     push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
-    assert len(touches) >= 3 and push.balanced
+    assert len(touches) >= 3
+    assert push.balanced
     assert push.lambdas.min() >= 0.0
     forces = push.lambdas[:, None] * touches.directions_w
     run = np.diff(nodes, axis=1).T
@@ -86,7 +87,8 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
     pegs = [peg for peg in make_stage().pegs if random.uniform() < 0.6]
     nodes, touches, slope = touching(float(random.uniform(0.0, 2.0)), pegs)
     push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
-    assert (push.lambdas >= 0.0).all() and np.isfinite(push.torques_nm).all()
+    assert (push.lambdas >= 0.0).all()
+    assert np.isfinite(push.torques_nm).all()
     if len(touches) < 3:
         assert not push.balanced
 
@@ -97,7 +99,8 @@ def test_margin_joints_do_not_work_against_each_other(tail_s_m: float) -> None:
     thrifty, smallest = (
         push_forward(nodes, touches, one, contact_gap_scale_m=0.005) for one in (slope, np.zeros_like(slope))
     )
-    assert thrifty.balanced and smallest.balanced
+    assert thrifty.balanced
+    assert smallest.balanced
     done, circled = (np.abs(one.torques_nm * slope).sum() for one in (thrifty, smallest))
     assert done < 0.9 * circled
     assert done < 1.5  # J per metre and newton; by virtual work 1 is the least
@@ -111,5 +114,6 @@ def test_margin_contacts_with_extra_cost_leave_push_to_others(tail_s_m: float) -
     dearer[three] = 0.0
     push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005, extra_cost=dearer)
     usual = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
-    assert push.rest < 0.1 and np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
+    assert push.rest < 0.1
+    assert np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
     assert len(touches) == 3 or np.delete(usual.lambdas, three).sum() > np.delete(push.lambdas, three).sum()

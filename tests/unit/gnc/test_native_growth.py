@@ -1,4 +1,4 @@
-"""The path search in C gives the paths of its specification in Python, to the last bit."""
+"""The path search in C gives the grids and paths of its specification in Python, to the last bit."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.geometry.planar import space_evenly
-from snakesim_gnc.navigation import native_growth
-from snakesim_gnc.navigation.beam import BeamSearch, PathSearch
-from snakesim_gnc.navigation.native_growth import NativeGrowth, NativeGrowthError, is_native_available
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_growth import SearchedPath, SearchTask, SpecifiedGrowth
-from snakesim_gnc.navigation.search_nodes import NodeLayer, make_start_nodes
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
+from snakesim_gnc.navigation.path_search.native_library import NativeGrowthError, is_native_available, load_library
+from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
+from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
+from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_native import load
@@ -173,9 +174,21 @@ def test_no_more_layers_than_there_is_room_for() -> None:
 def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Switch the C libraries off."""
     monkeypatch.setenv(load.SWITCH, load.OFF)
-    native_growth.load_library.cache_clear()
+    load_library.cache_clear()
     yield
-    native_growth.load_library.cache_clear()
+    load_library.cache_clear()
+
+
+@needs_library
+def test_the_grid_of_obstacles_is_the_same_without_the_library(request: pytest.FixtureRequest) -> None:
+    random = np.random.default_rng(5)
+    obstacles = make_obstacles(random, make_body(random))
+    native = ObstacleGrid(obstacles)
+    request.getfixturevalue("no_library")
+    specified = ObstacleGrid(obstacles)
+    assert native.cell_nearest.tobytes() == specified.cell_nearest.tobytes()
+    assert native.cell_distance_m.tobytes() == specified.cell_distance_m.tobytes()
+    assert len(np.unique(native.cell_nearest)) > len(obstacles) // 2
 
 
 @pytest.mark.usefixtures("no_library")

@@ -34,16 +34,22 @@ def test_trajectory_age_is_that_of_its_world_model() -> None:
     planner = KnownPath(ROUTE, [PEG], 0.15)
     blind = planner.update(0, None, MISSION)
     assert blind.assumed_obstacle_friction == 0.15
-    assert blind.timestamp_ns is None and blind.push_points == [] and not blind.finished
+    assert blind.timestamp_ns is None
+    assert blind.push_points == []
+    assert not blind.finished
     seen = planner.update(20, world(0.5, timestamp_ns=18 * 10**7), MISSION)
-    assert (seen.tick, seen.timestamp_ns, seen.push_points) == (20, 18 * 10**7, ["peg"])
+    assert seen.tick == 20
+    assert seen.timestamp_ns == 18 * 10**7
+    assert seen.push_points == ["peg"]
     again = planner.update(40, world(0.5, timestamp_ns=18 * 10**7), MISSION)
     assert again.timestamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
 
 
-def test_the_path_ends() -> None:
+def test_navigation_stops_at_the_end_of_path() -> None:
     there = KnownPath(ROUTE, []).update(0, world(10.0), MISSION)
-    assert there.finished and there.speed_m_s == 0.0 and there.reason == "the path is finished"
+    assert there.finished
+    assert there.speed_m_s == 0.0
+    assert there.reason == "the path is finished"
 
 
 def test_intent_expires_after_its_validity_and_robot_stops() -> None:
@@ -53,20 +59,24 @@ def test_intent_expires_after_its_validity_and_robot_stops() -> None:
     assert desired(intents, asked, 1.2) == (0.1, "as ann wants it")
     assert desired(intents, asked, 2.0) == (0.1, "as ann wants it")
     speed, why = desired(intents, asked, 2.2)
-    assert speed == 0.0 and why.startswith("the intent of ann has expired: it is 1.2 s old, valid for 1 s")
+    assert speed == 0.0
+    assert why.startswith("the intent of ann has expired: it is 1.2 s old, valid for 1 s")
     speed, why = desired(intents, None, 60.0)  # it does not go back to its mission
-    assert speed == 0.0 and "send a new one to go on" in why
+    assert speed == 0.0
+    assert "send a new one to go on" in why
     assert desired(intents, intent(60.0, requester="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
     assert desired(intents, intent(60.2, go=False), 60.3) == (0.0, "ann wants it to stop")
 
 
 def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> None:
     intents, brief = Intents(MISSION_M_S), intent(0.0, valid_for_ns=SECOND // 2)
-    assert desired(intents, brief, 0.5)[0] == 0.1 and desired(intents, brief, 0.6)[0] == 0.0
+    assert desired(intents, brief, 0.5)[0] == 0.1
+    assert desired(intents, brief, 0.6)[0] == 0.0
     intents, endless = Intents(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
     assert desired(intents, endless, LONGEST_NS / SECOND)[0] == 0.1
     speed, why = desired(intents, endless, LONGEST_NS / SECOND + 0.1)
-    assert speed == 0.0 and "valid for 5 s" in why
+    assert speed == 0.0
+    assert "valid for 5 s" in why
 
 
 @pytest.mark.parametrize(
@@ -75,7 +85,8 @@ def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> Non
 def test_intent_with_future_or_old_timestamp_is_refused(at_s: float, words: str) -> None:
     intents = Intents(MISSION_M_S)
     speed, why = desired(intents, intent(at_s), 10.0)
-    assert speed == MISSION_M_S and words in why  # nobody has taken over from the mission
+    assert speed == MISSION_M_S
+    assert words in why  # nobody has taken over from the mission
     good = intent(10.0)
     assert desired(intents, good, 10.1)[0] == 0.1
     assert desired(intents, intent(at_s, speed_m_s=5.0), 10.2) == (0.1, "as ann wants it")  # the good one goes on
@@ -87,16 +98,18 @@ def test_a_clock_that_the_sender_heard_first_is_no_future() -> None:
 
 
 @pytest.mark.parametrize("speed_m_s", [10.1, -11.0, 1e5])
-def test_nobody_goes_faster_than_a_mission_may(speed_m_s: float) -> None:
+def test_navigation_intent_speed_is_limited_by_mission(speed_m_s: float) -> None:
     speed, why = desired(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
-    assert speed == MISSION_M_S and f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
+    assert speed == MISSION_M_S
+    assert f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
 
 
 def test_intent_direction_holds_while_standing_until_mission_resumes() -> None:
     intents = Intents(MISSION_M_S)
     assert intents.desired(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
     expired = intents.desired(None, 2 * SECOND)
-    assert (expired.speed_m_s, expired.heading_w_rad) == (0.0, 1.5)  # it stops on the path that it is on
+    assert expired.speed_m_s == 0.0
+    assert expired.heading_w_rad == 1.5  # it stops on the path that it is on
     assert intents.desired(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
     assert intents.desired(intent(2.2), 2_200_000_000).heading_w_rad is None
 
@@ -106,7 +119,8 @@ def test_intent_before_a_robot_restart_is_ignored_afterwards() -> None:
     assert desired(intents, asked, 50.1)[0] == 0.1
     intents.start_over()
     speed, why = desired(intents, None, 0.0)
-    assert speed == 0.0 and "the intent of ann was for another start of the robot" in why
+    assert speed == 0.0
+    assert "the intent of ann was for another start of the robot" in why
     assert desired(intents, None, 50.1)[0] == 0.0
     fresh = Intents(MISSION_M_S)
     fresh.start_over()

@@ -130,7 +130,7 @@ def test_triplet_hand_over_to_same_joint_keeps_torque_continuous():
     assert np.abs(np.diff(torques)).max() < 0.1 * abs(torques[-1] - torques[0])
 
 
-def test_nobody_wants_to_move():
+def test_triplet_without_requested_speed_does_not_push():
     stage = make_stage()
     controller = make_controller(stage)
     assert torque_joints(stay(controller, stage, 10))
@@ -162,7 +162,8 @@ def test_triplet_standing_still_is_reported_and_jam_released():
             jams.append(report.reason)
             pushed += report.propulsion_joint is not None
             released += report.propulsion_joint is None
-    assert jams[0].startswith("jammed: standing still") and jams[0].endswith("peg_2 most")
+    assert jams[0].startswith("jammed: standing still")
+    assert jams[0].endswith("peg_2 most")
     assert pushed
     assert released
     moved = stay(controller, stage, 3)

@@ -156,7 +156,8 @@ def test_points_become_choices_with_a_joint_each():
     found, refused = triplets.find_choices(points, lie.nodes_w, NODE_S, None, None)
     threes = [[int(name[-1]) for name in c.triplet.names] for c in found]
     assert threes == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
-    assert len(refused) == 1 and "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refused[0]
+    assert len(refused) == 1
+    assert "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refused[0]
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9

@@ -69,7 +69,8 @@ def cause(**more):
 
 def test_stall_contacts_that_carry_load_are_no_jam():
     stall = cause()
-    assert not stall.jammed and not stall.release_triplet
+    assert not stall.jammed
+    assert not stall.release_triplet
     assert stall.reason == (
         "standing still with 30.0 N of propulsion; contacts push it on with 29.5 N, too little against the friction of "
         "the ground; raise propulsion_n"
@@ -86,12 +87,15 @@ def test_a_push_point_that_is_not_felt_is_named():
 @pytest.mark.parametrize("desired_n", [8.0, 35.0, 300.0])
 def test_a_body_that_touches_nothing_is_not_jammed(desired_n, saturated):
     stall = cause(desired_n=desired_n, net_force=along(), weight_n=40.0, saturated=saturated)
-    assert not stall.jammed and not stall.release_triplet and "no obstacle touches the body" in stall.reason
+    assert not stall.jammed
+    assert not stall.release_triplet
+    assert "no obstacle touches the body" in stall.reason
 
 
 def test_without_a_sensor_of_contacts_the_cause_is_unknown():
     stall = cause(net_force=None, weight_n=40.0)
-    assert not stall.jammed and stall.release_triplet
+    assert not stall.jammed
+    assert stall.release_triplet
     assert stall.reason.endswith("what holds it is unknown without a sensor of contacts")
 
 
@@ -119,8 +123,10 @@ def test_a_jam_is_what_obstacles_hold_back():
 )
 def test_stall_straining_body_that_stands_is_released_without_jam(given, words):
     stall = cause(**given)
-    assert stall.release_triplet and not stall.jammed
-    assert words in stall.reason and not stall.reason.startswith("jam")
+    assert stall.release_triplet
+    assert not stall.jammed
+    assert words in stall.reason
+    assert not stall.reason.startswith("jam")
 
 
 def test_forces_are_judged_as_means_over_50_ms():
@@ -128,11 +134,13 @@ def test_forces_are_judged_as_means_over_50_ms():
     for turn in range(9):
         felt.add_world(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
     net_force = known(felt.resolve_along((1.0, 0.0)))
-    assert net_force.strongest_n == pytest.approx(10.0) and net_force.ahead_n == pytest.approx(10.0)
+    assert net_force.strongest_n == pytest.approx(10.0)
+    assert net_force.ahead_n == pytest.approx(10.0)
 
 
 def test_estimated_contacts_are_no_measured_forces():
     felt, world = MeasuredContacts(), world_with(*PUSHED)
     felt.add_world(world)
     felt.add_world(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
-    assert felt.resolve_along((1.0, 0.0)) is None and felt.mean_sizes_n(["peg_1"]) == []
+    assert felt.resolve_along((1.0, 0.0)) is None
+    assert felt.mean_sizes_n(["peg_1"]) == []

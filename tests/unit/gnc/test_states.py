@@ -29,7 +29,7 @@ READY = {"usable_push_points": 3, "advanced_m": 0.1}
         ({"silent": "no clock from the HAL for 1 s"}, "PowerOff", "no clock from the HAL for 1 s"),
     ],
 )
-def test_state_and_reason(change, state, word):
+def test_states_have_a_reason(change, state, word):
     found, reason = locomotion_state(**{**READY, **change})
     assert found == state
     assert word in reason
@@ -60,7 +60,8 @@ def test_a_body_that_stops_stands_still_a_second_later():
     for tick in range(300):
         advance.add(tick * 0.02, (0.1 * min(tick * 0.02, 2.0), 0.0, 0.0))
         if tick * 0.02 > 3.4:
-            assert advance.distance_m is not None and advance.distance_m < 0.005
+            assert advance.distance_m is not None
+            assert advance.distance_m < 0.005
 
 
 def test_states_are_unknown_before_first_sample_and_after_a_gap():

@@ -172,10 +172,11 @@ def test_normals_that_decide_nothing_are_refused_as_ill_conditioned(case):
     assert not solved.feasible
     assert "ill-conditioned" in solved.reason
     assert solved.condition > 100
-    assert np.isnan(solved.forces_n).all() and np.isnan(solved.torque_nm)
+    assert np.isnan(solved.forces_n).all()
+    assert np.isnan(solved.torque_nm)
 
 
-def test_conditioning_is_a_choice():
+def test_statics_conditioning_limit_can_be_set():
     case = at_inflections(np.radians(1.0))
     assert case.solve(condition_max=1e3).feasible
     assert not case.solve(condition_max=10).feasible
@@ -208,7 +209,7 @@ def test_coinciding_contacts_are_refused():
         *(("propulsion_n", no_push) for no_push in (0.0, -1.0, np.nan, np.inf)),
     ],
 )
-def test_what_is_no_triplet_is_an_error(name, value):
+def test_statics_without_three_contacts_is_an_error(name, value):
     case = at_inflections(0.3)
     arguments = {
         "points_w": case.points,

@@ -50,7 +50,8 @@ def test_undulation_standing_body_is_pushed_harder_up_to_limit() -> None:
     first, *_, last = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(400)]
     pushed = np.abs(np.array(last.setpoints.target) - first.setpoints.target)
     assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
-    assert last.telemetry.propulsion_n is not None and first.telemetry.propulsion_n is not None
+    assert last.telemetry.propulsion_n is not None
+    assert first.telemetry.propulsion_n is not None
     assert last.telemetry.propulsion_n > first.telemetry.propulsion_n
 
 
@@ -66,7 +67,8 @@ def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
 def test_a_scaled_push_is_turned_round() -> None:
     still = pushed(0.0)
     forward, back = (pushed(scale)[-1] - still[-1] for scale in (1.0, -1.0))
-    assert forward @ back < 0 and np.abs(still[-1] - still[0]).max() < 1e-6
+    assert forward @ back < 0
+    assert np.abs(still[-1] - still[0]).max() < 1e-6
 
 
 def test_undulation_push_uses_friction_of_the_planned_path() -> None:

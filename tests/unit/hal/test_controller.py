@@ -45,9 +45,11 @@ class Gained(Plain):
 def test_a_subclass_with_update_alone_has_all_defaults() -> None:
     robot = description()
     plain = Plain(robot, NoParameters())
-    assert plain.robot is robot and plain.parameters == NoParameters()
+    assert plain.robot is robot
+    assert plain.parameters == NoParameters()
     assert (plain.needs_world, plain.uses_sensors) == (True, False)
-    assert (plain.required_modes, plain.required_measurements) == ((), ())
+    assert plain.required_modes == (())
+    assert plain.required_measurements == (())
     assert decode_parameters(Plain, {}, "a.toml", "controllers.plain") == Plain.Parameters()
     Plain.check(robot, NoParameters())
     command = plain.update(Observation(0, 0.0, 0.01, state(robot), None, None))
@@ -132,7 +134,8 @@ def test_controller_preflight_refuses_other_classes_with_instructions(wrong: str
     config = load("triplet", [parse_set(f"controller={file}:Wave")]).config
     with pytest.raises(ConfigError, match=re.escape(words.format(file=file))) as caught:
         check_plugins(config)
-    assert str(caught.value).startswith("controller '") and "snakesim_hal.controller" in str(caught.value)
+    assert str(caught.value).startswith("controller '")
+    assert "snakesim_hal.controller" in str(caught.value)
 
 
 def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:

@@ -49,15 +49,15 @@ def injections(draw: st.DrawFn) -> Injection:
 def test_texts_go_both_ways(injection: Injection) -> None:
     there = parse_injection(str(injection))
     assert str(there) == str(injection)
-    assert (there.kind, there.target, there.part) == (injection.kind, injection.target, injection.part)
+    assert there.kind == injection.kind
+    assert there.target == injection.target
+    assert there.part == injection.part
     assert there.about is KINDS[there.target_type][there.kind]
 
 
 def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
-    assert (
-        parse_injection("drop:sensor/joints@1").amount == 1.0
-        and parse_injection("delay:sensor/joints@1").amount == 0.05
-    )
+    assert parse_injection("drop:sensor/joints@1").amount == 1.0
+    assert parse_injection("delay:sensor/joints@1").amount == 0.05
     assert parse_injection("mute:joint_2@1").amount is None
 
 
@@ -114,7 +114,9 @@ def test_injection_plan_yields_each_change_once_in_time_order(given_: list[Injec
 def test_help_explains_every_kind() -> None:
     for kinds in KINDS.values():
         for name, kind in kinds.items():
-            assert name in kinds_in_short() and name in explain_kinds() and kind.description in explain_kinds()
+            assert name in kinds_in_short()
+            assert name in explain_kinds()
+            assert kind.description in explain_kinds()
 
 
 def test_the_page_has_every_kind() -> None:

@@ -36,9 +36,11 @@ def test_service_waits_for_the_joints_before_it_answers_ticks() -> None:
     loop.join()
     entries = hal.latched_reader(keys.PROCESS_ALL, Process)
     loop.act()
-    assert done.drain() == [] and entries.drain()[-1].waits_for == [keys.JOINTS]
+    assert done.drain() == []
+    assert entries.drain()[-1].waits_for == [keys.JOINTS]
     felt.put(state(ROBOT, 0.1, tick=CLOCK.tick))
     clocks.put(CLOCK)
     loop.act()
-    assert [one.tick for one in done.drain()] == [CLOCK.tick] and entries.drain()[-1].waits_for == []
+    assert [one.tick for one in done.drain()] == [CLOCK.tick]
+    assert entries.drain()[-1].waits_for == []
     loop.close()

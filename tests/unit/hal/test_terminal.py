@@ -31,10 +31,11 @@ def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
 def test_a_json_text_that_is_printed_stays_one(text: str) -> None:
     value = {text: [text]}
     shown = escape_invisible(json.dumps(value, ensure_ascii=False))
-    assert json.loads(shown) == value and "\n" not in shown
+    assert json.loads(shown) == value
+    assert "\n" not in shown
 
 
-def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
+def test_terminal_output_has_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
     print_line("\x1b]0;title\x07")
     report_error(ConfigError("a.toml: \x9b2J\n  next: trust me", "second line"), "snakesim")
     assert overwrite_line("tick 10 \x1b[1A and much more", 24, 3) == 24
@@ -43,7 +44,7 @@ def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
     assert err == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me [config/invalid-value]\nsecond line\n"
 
 
-def test_nothing_else_prints() -> None:
+def test_terminal_streams_are_never_written_directly() -> None:
     """`make check` refuses `print`; nor does anything write to the streams directly."""
     for package in REPOSITORY.glob("snakesim*"):
         for path in package.rglob("*.py"):

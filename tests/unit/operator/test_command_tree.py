@@ -45,7 +45,7 @@ TREE = make_parser()
 LEAVES = {name_of(leaf): leaf for leaf in walk(TREE)}
 
 
-def test_there_are_few_words_to_begin_with() -> None:
+def test_command_tree_has_few_top_level_words() -> None:
     assert len(TREE.commands.choices) <= MAX_COMMANDS
     listed = [action.dest for _, actions in TREE.commands_by_heading() for action in actions]
     assert sorted(listed) == sorted(TREE.commands.choices), "each has a heading"
@@ -54,7 +54,9 @@ def test_there_are_few_words_to_begin_with() -> None:
 @pytest.mark.parametrize("name", LEAVES)
 def test_each_command_has_help_and_two_examples_that_parse(name: str) -> None:
     leaf = LEAVES[name]
-    assert leaf.description and leaf.description.endswith(".") and leaf.epilog
+    assert leaf.description
+    assert leaf.description.endswith(".")
+    assert leaf.epilog
     _, _, examples = leaf.epilog.rpartition("examples:\n")
     lines = [line.strip() for line in examples.splitlines()]
     assert len(lines) == 2 and len(set(lines)) == 2, lines
@@ -94,7 +96,7 @@ def test_messages_and_pages_name_commands_that_exist() -> None:
         assert TREE.has_command(words.split()) or words in {*TREE.commands.choices, "robot calibrate"}, words
 
 
-def test_the_reference_is_current() -> None:
+def test_command_reference_page_is_current() -> None:
     assert PAGE.read_text(encoding="utf-8") == make_page(), "run `make schemas`"
 
 
@@ -131,4 +133,5 @@ def test_command_without_noun_is_reported_and_others_work(
         parser = MainParser()
         parser.add_installed()
     assert "no Noun 'arm_rest' is registered" in capsys.readouterr().err
-    assert isinstance(parser, CommandParser) and parser.has_command(["robot", "check"])
+    assert isinstance(parser, CommandParser)
+    assert parser.has_command(["robot", "check"])

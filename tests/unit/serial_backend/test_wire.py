@@ -27,12 +27,14 @@ def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -
             SerialWire(pty.path, 1_000_000)
         wire.send(b"first?")
         pty.send(b"late")
-        assert wire.receive(1.0) == b"late" and wire.receive(0.0) == b""
+        assert wire.receive(1.0) == b"late"
+        assert wire.receive(0.0) == b""
         pty.send(b"later")
         assert wire.receive(1.0) == b"later"
         wire.cut(begins=True)
         wire.send(b"lost")
-        assert wire.error() == "it is cut" and wire.receive(0.0) == b""
+        assert wire.error() == "it is cut"
+        assert wire.receive(0.0) == b""
         wire.cut(begins=False)
         assert wire.error() == ""
         pty.expected_bytes = len(b"first?")

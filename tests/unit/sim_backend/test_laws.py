@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from mujoco import batch
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
@@ -22,6 +23,8 @@ from snakesim_testing.sim.simulator_rig import make_config
 
 STATES = 100  # in each scene
 MANY_STATES = 2000  # in each scene: ten thousand together
+BATCH_SIZE = 9
+BATCH_STEPS = 20
 STEPS_PER_STATE = 2  # the second begins with the memory that the first has left
 
 PEGS = [
@@ -170,3 +173,24 @@ def test_a_plain_mujoco_program_begins_with_feet_that_stick_where_they_are() -> 
     simulation.data.qpos[2] = 0.99 * simulation.data.qpos[2]
     mujoco.mj_step(simulation.model, simulation.data)
     assert np.abs(simulation.data.qvel[:2]).max() < 1e-6
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_a_batch_computes_the_bits_of_single_simulations_on_any_number_of_threads(threads: int) -> None:
+    config = make_config(scene=SCENES["obstacles that move"])
+    single = Simulation(config, "c")
+    simulations = batch.Batch(single.model, nsim=BATCH_SIZE, nthread=threads)
+    random = np.random.default_rng(11)
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(single.model, kind))
+    expected: list[bytes] = []
+    for row in range(BATCH_SIZE):
+        single.go(State(single.model, random), 0.0)
+        mujoco.mj_getState(single.model, single.data, state, kind)
+        simulations.state[row] = state
+        single.physics.step(BATCH_STEPS)
+        mujoco.mj_getState(single.model, single.data, state, kind)
+        expected.append(state.tobytes())
+    simulations.step(nstep=BATCH_STEPS // 2)
+    simulations.step(nstep=BATCH_STEPS - BATCH_STEPS // 2)
+    assert [row.tobytes() for row in simulations.state] == expected

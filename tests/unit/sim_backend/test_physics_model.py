@@ -108,7 +108,7 @@ class Firmware:
     ],
     ids=["flat", "triplet", "hills_mamba"],
 )
-def test_it_starts_as_the_simulated_robot_does(config):
+def test_physics_model_starts_like_the_simulator(config):
     physics_model, state = make_physics_model(config), Run(config).sim.true_state()
     pose = physics_model.pose()
     assert physics_model.angle_rad == pytest.approx(state.angles_rad, abs=1e-4)
@@ -119,7 +119,7 @@ def test_it_starts_as_the_simulated_robot_does(config):
     assert physics_model.data.time == 0.0
 
 
-def test_without_torque_it_stays_where_it_lies():
+def test_physics_model_without_torque_stays_at_rest():
     physics_model: PhysicsModel = make_physics_model(load("triplet").config)
     angles, before = physics_model.angle_rad.copy(), physics_model.pose()
     pass_time(physics_model, seconds=1.0)
@@ -129,7 +129,10 @@ def test_without_torque_it_stays_where_it_lies():
     assert physics_model.angle_rad == pytest.approx(angles, abs=1e-4)
     assert after.position_w == pytest.approx(before.position_w, abs=1e-4)
     assert np.abs(physics_model.velocity_rad_s).max() < 1e-4
-    assert (before.tick, before.timestamp_ns, after.tick, after.timestamp_ns) == (0, 0, 0, 10**9)
+    assert before.tick == 0
+    assert before.timestamp_ns == 0
+    assert after.tick == 0
+    assert after.timestamp_ns == 10**9
 
 
 # --- torques ------------------------------------------------------------------------------------------------------
@@ -217,7 +220,8 @@ def test_contact_forces_without_contact_or_imus_are_zero():
     physics_model = make_physics_model(make_config({"sensors!": {"joints": {}}}))
     assert physics_model.loads() == []
     pass_time(physics_model)
-    assert physics_model.loads() == [] and physics_model.imu() is None
+    assert physics_model.loads() == []
+    assert physics_model.imu() is None
 
 
 def test_motor_between_three_pegs_measures_their_moment():
@@ -230,7 +234,9 @@ def test_motor_between_three_pegs_measures_their_moment():
     for k in range(500):
         firmware.drive(physics_model, np.array([0.0, 0.0, -min(k * 1e-4, 0.03), 0.0, 0.0, 0.0]))
     tail, middle, head = physics_model.loads()
-    assert (tail.link, middle.link, head.link) == (0, 2, 6)
+    assert tail.link == 0
+    assert middle.link == 2
+    assert head.link == 6
     assert middle.force_l[1] < -1.0 < 1.0 < min(tail.force_l[1], head.force_l[1])
     assert tail.position_l[1] < 0.0 < middle.position_l[1]
     assert np.abs(physics_model.velocity_rad_s).max() < 0.02  # it is being squeezed out forwards, slowly
@@ -311,7 +317,7 @@ def test_the_pose_is_true_and_of_now():
 # --- the rest -----------------------------------------------------------------------------------------------------
 
 
-def test_a_tether_tows_it():
+def test_physics_model_is_towed_by_a_tether():
     physics_model = make_physics_model(
         make_config(FOUR), tether=Tether(link=4, direction_w=(1.0, 0.0), reel_in_m_s=0.1)
     )

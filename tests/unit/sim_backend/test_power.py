@@ -25,9 +25,11 @@ def test_power_sample_keeps_its_rate_and_starts_at_ambient():
     sensor = SensorDescription(key=keys.POWER, rate_hz=5.0, delay_s=0.0)
     assert sensor in run.sim.describe().sensors
     power = run.sensed(Power)
-    assert power.motor_c == power.board_c == [20.0] * run.count and power.voltage_v == [24.0] * run.count
+    assert power.motor_c == power.board_c == [20.0] * run.count
+    assert power.voltage_v == [24.0] * run.count
     assert power.current_a == pytest.approx([0.05] * run.count)
-    assert power.valid == [True] * run.count and power.leak == [False] * run.count
+    assert power.valid == [True] * run.count
+    assert power.leak == [False] * run.count
     due: list[int] = []
     for _ in range(40):
         run.go()
@@ -44,7 +46,8 @@ def test_a_motor_that_works_gets_warm_and_takes_current():
     power = run.sensed(Power)
     # The joint turns to its stop and pushes; 3.5 of 7 N·m settle at 80 °C, by a time constant of a minute.
     assert power.motor_c[0] == pytest.approx(20 + 60 * (1 - 2.718 ** (-6 / 60)), abs=0.6)
-    assert power.motor_c[-1] < 20.5 and power.current_a[0] > 0.4 > power.current_a[-1]
+    assert power.motor_c[-1] < 20.5
+    assert power.current_a[0] > 0.4 > power.current_a[-1]
 
 
 def test_heat_on_request_goes_away_by_itself_or_is_held():

@@ -80,7 +80,7 @@ def test_on_uneven_ground_it_rests_where_it_was_put(robot):
     assert deepest_m(run) < 2e-3
 
 
-def test_it_lies_half_on_a_step_without_sinking_in():
+def test_start_half_on_a_step_does_not_sink_in():
     step = {"step": [{"position_m": [1.2, 0.0], "size_m": [1.2, 1.0], "height_m": 0.06}]}
     run = Run(make_config(scene={**step, **CURVE}, base_robot="mamba", start={"on_route": True}))
     stays(run, within_m=0.01)

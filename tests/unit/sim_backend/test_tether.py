@@ -19,14 +19,14 @@ def pulled(force, tether=BACKWARD):
     return run
 
 
-def test_the_tension_is_the_pull():
+def test_tether_tension_equals_the_pull():
     run = pulled([12.0, 0.0, 0.0])
     run.go(1.0)
     assert run.sim.tether_tension_n == pytest.approx(12.0, rel=0.01)
     assert abs(run.sim.true_state().base_position_w[0]) < 1e-3
 
 
-def test_it_does_not_hold_along_its_own_pull():
+def test_tether_does_not_hold_along_its_pull():
     run = pulled([-1.0, 0.0, 0.0])
     run.go(1.0)
     assert run.sim.tether_tension_n == pytest.approx(0.0, abs=1e-9)
@@ -44,13 +44,13 @@ def test_tether_hardly_holds_sideways_and_has_tension_only_if_present():
     assert moved > 0.04
 
 
-def test_it_pulls_towards_its_direction_from_any_point():
+def test_tether_pulls_in_its_direction_from_any_point():
     run = pulled([0.0, -9.0, 0.0], {"link": 2, "point_m": 0.055, "direction_w": [0.0, 3.0]})
     run.go(1.0)
     assert run.sim.tether_tension_n == pytest.approx(9.0, rel=0.01)
 
 
 @pytest.mark.parametrize("change", [{"link": 14}, {"direction_w": [0.0, 0.0]}])
-def test_a_tether_that_cannot_be_is_refused(change):
+def test_tether_impossible_is_refused(change):
     with raises_error(ConfigError, code=("config/invalid-value", "config/out-of-range")):
         open_sim(make_config(), tether={**BACKWARD, **change})

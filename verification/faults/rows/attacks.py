@@ -25,73 +25,80 @@ Flood = Callable[[Robot], AbstractContextManager[object]]
 
 
 def _flooding(kind: str, amount: int, processes: int) -> Flood:
-    return lambda made: flood(made.folder, kind, made.endpoint, amount, processes)
+    return lambda started_robot: flood(started_robot.folder, kind, started_robot.endpoint, amount, processes)
 
 
 FLOODS: dict[str, Flood] = {
-    "half_open": lambda made: half_open(made.endpoint, HALF_OPEN),
+    "half_open": lambda started_robot: half_open(started_robot.endpoint, HALF_OPEN),
     "idle": _flooding("idle", IDLE // 4, 4),
     "lease": _flooding("lease", QUERIES, 2),
     "garbage": _flooding("garbage", SAMPLES, 1),
-    "datagrams": lambda made: datagrams.flood(made.endpoint),
+    "datagrams": lambda started_robot: datagrams.flood(started_robot.endpoint),
 }
 
 
 def stopped_under(name: str, request: Request) -> Iterator[Trial]:
-    """The value: from the stop that is asked for to the setpoints of the stop, by the host's private channel."""
-    with robot(request, **STANDING) as (made, observer), FLOODS[name](made):
+    """The value: from the request of the stop to the setpoints of the stop, by the host's private channel."""
+    with robot(request, **STANDING) as (started_robot, observer), FLOODS[name](started_robot):
         for number in range(request.trials):
-            yield _stopped(request, made, observer, by_datagram=number % 2 == 1)
+            yield _stopped(request, started_robot, observer, by_datagram=number % 2 == 1)
     _explain(request)
 
 
 def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
     """The same, with many readers of everything that leave together just before."""
-    with robot(request, **STANDING) as (made, observer):
+    with robot(request, **STANDING) as (started_robot, observer):
         for number in range(request.trials):
-            with flood(made.folder, "readers", made.endpoint, READERS) as (readers,):
-                yield _stopped(request, made, observer, by_datagram=number % 2 == 1, before=partial(end, readers))
+            with flood(started_robot.folder, "readers", started_robot.endpoint, READERS) as (readers,):
+                yield _stopped(
+                    request, started_robot, observer, by_datagram=number % 2 == 1, before=partial(end, readers)
+                )
     _explain(request)
 
 
 def _explain(request: Request) -> None:
     request.note(
-        "asked for in turn by a query on a session that was there before, and by a datagram; 50 Hz, controller `hold`; "
-        "told over the host's private channel, and a period (20 ms) added, in which the setpoints go out"
+        "requested in turn by a query on a session that was there before, and by a datagram; 50 Hz, controller `hold`; "
+        "reported over the host's private channel, and a period (20 ms) added, in which the setpoints go out"
     )
 
 
 def _stopped(
-    request: Request, made: Robot, observer: Observer, *, by_datagram: bool, before: Callable[[], object] | None = None
+    request: Request,
+    started_robot: Robot,
+    observer: Observer,
+    *,
+    by_datagram: bool,
+    before: Callable[[], object] | None = None,
 ) -> Trial:
     for _ in range(TRIES):
         if observer.state() != "armed":
             observer.arm(60.0)
-        observer.watch(0.1 + made.random.random() * 0.02)
-        if made.host.lifecycle() == "armed":
+        observer.watch(0.1 + started_robot.random.random() * 0.02)
+        if started_robot.host.lifecycle() == "armed":
             break
         request.retry()
     else:
         raise TrialError(f"the robot was not seen armed under the flood: {observer.in_words()}")
     if before is not None:
         before()
-    asked_ns = time.monotonic_ns()
+    requested_ns = time.monotonic_ns()
     answers: list[object] = []
 
     def ask() -> None:
         if by_datagram:
-            answers.append(datagrams.ask(made.endpoint, datagrams.stop("operator"), ANSWER_S))
+            answers.append(datagrams.ask(started_robot.endpoint, datagrams.stop("operator"), ANSWER_S))
         else:
             answers.append(observer.ask(keys.ESTOP, EstopRequest(requester="operator")).ok)
 
     asking = threading.Thread(target=ask, daemon=True)
     asking.start()
-    stop = made.host.first(lambda status: status.lifecycle != "armed", asked_ns, "a stop")
-    made.host.first(lambda status: status.lifecycle == "estop", asked_ns, "the emergency stop")
+    stop = started_robot.host.first(lambda status: status.lifecycle != "armed", requested_ns, "a stop")
+    started_robot.host.first(lambda status: status.lifecycle == "estop", requested_ns, "the emergency stop")
     asking.join(ANSWER_S)
     period_ns = observer.description().period_ns
     failure = "" if answers and answers[0] else "the stop was not confirmed to who asked for it"
-    return recovered(observer, (stop.at_ns - asked_ns + period_ns) / 1e6, failure)
+    return recovered(observer, (stop.at_ns - requested_ns + period_ns) / 1e6, failure)
 
 
 # --- a second run --------------------------------------------------------------------------------------------------
@@ -110,7 +117,7 @@ def second_run(request: Request) -> Iterator[Trial]:
         "--duration",
         "1",
     ]
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         for number in range(request.trials):
             if observer.state() != "armed":
                 observer.arm()
@@ -118,12 +125,12 @@ def second_run(request: Request) -> Iterator[Trial]:
             observer.until(lambda: observer.state() == "disarmed", "disarmed")
             observer.watch(0.1)
             observer.forget()
-            where = ["--router" if number % 2 else "--endpoint", made.endpoint]
-            typed, output = [*command, *where, "--out", str(made.folder / f"second{number}")], subprocess.PIPE
+            where = ["--router" if number % 2 else "--endpoint", started_robot.endpoint]
+            typed, output = [*command, *where, "--out", str(started_robot.folder / f"second{number}")], subprocess.PIPE
             second = subprocess.run(typed, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, timeout=60)
             observer.listen()
             failures: list[str] = []
-            if second.returncode not in (1, 2) or made.config.robot.name not in second.stdout:
+            if second.returncode not in (1, 2) or started_robot.config.robot.name not in second.stdout:
                 failures.append(f"the second run ended with {second.returncode}: {second.stdout[-300:]}")
             moving = sum(any(mode is not Mode.PASSIVE for mode in h.message.mode) for h in observer.applied)
             if observer.state() != "disarmed":

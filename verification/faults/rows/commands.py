@@ -65,14 +65,14 @@ def wrong_in_itself(request: Request) -> Iterator[Trial]:
 
 
 def _among_good_ones(request: Request, make: Callable[[Stranger], Kinds]) -> Iterator[Trial]:
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         stranger = Stranger(observer)
         kinds = make(stranger)
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             yield _bombarded(observer, stranger, kinds)
-            if made.ended():
-                raise AssertionError(f"{made.ended()}: {made.last_words()}")
+            if started_robot.ended():
+                raise AssertionError(f"{started_robot.ended()}: {started_robot.last_words()}")
         each = ", ".join(f"{name}: {reason}" for name, (_, reason) in kinds.items())
         request.note(f"in each trial {EACH} of each kind among the controller's own; counted as {each}")
 
@@ -121,10 +121,10 @@ def applied_of_others(observer: Observer) -> int:
 
 def second_controller(request: Request) -> Iterator[Trial]:
     """A second one asks for the lease, is refused, and commands all the same."""
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         stranger, answered_ms = Stranger(observer), list[float]()
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             yield _second(observer, stranger, answered_ms)
         request.note(f"the lease request was answered within {max(answered_ms):.0f} ms")
         request.note(
@@ -134,9 +134,10 @@ def second_controller(request: Request) -> Iterator[Trial]:
 
 
 def _second(observer: Observer, stranger: Stranger, answered_ms: list[float]) -> Trial:
-    before, asked = _counts(observer), time.monotonic()
+    before = _counts(observer)
+    request_start_s = time.monotonic()
     answer = observer.ask(keys.LEASE, LeaseRequest(action="acquire", holder="second"))
-    answered_ms.append(1e3 * (time.monotonic() - asked))
+    answered_ms.append(1e3 * (time.monotonic() - request_start_s))
     failures: list[str] = []
     if answer.ok or answer.refusal != "lease_held":
         failures.append(f"not refused as held: ok {answer.ok}, {answer.refusal!r}: {answer.reason}")
@@ -198,13 +199,13 @@ class TwoWriters:
 
     def second_asks(self) -> bool:
         """The second wants the lease, at no higher priority."""
-        asked = LeaseRequest(
+        lease_request = LeaseRequest(
             action=self.rng.choice(("acquire", "renew", "release")),
             holder="second",
             epoch=self.epoch,
             priority=self.rng.randrange(101),
         )
-        answer = self.authority.on_lease(asked, self.rig.now_ns)
+        answer = self.authority.on_lease(lease_request, self.rig.now_ns)
         return answer.ok or self.authority.lease.holder != self.holder
 
     def ends(self) -> bool:
@@ -213,7 +214,11 @@ class TwoWriters:
         self.rig.observe(0.1)
         return False
 
-    def _offer(self, given: JointCommand, sequence: int, epoch: int) -> str | None:
+    def _offer(self, command: JointCommand, sequence: int, epoch: int) -> str | None:
         tick, now_ns, arm_session = self.rig.tick, self.rig.now_ns, self.authority.arm_session
-        made = msgspec.structs.replace(given, sequence=sequence, tick=tick, lease_epoch=epoch, arm_session=arm_session)
-        return self.authority.offer_command(made, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS))
+        started_robot = msgspec.structs.replace(
+            command, sequence=sequence, tick=tick, lease_epoch=epoch, arm_session=arm_session
+        )
+        return self.authority.offer_command(
+            started_robot, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS)
+        )

@@ -29,9 +29,9 @@ def cannot_keep_up(kind: str, request: Request) -> Iterator[Trial]:
     A cycle is missed when the setpoints of a tick are those of the tick before: no command had come for it. The value:
     how many more are missed in half a second than in the worst such window before the consumer came.
     """
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         before, with_it = [_missed(observer) for _ in range(request.trials)], list[int]()
-        with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
+        with _consumer(kind, started_robot.endpoint, started_robot.config.robot.name, request.folder) as process:
             for _ in range(request.trials):
                 with_it.append(_missed(observer))
                 trial = _beside_it(observer, with_it[-1] - max(before))
@@ -49,12 +49,12 @@ sleeps, disk_full = (partial(cannot_keep_up, kind) for kind in ("sleep", "disk")
 def frozen_readers(request: Request) -> Iterator[Trial]:
     """Readers of everything whose processes are stopped, and stay. The value: as above, in windows of a second.
 
-    Their buffers are small and full at once, so whoever waits for them stands still.
+    Their buffers are small and full at once, so a process that waits for them stops.
     """
     rate_hz = FROZEN_HZ[request.backend]
-    with robot(request, rate_hz=rate_hz, controller="hold") as (made, observer), ExitStack() as stack:
+    with robot(request, rate_hz=rate_hz, controller="hold") as (started_robot, observer), ExitStack() as stack:
         before, with_them = [_missed(observer, FROZEN_WINDOW_S) for _ in range(5)], list[int]()
-        for reader in stack.enter_context(flood(request.folder, "everything", made.endpoint, 0, FROZEN)):
+        for reader in stack.enter_context(flood(request.folder, "everything", started_robot.endpoint, 0, FROZEN)):
             stack.callback(reader.send_signal, signal.SIGCONT)
             reader.send_signal(signal.SIGSTOP)
         if observer.state() != "armed":
@@ -81,7 +81,7 @@ def _beside_it(observer: Observer, more_missed: int) -> Trial:
 def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:
     observer.forget()
     observer.watch(window_s)
-    rows = [heard.message for heard in observer.applied]
+    rows = [received.message for received in observer.applied]
     return sum(a.sequence == b.sequence for a, b in itertools.pairwise(rows) if b.sequence is not None)
 
 
@@ -90,8 +90,8 @@ def _consumer(kind: str, endpoint: str, namespace: str, folder: Path) -> Iterato
     """As soon as it is stuck."""
     command = [sys.executable, "-m", "verification.faults.consumer", kind, endpoint, namespace]
     log = folder / "consumer.log"
-    with log.open("w") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, text=True)
+    with log.open("w") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, text=True)
     try:
         wait_until(lambda: STUCK in log.read_text() or process.poll() is not None, "the consumer is stuck", 20.0)
         assert process.poll() is None, f"the consumer did not get stuck: {log.read_text()[-500:]}"

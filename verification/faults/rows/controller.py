@@ -21,9 +21,9 @@ Fail = Callable[[Robot, Observer], int]
 Mend = Callable[[Robot], object]
 
 
-def _trial(made: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
-    made.set_in_motion(observer)
-    failed_ns = fail(made, observer)
+def _trial(started_robot: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
+    started_robot.set_in_motion(observer)
+    failed_ns = fail(started_robot, observer)
     value = observer.safe_after_ms(failed_ns)
     status = observer.first_fault(failed_ns)
     failures: list[str] = []
@@ -31,7 +31,7 @@ def _trial(made: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
         failures.append(f"not because of the lease: {status.reason}")
     if status.lease_holder is not None:
         failures.append(f"the lease is still {status.lease_holder}'s")
-    mend(made)
+    mend(started_robot)
     observer.until(lambda: observer.status is not None and observer.status.lease_holder == "control", "control is back")
     observer.forget()
     observer.watch(LATCHED_S)
@@ -42,9 +42,9 @@ def _trial(made: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
 
 def _failing(fail: Fail, mend: Mend, request: Request) -> Iterator[Trial]:
     """fail: when it began, by the monotonic clock; mend: before the operator resets."""
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
-            yield _trial(made, observer, fail, mend)
+            yield _trial(started_robot, observer, fail, mend)
 
 
 def _hang(_made: Robot, observer: Observer) -> int:
@@ -54,9 +54,15 @@ def _hang(_made: Robot, observer: Observer) -> int:
     return now_ns
 
 
-killed = partial(_failing, lambda made, _: made.signal("control", SIGKILL), lambda made: made.start("control"))
+killed = partial(
+    _failing,
+    lambda started_robot, _: started_robot.signal("control", SIGKILL),
+    lambda started_robot: started_robot.start("control"),
+)
 frozen = partial(
-    _failing, lambda made, _: made.signal("control", SIGSTOP), lambda made: made.signal("control", SIGCONT)
+    _failing,
+    lambda started_robot, _: started_robot.signal("control", SIGSTOP),
+    lambda started_robot: started_robot.signal("control", SIGCONT),
 )
 suspended = partial(_failing, _hang, lambda _: None)
 
@@ -64,18 +70,18 @@ suspended = partial(_failing, _hang, lambda _: None)
 def host_restarts(request: Request) -> Iterator[Trial]:
     """The host is killed while moving and started again; what was streamed before is sent to the new one.
 
-    The value: setpoints of the new host that were not passive, before somebody armed it.
+    The value: setpoints of the new host that were not passive, before an operator armed it.
     """
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             observer.watch(0.1)
             streamed = [arrival.payload for arrival in observer.commands][-REPLAYED:]
             epoch = observer.status.lease_epoch if observer.status else 0
-            made.signal("host", SIGKILL)
+            started_robot.signal("host", SIGKILL)
             observer.watch(UNDER_WAY_S)
             observer.forget()
-            made.start("host")
+            started_robot.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
             observer.until(lambda: observer.applied, "the new host's setpoints")
             failures = _objections(observer, streamed)

@@ -1,6 +1,6 @@
 """Drives of every type: their host is frozen, and what goes wrong with one of them or with their bus.
 
-At 50 Hz, which emulated drives of every type keep on a busy computer. Times within a host are told in its periods.
+At 50 Hz, which emulated drives of every type keep on a busy computer. Times within a host are measured in its periods.
 """
 
 import contextlib
@@ -67,12 +67,12 @@ class DrivesOutside:
         write_config(config, folder / "drives.json")
         module = ["verification.faults.drives_process", str(folder / "drives.json"), str(self._notes), "--pose", POSE]
         self._child = children.start_child("drives", module, keep)
-        wait_until(lambda: READY in self.said(), "the drives", START_LIMIT_S)
+        wait_until(lambda: READY in self.output(), "the drives", START_LIMIT_S)
 
-    def said(self) -> str:
+    def output(self) -> str:
         """What the process printed."""
-        if (how := self._child.describe_end()) is not None:
-            raise TrialError(how)
+        if (ending := self._child.describe_end()) is not None:
+            raise TrialError(ending)
         return b"".join(self._words).decode(errors="replace")
 
     def changes(self) -> list[tuple[int, list[bool]]]:
@@ -98,11 +98,11 @@ def host_frozen(request: Request) -> Iterator[Trial]:
         contextlib.chdir(request.folder),
         (request.folder / "drives.log").open("ab", buffering=0) as log,
         contextlib.closing(DrivesOutside(request.folder, config, log)) as drives,
-        robot(request, check_plugins(config)) as (made, observer),  # once the servos' port is there
+        robot(request, check_plugins(config)) as (started_robot, observer),  # once the servos' port is there
     ):
         for _ in range(request.trials):
-            _set_in_motion(request, made, observer, lambda: all(drives.enabled()))
-            trial, off_ms = _frozen(made, observer, drives)
+            _set_in_motion(request, started_robot, observer, lambda: all(drives.enabled()))
+            trial, off_ms = _frozen(started_robot, observer, drives)
             slowest_ms = max(slowest_ms, off_ms)
             yield trial
     request.note(
@@ -112,26 +112,26 @@ def host_frozen(request: Request) -> Iterator[Trial]:
 
 
 def _set_in_motion(
-    request: Request, made: Robot, observer: Observer, is_ready: Callable[[], bool] = lambda: True
+    request: Request, started_robot: Robot, observer: Observer, is_ready: Callable[[], bool] = lambda: True
 ) -> None:
-    """Again if the robot stops by itself: a bus of emulated drives is late on a busy computer."""
+    """Repeat a trial if the robot stops by itself: a bus of emulated drives is late on a busy computer."""
     for _ in range(MAX_RETRIES):
         with contextlib.suppress(TrialError):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             if is_ready():
                 return
         request.retry()
     raise TrialError(f"this machine is too busy: the robot stopped by itself {MAX_RETRIES} times")
 
 
-def _frozen(made: Robot, observer: Observer, drives: DrivesOutside) -> tuple[Trial, float]:
-    """A trial, and how long after the signal the last drive was off."""
-    stopped_ns = made.signal("host", signal.SIGSTOP)
+def _frozen(started_robot: Robot, observer: Observer, drives: DrivesOutside) -> tuple[Trial, float]:
+    """Return a trial, and how long after the signal the last drive was off."""
+    stopped_ns = started_robot.signal("host", signal.SIGSTOP)
     try:
         time.sleep(FROZEN_S)
         changes = [change for change in drives.changes() if change[0] > stopped_ns]
     finally:
-        resumed_ns = made.signal("host", signal.SIGCONT)
+        resumed_ns = started_robot.signal("host", signal.SIGCONT)
     off_ms = (changes[-1][0] - stopped_ns) / 1e6 if changes else 0.0
     failures: list[str] = []
     if not changes or any(changes[-1][1]):
@@ -171,17 +171,17 @@ def _use_loopback() -> None:
 
 
 def at_host(kind: str, expected: dict[str, Sequence[str]], request: Request) -> Iterator[Trial]:
-    """A fault of joint_N or bus_1, asked of the host whose process emulates the drives.
+    """Inject a fault of joint_N or bus_1 into the host whose process emulates the drives.
 
     expected: names that the driver of each type gives it. The value: from its beginning to the stop mode.
     """
     rng = random.Random(9)
     config = robot_of(request.backend, robot__heat__time_constant_s=COOLS_IN_S)
     what = expected.get(request.backend, expected["others"])
-    with robot(request, check_plugins(config)) as (made, observer):  # as `snakesim run` does
+    with robot(request, check_plugins(config)) as (started_robot, observer):  # as `snakesim run` does
         joints = len(observer.description().joints)
         for _ in range(request.trials):
-            _set_in_motion(request, made, observer)
+            _set_in_motion(request, started_robot, observer)
             target = "bus_1" if kind in modules.BUS_KINDS else f"joint_{rng.randrange(joints) + 1}"
             yield modules.injected(observer, Injection(kind, target), what, PERIOD_MS)
     request.note(f"the real host process at {RATE_HZ:g} Hz, drives emulated in it; counted in its periods")

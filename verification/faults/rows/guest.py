@@ -86,7 +86,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
     listener, fault = robot.listener, {ModuleState.FAULT}
     now_ns = time.time_ns()
     os.kill(pid, number)
-    time.sleep(LEFT_S)  # also for the heartbeats after it, by which the modules' own time is told
+    time.sleep(LEFT_S)  # also for the heartbeats after it, from which the modules' own time is known
     heard = listener.listen()
     if not _went_well_until(heard, now_ns):
         return None
@@ -106,7 +106,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
 
 
 def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
-    """Whether every module had a setpoint within the last three periods, and nobody had been told to stop."""
+    """Return whether every module had a setpoint within the last three periods, and none had a stop command."""
     recent_ns = now_ns - round(3e9 / RATE_HZ)
     driven = {parse_node(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
     return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
@@ -177,11 +177,11 @@ def clock_step(request: Request) -> Iterator[Trial]:
     scenario = write_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
     settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
     config = load(scenario, [Override(key, value, "the fault table") for key, value in settings.items()]).config
-    with robot(request, config) as (made, observer):
+    with robot(request, config) as (started_robot, observer):
         for number in range(request.trials):
             trial = Trial(value=None)
             for _ in range(ATTEMPTS):
-                trial = _stepped(made, observer, STEP_S if number % 2 == 0 else -STEP_S)
+                trial = _stepped(started_robot, observer, STEP_S if number % 2 == 0 else -STEP_S)
                 if trial.value == 0:
                     break
                 request.retry()
@@ -196,10 +196,10 @@ def clock_step(request: Request) -> Iterator[Trial]:
     )
 
 
-def _stepped(made: Robot, observer: Observer, by_s: float) -> Trial:
+def _stepped(started_robot: Robot, observer: Observer, by_s: float) -> Trial:
     while observer.state() != "armed":
         observer.arm(START_LIMIT_S)
-    observer.watch(LIVE_S + made.random.random() / RATE_HZ)
+    observer.watch(LIVE_S + started_robot.random.random() / RATE_HZ)
     observer.forget()
     _step_clock(by_s)
     observer.watch(AFTER_STEP_S)

@@ -7,11 +7,11 @@ from typing import Any
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, LifecycleRequest, Mode
-from verification.faults.observer import Heard, Observer, TrialError
+from verification.faults.observer import Observer, Received, TrialError
 from verification.faults.robot import recovered, robot
 from verification.faults.row import Request, Trial
 
-ASKED_FOR_S = 0.3
+FAULT_DURATION_S = 0.3
 MORE_S = 0.1  # that the others are watched for, when the joint is sound again
 MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__max_isolated_joints": 1}
 
@@ -19,26 +19,26 @@ MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__max_isolated_joints": 1}
 def set_aside(kind: str, request: Request) -> Iterator[Trial]:
     """The value: from the request to the injector to the first setpoints that leave the joint passive."""
     rng = random.Random(7)
-    with robot(request, **MAY_LOSE_ONE) as (made, observer):
+    with robot(request, **MAY_LOSE_ONE) as (started_robot, observer):
         names = [joint.name for joint in observer.description().joints]
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             joint = rng.randrange(len(names))
-            asked_ns = time.monotonic_ns()
-            observer.inject("hal", kind, names[joint], for_s=ASKED_FOR_S)
-            value = (_let_go(observer, joint, asked_ns).at_ns - asked_ns) / 1e6
-            observer.watch(ASKED_FOR_S + MORE_S)
-            failures = _objections(observer, names[joint], asked_ns)
+            requested_ns = time.monotonic_ns()
+            observer.inject("hal", kind, names[joint], for_s=FAULT_DURATION_S)
+            value = (_let_go(observer, joint, requested_ns).at_ns - requested_ns) / 1e6
+            observer.watch(FAULT_DURATION_S + MORE_S)
+            failures = _objections(observer, names[joint], requested_ns)
             _take_back(observer)
             yield recovered(observer, value, "; ".join(failures))
 
 
-def _let_go(observer: Observer, joint: int, since_ns: int) -> Heard[AppliedCommand]:
+def _let_go(observer: Observer, joint: int, since_ns: int) -> Received[AppliedCommand]:
     """The first setpoints without the joint; by the controller, not by the host alone."""
 
-    def found() -> list[Heard[AppliedCommand]]:
+    def found() -> list[Received[AppliedCommand]]:
         passive = (h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint] is Mode.PASSIVE)
-        return [heard for heard in passive if heard.message.sequence is not None]
+        return [received for received in passive if received.message.sequence is not None]
 
     return observer.until(found, "the joint is let go", 3.0)[0]
 

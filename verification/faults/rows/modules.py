@@ -1,7 +1,7 @@
 """Joint modules and buses that fail, through the product's own injector, in a robot with all its processes.
 
-Those of CAN alone are told in periods of robot time, from the host's ticks: a machine that is late by some milliseconds
-does not count, one that misses a period does. What sensors of any backend can do is measured from outside.
+Those of CAN alone are measured in periods of robot time, from the host's ticks: a machine that is late by some
+milliseconds does not count, one that misses a period does. What sensors of any backend can do is measured from outside.
 """
 
 import random
@@ -18,25 +18,25 @@ from verification.faults.robot import START_LIMIT_S, Robot, configuration, recov
 from verification.faults.row import Request, Trial
 
 PERIOD_MS = 10.0
-ASKED_FOR_S = 0.3
+FAULT_DURATION_S = 0.3
 REST_S = 0.4  # until all motors must be off
 OFF_NM = 0.1  # what noise makes of none
 CUT_OFF = ("cut", "bus_off", "full")  # of a bus that takes no frame any more: modules stop by themselves
 BUS_KINDS = (*CUT_OFF, "error_passive", "overflow")
 BUS_LOG = "bus.log"
-SAID_AT = re.compile(r"at ([0-9.]+) s of robot time")
+ROBOT_TIME_PATTERN = re.compile(r"at ([0-9.]+) s of robot time")
 
 
 def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
-    """A fault of joint_N or bus_1 on CAN, asked of the host. what: the name that the driver gives it.
+    """Inject a fault of joint_N or bus_1 on CAN into the host. what: the name that the driver gives it.
 
     The value: from its beginning, which is just before a Sync, to the stop mode, which goes out where the setpoints
     of that period would have; for a module from its last good answer, a period earlier.
     """
     rng, log = random.Random(5), request.folder / BUS_LOG
-    with robot(request, backend__log=str(log)) as (made, observer):
+    with robot(request, backend__log=str(log)) as (started_robot, observer):
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             number = rng.randrange(len(observer.description().joints)) + 1
             injection = Injection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}")
             yield injected(observer, injection, [what], PERIOD_MS)
@@ -47,35 +47,35 @@ def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
 
 
 def injected(observer: Observer, injection: Injection, what: Sequence[str], period_ms: float) -> Trial:
-    """One trial of it. what: names that the driver may give it; period_ms: of the host."""
-    injection, asked_ns = check_injection(injection), time.monotonic_ns()
-    answer = observer.inject("hal", injection.kind, injection.target, for_s=ASKED_FOR_S)
+    """Inject a fault once, and return the trial. what: names that the driver may give it; period_ms: of the host."""
+    injection, requested_ns = check_injection(injection), time.monotonic_ns()
+    answer = observer.inject("hal", injection.kind, injection.target, for_s=FAULT_DURATION_S)
     begun = _begun_tick(answer, period_ms)
-    status = observer.first_fault(asked_ns)
+    status = observer.first_fault(requested_ns)
     found = min((fault for fault in status.faults if fault.tick >= begun), key=lambda fault: fault.tick, default=None)
     if found is None:
         return Trial(value=None, failure=f"nothing found after tick {begun}: {status.faults}")
     observer.watch(REST_S)
-    failures = _objections(observer, injection, what, asked_ns)
+    failures = _objections(observer, injection, what, requested_ns)
     if injection.target_type == "joint" and found.joint != injection.target:
         failures.append(f"{found.joint} was named, not {injection.target}: {found.cause}")
-    observer.watch(ASKED_FOR_S)
+    observer.watch(FAULT_DURATION_S)
     periods = found.tick - begun + (2 if injection.target_type == "joint" else 1)
     return recovered(observer, period_ms * periods, "; ".join(failures))
 
 
 def _begun_tick(answer: Answer, period_ms: float) -> int:
-    """The first tick that a fault concerns: it begins before the Sync."""
-    said = SAID_AT.search(answer.reason)
-    if said is None:
-        raise TrialError(f"the injector does not say when: {answer.reason}")
-    return round(float(said[1]) * 1000 / period_ms)
+    """Return the first tick that a fault concerns: it begins before the Sync."""
+    match = ROBOT_TIME_PATTERN.search(answer.reason)
+    if match is None:
+        raise TrialError(f"the injector does not report the time: {answer.reason}")
+    return round(float(match[1]) * 1000 / period_ms)
 
 
-def _objections(observer: Observer, injection: Injection, what: Sequence[str], asked_ns: int) -> list[str]:
-    """What is not as it must be after the stop mode."""
+def _objections(observer: Observer, injection: Injection, what: Sequence[str], requested_ns: int) -> list[str]:
+    """Return every condition that is not met after the stop mode."""
     failures: list[str] = []
-    reported: list[Status] = [heard.message for heard in observer.statuses if heard.at_ns >= asked_ns]
+    reported: list[Status] = [received.message for received in observer.statuses if received.at_ns >= requested_ns]
     words = {fault.what for status in reported for fault in status.faults}
     if words.isdisjoint(what):
         failures.append(f"found as {sorted(words)}, not {' or '.join(what)}")
@@ -94,15 +94,15 @@ def _objections(observer: Observer, injection: Injection, what: Sequence[str], a
 
 
 def twice_at_start(request: Request) -> Iterator[Trial]:
-    """A node id that is there twice when the host opens its bus. The value: modules that it enabled all the same."""
+    """Open a bus on which two modules have one node id. The value: modules that the host enabled all the same."""
     joints = configuration("can").robot.chain.modules
     for number in range(request.trials):
         joint, folder = f"joint_{number % joints + 1}", request.folder / str(number)
         folder.mkdir()
         log = folder / BUS_LOG
         config = configuration("can", backend__log=str(log), backend__faults=[f"duplicate:{joint}@0"])
-        with Robot(folder, config) as made:
-            host = made.start("host")
+        with Robot(folder, config) as started_robot:
+            host = started_robot.start("host")
             host.process.wait(START_LIMIT_S)
             words = "\n".join(host.output.last_lines())
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
@@ -110,25 +110,25 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
         yield Trial(
             value=float(bus_log.commands(frames, CommandAction.ARM) + bus_log.setpoints(frames)), failure=failure
         )
-    request.note("the real host process, which says why it refuses; enabled is what its bus log shows")
+    request.note("the real host process, which reports why it refuses; enabled is what its bus log shows")
 
 
 def through_robot(kind: str, request: Request) -> Iterator[Trial]:
-    """A joint's sensor fails while the robot moves.
+    """Let a joint's sensor fail while the robot moves.
 
-    The value: from the request to the injector to the first safe setpoints that were heard of.
+    The value: from the request to the injector to the first safe setpoints that were received.
     """
     rng = random.Random(6)
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             joint = f"joint_{rng.randrange(len(observer.description().joints)) + 1}"
-            asked_ns = time.monotonic_ns()
-            observer.inject("hal", kind, joint, for_s=ASKED_FOR_S)
-            value = observer.safe_after_ms(asked_ns)
-            status = observer.first_fault(asked_ns)
+            requested_ns = time.monotonic_ns()
+            observer.inject("hal", kind, joint, for_s=FAULT_DURATION_S)
+            value = observer.safe_after_ms(requested_ns)
+            status = observer.first_fault(requested_ns)
             failures: list[str] = []
             if not any(joint in fault.cause or fault.joint == joint for fault in status.faults):
                 failures.append(f"{joint} was not named: {[fault.cause for fault in status.faults]}")
-            observer.watch(ASKED_FOR_S)
+            observer.watch(FAULT_DURATION_S)
             yield recovered(observer, value, "; ".join(failures))

@@ -29,16 +29,16 @@ CUTS_S = (0.3, 0.5, 1.0, 3.0)  # the longest outlives Zenoh's own lease of a lin
 
 def router_restarts(request: Request) -> Iterator[Trial]:
     """The router is killed and started again. The value: from the kill to the stop."""
-    with robot(request, router=True) as (made, observer):
+    with robot(request, router=True) as (started_robot, observer):
         slowest_s = 0.0
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             observer.watch(0.05)
-            dead_ns = made.signal("router", signal.SIGKILL)
+            dead_ns = started_robot.signal("router", signal.SIGKILL)
             observer.watch(DOWN_S)
-            stop = made.host.first(lambda status: status.lifecycle != "armed", dead_ns, "a stop")
+            stop = started_robot.host.first(lambda status: status.lifecycle != "armed", dead_ns, "a stop")
             observer.forget()
-            made.start("router")
+            started_robot.start("router")
             started = time.monotonic()
             observer.until(lambda: observer.statuses and observer.clocks, "reconnected", START_LIMIT_S)
             observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
@@ -77,16 +77,16 @@ def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
 def network_cut(request: Request) -> Iterator[Trial]:
     """Host and observer on one side of a veth pair, the services on the other; the link goes down, and up again."""
     endpoint = f"tcp/{OURS}:{PORT}"
-    with _far_side() as far, Robot(request.folder, configuration(request.backend), endpoint=endpoint) as made:
-        made.start("host")
-        observer = made.observe()
+    with _far_side() as far, Robot(request.folder, configuration(request.backend), endpoint=endpoint) as started_robot:
+        started_robot.start("host")
+        observer = started_robot.observe()
         with _inside(far):
-            for service in made.config.services:
-                made.start(service)
+            for service in started_robot.config.services:
+                started_robot.start(service)
         observer.arm(START_LIMIT_S)
         slowest_s = 0.0
         for number in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             cut_ns = time.monotonic_ns()
             _set_link("ours", up=False)
             value = observer.safe_after_ms(cut_ns)
@@ -141,7 +141,7 @@ def _ip(*arguments: str) -> None:
 def _set_link(name: str, *, up: bool) -> None:
     """What `ip link set` does, without the time that a process takes to start."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
-        asked = INTERFACE.pack(name.encode(), 0)
-        _, flags = INTERFACE.unpack(fcntl.ioctl(any_socket, SIOCGIFFLAGS, asked))
+        interface_request = INTERFACE.pack(name.encode(), 0)
+        _, flags = INTERFACE.unpack(fcntl.ioctl(any_socket, SIOCGIFFLAGS, interface_request))
         flags = flags | IFF_UP if up else flags & ~IFF_UP
         fcntl.ioctl(any_socket, SIOCSIFFLAGS, INTERFACE.pack(name.encode(), flags))

@@ -41,13 +41,13 @@ def slow(request: Request) -> Iterator[Trial]:
 
 def diverges(request: Request) -> Iterator[Trial]:
     """Its state becomes impossible. The value: steps from the injection to the fault. Then a new host is started."""
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
-            made.set_in_motion(observer)
+            started_robot.set_in_motion(observer)
             record = request.folder / HOST_RECORD
             record.unlink(missing_ok=True)
             observer.inject("hal", "diverge", "simulator")
-            made.running["host"].process.wait(START_LIMIT_S)
+            started_robot.running["host"].process.wait(START_LIMIT_S)
             observer.listen()
             left = msgspec.json.decode(record.read_bytes(), type=HostRecord)
             _, box = read_black_box(request.folder / BLACK_BOX)
@@ -66,9 +66,9 @@ def diverges(request: Request) -> Iterator[Trial]:
             elif np.abs(np.array(last.angle_rad) - angles[-1]).max() > MAX_STEP_RAD:
                 failures.append("the last state that was published is not the last good one")
             observer.forget()
-            made.start("host")
+            started_robot.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
-            told = next(text for text in left.injected if "diverge" in text)  # `tick 31: diverge:simulator@...`
-            begun = int(told.removeprefix("tick ").partition(":")[0])
+            reported = next(text for text in left.injected if "diverge" in text)  # `tick 31: diverge:simulator@...`
+            begun = int(reported.removeprefix("tick ").partition(":")[0])
             yield recovered(observer, float(fault.tick - begun + 1), "; ".join(failures))
         request.note("the host process ends after a divergence, with its record; a new one was started and armed")

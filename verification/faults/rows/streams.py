@@ -19,12 +19,12 @@ DEPTH = 4096
 
 def no_joints(request: Request) -> Iterator[Trial]:
     """The value: until the stop mode. Somebody resets and arms when the stream is back."""
-    with robot(request) as (made, observer):
+    with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
-            made.set_in_motion(observer)
-            asked_ns = _cut(observer, keys.JOINTS)
-            value = observer.safe_after_ms(asked_ns)
-            status = observer.first_fault(asked_ns)
+            started_robot.set_in_motion(observer)
+            requested_ns = _cut(observer, keys.JOINTS)
+            value = observer.safe_after_ms(requested_ns)
+            status = observer.first_fault(requested_ns)
             failures: list[str] = []
             if [fault.what for fault in status.faults] != ["lease_expired"]:
                 failures.append(f"not because of the lease: {status.reason}")
@@ -36,16 +36,16 @@ def no_joints(request: Request) -> Iterator[Trial]:
 
 def withheld(key: str, request: Request) -> Iterator[Trial]:
     """The value: from the request to the injector to the last setpoints with which a joint pushed."""
-    with robot(request, **ALONG_PEGS) as (made, observer):
+    with robot(request, **ALONG_PEGS) as (started_robot, observer):
         states = observer.session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
         back_ms: list[float] = []
         for _ in range(request.trials):
-            _pushing(made, observer)
+            _pushing(started_robot, observer)
             states.drain()
-            asked_ns = _cut(observer, key)
+            requested_ns = _cut(observer, key)
             observer.until(lambda: _named(states.drain(), key), f"{key} named in control/state", BACK_S)
             observer.watch(AWAY_S)
-            value, failures = _held(observer, asked_ns)
+            value, failures = _held(observer, requested_ns)
             yield _back(observer, key, value, failures, back_ms)
         request.note(
             "along `peg_row` at 0.2 m/s; until the first setpoints with which no joint pushes, nor does again "
@@ -59,18 +59,18 @@ def withheld(key: str, request: Request) -> Iterator[Trial]:
 
 def _cut(observer: Observer, key: str) -> int:
     """Have a stream's writer lose all of it; when that was asked for, by the monotonic clock."""
-    asked_ns = time.monotonic_ns()
+    requested_ns = time.monotonic_ns()
     observer.inject(find_writer(key), "drop", key)
-    return asked_ns
+    return requested_ns
 
 
 def _mend(observer: Observer, key: str) -> None:
     observer.inject(find_writer(key), "drop", key, end=True)
 
 
-def _pushing(made: Robot, observer: Observer) -> None:
+def _pushing(started_robot: Robot, observer: Observer) -> None:
     """Armed, and some joint has pushed for a moment."""
-    made.set_in_motion(observer)
+    started_robot.set_in_motion(observer)
 
     def pushes() -> bool:
         newest = observer.applied[-PUSHES:]
@@ -84,19 +84,19 @@ def _named(states: list[ControlState], key: str) -> bool:
     return any(key in state.reason and state.state == "NotLocomoting" for state in states)
 
 
-def _held(observer: Observer, asked_ns: int) -> tuple[float | None, list[str]]:
+def _held(observer: Observer, requested_ns: int) -> tuple[float | None, list[str]]:
     """When the push ended for good, in ms, and what else is not as it must be."""
     failures: list[str] = []
-    if observer.state() != "armed" or observer.first_safe(asked_ns) is not None:
+    if observer.state() != "armed" or observer.first_safe(requested_ns) is not None:
         failures.append(f"the robot stopped: {observer.in_words()}")
-    since = [h for h in observer.applied if h.at_ns >= asked_ns]
+    since = [h for h in observer.applied if h.at_ns >= requested_ns]
     pushing = [i for i, h in enumerate(since) if Mode.TORQUE in h.message.mode]
     last = pushing[-1] if pushing else -1
     if last + 1 >= len(since):
         return None, [*failures, "a joint pushes on"]
     if any(set(h.message.mode) != {Mode.POSITION} for h in since[last + 1 :]):
         failures.append("not all joints hold their position")
-    return (since[last + 1].at_ns - asked_ns) / 1e6, failures
+    return (since[last + 1].at_ns - requested_ns) / 1e6, failures
 
 
 def _back(observer: Observer, key: str, value: float | None, failures: list[str], back_ms: list[float]) -> Trial:

@@ -13,7 +13,8 @@ from pathlib import Path
 from snakesim_hal.base.process import die_with_parent, on_stop_signal, raise_open_files
 from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.base.workers import start_worker
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.programs.arguments import add_network, add_parent, read_session_option
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_operator.base.console_port import TOKEN_VARIABLE

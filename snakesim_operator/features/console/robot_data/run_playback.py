@@ -165,7 +165,7 @@ class RunPlayback:
 
     def _read_base(self, row: int) -> tuple[Vector, Quaternion] | None:
         """Return position and orientation of the tail end; None if they are not known."""
-        position_w = self.record.position_w[row]
+        position_w = self.record.position_w_m[row]
         orientation_wxyz = self.record.orientation_wxyz[row]
         if not (np.isfinite(position_w).all() and np.isfinite(orientation_wxyz).all()):
             return None

@@ -25,7 +25,8 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
         module = module_of(run, 3)
         (wire,) = WIRES
         run.backend.close()
-        assert words(wire.sent)[-1] == "disarm" and wire.closed == 1
+        assert words(wire.sent)[-1] == "disarm"
+        assert wire.closed == 1
         assert module.state == DISARMED and module.last_stop == LastStop.DISARM, "and they have heard it"
         sent = len(wire.sent)
         run.backend.close()
@@ -34,7 +35,8 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
             with raises_error(BackendError, code="backend/closed"):
                 call()
         run.backend.enact(run.staying(run.samples[-1]), "armed")
-        assert run.backend.faults() == [] and len(wire.sent) == sent
+        assert run.backend.faults() == []
+        assert len(wire.sent) == sent
 
 
 def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +98,8 @@ def test_closing_reports_errors_even_when_stop_cannot_be_sent() -> None:
         with raises_error(BackendError, code="backend/failed"):  # by the next tick, which tries again
             run.run(3, run.waving)
         reported = {fault.what: fault.cause for fault in run.faults}
-        assert "leak" in reported["module_leak"] and reported["stop_not_sent"] == "the bus is broken"
+        assert "leak" in reported["module_leak"]
+        assert reported["stop_not_sent"] == "the bus is broken"
 
 
 def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None:
@@ -112,6 +115,7 @@ def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None
     assert [line[2] for line in lines] == [f"{f.id:03X}#{f.data.hex().upper()}" for f in WIRES[0].all]
     assert {line[1] for line in lines} == {WIRES[0].channel}
     opcodes = {int(line[2][:3], 16) >> 6 for line in lines}
-    assert opcodes > {*FROM_HOST} - {Opcode.EMERGENCY} and Opcode.JOINT_STATE in opcodes
+    assert opcodes > {*FROM_HOST} - {Opcode.EMERGENCY}
+    assert Opcode.JOINT_STATE in opcodes
     last = [line[2] for line in lines if int(line[2][:3], 16) >> 6 in FROM_HOST][-1]
     assert last.startswith("040#02"), "which is disarm"

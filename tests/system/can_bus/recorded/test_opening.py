@@ -58,10 +58,12 @@ def test_bring_up_enables_nothing() -> None:
         )
         disarm = next(i for i, frame in enumerate(sent) if is_action(frame, CommandAction.DISARM))
         written = next(i for i, frame in enumerate(sent) if parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST)
-        assert disarm < written and parse_node(sent[disarm].id) == BROADCAST
+        assert disarm < written
+        assert parse_node(sent[disarm].id) == BROADCAST
         assert run.states() == [DISARMED] * JOINTS
         assert not any(is_set_point(frame) for frame in go(run, "disarmed", 30))
-        assert run.faults == [] and run.true_speed_rad_s == [0.0] * 30
+        assert run.faults == []
+        assert run.true_speed_rad_s == [0.0] * 30
 
 
 def test_opening_silent_module_is_reported_and_everything_closed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,7 +76,9 @@ def test_opening_silent_module_is_reported_and_everything_closed(monkeypatch: py
     with raises_error(BackendError, code="drive/silent", field="joint_2"), loop():
         pass
     (wire,) = WIRES
-    assert wire.closed == 1 and words(wire.sent)[-1] == "disarm" and not any(map(is_set_point, wire.sent))
+    assert wire.closed == 1
+    assert words(wire.sent)[-1] == "disarm"
+    assert not any(map(is_set_point, wire.sent))
 
 
 def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]) -> None:
@@ -144,7 +148,8 @@ def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest
 def test_opening_describes_joints_with_serials_and_firmware() -> None:
     with loop() as run:
         joints = run.backend.describe().joints
-        assert len({joint.serial for joint in joints}) == 4 and all(len(joint.serial) == 8 for joint in joints)
+        assert len({joint.serial for joint in joints}) == 4
+        assert all(len(joint.serial) == 8 for joint in joints)
         assert [joint.firmware for joint in joints] == ["1.0"] * 4
 
 

@@ -68,7 +68,9 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
     NoProcess.started.clear()
     run = two_buses([3, 1])
     ((channels, pose, stepped),) = NoProcess.started
-    assert channels == ["bus_a", "bus_b"] and pose.startswith("127.0.0.1:") and stepped
+    assert channels == ["bus_a", "bus_b"]
+    assert pose.startswith("127.0.0.1:")
+    assert stepped
     run.arm()
     run.run(30, run.waving)
     assert run.faults == []
@@ -84,7 +86,8 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
     stopped = NoProcess.stopped
     run.backend.close()
     assert [words(wire.sent)[-1] for wire in WIRES] == ["disarm", "disarm"]
-    assert NoProcess.stopped == stopped + 1 and [wire.closed for wire in WIRES] == [1, 1]
+    assert NoProcess.stopped == stopped + 1
+    assert [wire.closed for wire in WIRES] == [1, 1]
 
 
 def test_two_buses_in_lockstep_have_no_frames_left_in_flight(

@@ -53,7 +53,8 @@ def test_setpoints_are_sent_only_to_armed_robot_until_a_stop(
         sent = go(run, lifecycle, 40)
         assert not any(map(is_set_point, sent))
         assert words(sent)[:1] == said and len(words(sent)) <= 3, "a word, and not all the time"
-        assert run.states() == [state] * JOINTS and run.true_speed_rad_s[-1] < 0.05
+        assert run.states() == [state] * JOINTS
+        assert run.true_speed_rad_s[-1] < 0.05
         assert words(go(run, "disarmed"))[:1] == cleared
         cleared_and_armed_again(run)
         assert run.faults == []
@@ -67,7 +68,8 @@ def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) ->
         assert words(go(run, "armed"))[:2] == ["clear", "arm"]
         run.arm()
         run.run(20, run.waving)
-        assert run.faults == [] and max(run.true_speed_rad_s[-10:]) > 0.1
+        assert run.faults == []
+        assert max(run.true_speed_rad_s[-10:]) > 0.1
 
 
 def test_lost_arming_and_stop_frames_are_sent_again() -> None:
@@ -77,7 +79,8 @@ def test_lost_arming_and_stop_frames_are_sent_again() -> None:
         )
         sent = go(run, "armed", 6)
         assert words(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
-        assert run.states() == [ARMED] * JOINTS and run.faults == []
+        assert run.states() == [ARMED] * JOINTS
+        assert run.faults == []
         assert words(go(run, "fault", 3)) == ["stop", "stop 1", "stop 2", "stop 3", "stop 4"]
         go(run, "fault", 20)
         assert run.states() == [DISARMED] * JOINTS
@@ -90,7 +93,8 @@ def test_module_that_disarmed_itself_is_not_armed_again_automatically() -> None:
         module_of(run, 2).receive(make_command(CommandAction.DISARM), 0.0)
         before = len(WIRES[0].sent)
         run.run(5)
-        assert words(WIRES[0].sent[before:]) == ["stop"] and module_of(run, 2).state == DISARMED
+        assert words(WIRES[0].sent[before:]) == ["stop"]
+        assert module_of(run, 2).state == DISARMED
         assert [(fault.what, fault.joint) for fault in run.faults] == [("module_not_armed", "joint_2")]
 
 
@@ -131,7 +135,8 @@ def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
         assert all(f["position"] == pytest.approx(0.001 * (tick - start)) for tick, f in sent.items()), "the newest"
         counts = [int(frame["count"]) for frame in sent.values()]
         assert all((b - a) % 16 == 1 for a, b in pairwise(counts)), "a count is of what was sent"
-        assert run.faults == [] and run.states() == [ARMED] * JOINTS
+        assert run.faults == []
+        assert run.states() == [ARMED] * JOINTS
 
 
 def test_bus_without_sync_is_reported_even_when_disarmed() -> None:
@@ -158,7 +163,8 @@ def test_restarted_module_is_not_armed_before_its_parameters_are_set() -> None:
             states.append(module.state)
         assert ARMED not in states[states.index(ModuleState.BOOT) :]
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 0.0
-        assert "module_restarted" in [fault.what for fault in run.faults] and run.lifecycle == "fault"
+        assert "module_restarted" in [fault.what for fault in run.faults]
+        assert run.lifecycle == "fault"
         go(run, "armed", 8)  # cleared and armed between two ticks
         assert run.states() == [ARMED] * JOINTS
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 40.0
@@ -171,11 +177,13 @@ def test_robot_is_not_armed_while_module_rejects_parameters() -> None:
         assert run.lifecycle == "fault"
         before = len(run.faults)
         sent = go(run, "armed", 1) + go(run, "fault", 3)
-        assert "clear" in words(sent) and "arm" not in words(sent)
+        assert "clear" in words(sent)
+        assert "arm" not in words(sent)
         assert [(fault.what, fault.joint) for fault in run.faults[before:]] == [("module_not_configured", "joint_2")]
         assert ARMED not in run.states()
         WIRES[0].loses = none
         before = len(run.faults)
         go(run, "armed", 8)
-        assert run.states() == [ARMED] * JOINTS and run.faults[before:] == []
+        assert run.states() == [ARMED] * JOINTS
+        assert run.faults[before:] == []
         assert module_of(run, 2).parameters.values[ModuleParameter.STIFFNESS] == 40.0

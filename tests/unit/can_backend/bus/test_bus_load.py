@@ -85,7 +85,7 @@ def test_no_frame_is_ever_longer_than_the_worst_case(identifier: int, data: byte
     assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= worst_frame_bits(len(data))
 
 
-def test_the_worst_case_is_nearly_met() -> None:
+def test_bus_load_worst_case_is_nearly_reached() -> None:
     frames = [(i, bytes([b]) * 8) for i in range(0, 0x800, 8) for b in (0, 255, 0x0F, 0xF0, 0x87, 0x78, 0x3C, 0xC3)]
     assert max(frame_bits(*frame) for frame in frames) >= WORST_OF_8 - 4
 
@@ -93,7 +93,7 @@ def test_the_worst_case_is_nearly_met() -> None:
 # --- the sum -----------------------------------------------------------------------------------------------
 
 
-def test_what_is_not_reported_costs_nothing() -> None:
+def test_bus_load_of_absent_reports_is_zero() -> None:
     kinds = {s.opcode for s in list_streams(13, ReportSchedule(100.0, 0, 0)) if s.frames_per_s}
     assert kinds == {Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.HEARTBEAT, Opcode.HEALTH}
     without_tail = bus_load(13, ReportSchedule(100.0, tail=False))
@@ -135,8 +135,10 @@ def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> Non
     if buses > joints:
         return
     found = joints_per_bus(run_of(joints), CanSettings(channels=channels(buses)))
-    assert sum(found) == joints and len(found) == max(buses, 1)
-    assert max(found) - min(found) <= 1 and found == sorted(found, reverse=True)
+    assert sum(found) == joints
+    assert len(found) == max(buses, 1)
+    assert max(found) - min(found) <= 1
+    assert found == sorted(found, reverse=True)
 
 
 def test_given_shares_are_kept() -> None:
@@ -194,7 +196,8 @@ def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[
 def test_fewer_forces_are_suggested_when_that_is_enough() -> None:
     config, settings = run_of(13, 190.0), CanSettings(contact_rate_hz=190.0)
     text = refusal(config, settings)
-    assert text is not None and "backends.can.contact_rate_hz = 47.5" in text
+    assert text is not None
+    assert "backends.can.contact_rate_hz = 47.5" in text
 
 
 @given(
@@ -205,7 +208,7 @@ def test_fewer_forces_are_suggested_when_that_is_enough() -> None:
     buses=st.integers(0, 4),
     data=st.data(),
 )
-def test_everything_that_is_suggested_really_fits(
+def test_bus_load_suggestions_all_fit(
     joints: int, rate_hz: float, contact_hz: float | None, imu_hz: float, buses: int, data: st.DataObject
 ) -> None:
     buses = min(buses, joints)
@@ -235,7 +238,9 @@ def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
     assert max_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (None, 20)
 
 
-def test_a_bus_that_nothing_helps() -> None:
+def test_bus_load_beyond_all_settings_suggests_a_lower_rate() -> None:
     text = refusal(run_of(LAST_NODE, 5000.0), CanSettings(channels=channels(8)))
-    assert text is not None and "rate_hz = " in text  # slower always helps
-    assert "channels with" not in text and "contact_rate_hz" not in text
+    assert text is not None
+    assert "rate_hz = " in text  # slower always helps
+    assert "channels with" not in text
+    assert "contact_rate_hz" not in text

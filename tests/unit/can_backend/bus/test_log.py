@@ -24,7 +24,9 @@ def test_log_of_sent_and_received_frames_keeps_their_order(tmp_path: Path) -> No
     path, other = tmp_path / "bus.log", VirtualWire("can3")
     with open_log(path) as log:
         wire, neighbor = (LoggedWire(OnFile(channel), log) for channel in ("can3", "can4"))
-        assert (wire.channel, wire.fileno(), wire.idle()) == ("can3", 42, math.inf)
+        assert wire.channel == "can3"
+        assert wire.fileno() == 42
+        assert wire.idle() == math.inf
         assert wire.send(Frame(0x105, bytes.fromhex("00112233")))
         wire.inject("full", begins=True)
         assert not wire.send(Frame(0x106, b"\x01"))
@@ -32,7 +34,8 @@ def test_log_of_sent_and_received_frames_keeps_their_order(tmp_path: Path) -> No
         assert [error.kind for error in wire.errors()] == ["queue_full"]
         for frame in (Frame(0x7, b""), Frame(0x7FF, bytes(8))):
             other.send(frame)
-        assert wire.receive() == [Frame(0x7, b""), Frame(0x7FF, bytes(8))] and wire.receive() == []
+        assert wire.receive() == [Frame(0x7, b""), Frame(0x7FF, bytes(8))]
+        assert wire.receive() == []
         assert neighbor.send(Frame(0, b"\x02"))
         for one in (other, wire, neighbor):
             one.close()

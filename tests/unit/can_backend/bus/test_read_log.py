@@ -61,16 +61,20 @@ def test_a_log_is_read_as_python_can_reads_it(tmp_path: Path) -> None:
             assert ours.equals(other, timestamp_delta=0.0, check_channel=not ours.is_error_frame), (ours, other)
     assert list(log.report()) == []
     packed = log_of(tmp_path, gzip.compress(COMPACT.encode()), "bus.log.gz")
-    assert len(list(packed)) == 6 and list(packed.report()) == []
+    assert len(list(packed)) == 6
+    assert list(packed.report()) == []
 
 
 @pytest.mark.parametrize("option", PRINTED)
 def test_what_candump_prints_is_read_with_its_times(tmp_path: Path, option: str) -> None:
     log = log_of(tmp_path, PRINTED[option])
     state, sync, remote = list(log)[:3]
-    assert (state.arbitration_id, bytes(state.data)) == (0x105, bytes.fromhex("0011223344556677"))
-    assert (sync.arbitration_id, bytes(sync.data)) == (0x080, bytes.fromhex("0102030405"))
-    assert remote.is_remote_frame and not state.is_remote_frame
+    assert state.arbitration_id == 0x105
+    assert bytes(state.data) == bytes.fromhex("0011223344556677")
+    assert sync.arbitration_id == 0x080
+    assert bytes(sync.data) == bytes.fromhex("0102030405")
+    assert remote.is_remote_frame
+    assert not state.is_remote_frame
     assert sync.is_rx == (option != "-x -a")
     if option in ("-x -a", ""):
         assert state.timestamp < sync.timestamp < remote.timestamp
@@ -98,12 +102,14 @@ def test_read_log_of_cut_file_names_the_dropped_line(tmp_path: Path, cut: str, f
     log = log_of(tmp_path, cut)
     assert len(list(log)) == frames
     line = next(iter(log.report()))
-    assert line.startswith(f"1 line is no whole frame and was left out: {report}") and len(line) < 200
+    assert line.startswith(f"1 line is no whole frame and was left out: {report}")
+    assert len(line) < 200
 
 
 def test_read_log_last_line_without_newline_is_accepted_with_direction(tmp_path: Path) -> None:
     log = log_of(tmp_path, COMPACT.splitlines()[0])
-    assert len(list(log)) == 1 and list(log.report()) == []
+    assert len(list(log)) == 1
+    assert list(log.report()) == []
 
 
 def test_many_dropped_lines_are_counted(tmp_path: Path) -> None:
@@ -126,7 +132,8 @@ def test_a_cut_file_of_another_kind_gives_what_is_whole(tmp_path: Path) -> None:
     packed = tmp_path / "bus.log.gz"
     packed.write_bytes(gzip.compress(COMPACT.encode() * 1000)[:-300])
     log = BusLog(packed)
-    assert len(list(log)) > 100 and "1 line is no whole" in next(iter(log.report()))
+    assert len(list(log)) > 100
+    assert "1 line is no whole" in next(iter(log.report()))
 
 
 @pytest.mark.parametrize("text", ["not a frame\n", "\0" * 100, "(nan) can0 105#00\n"])

@@ -101,9 +101,10 @@ def actions(frames: list[Frame]) -> list[float]:
 # --- who is there ------------------------------------------------------------------------------------------
 
 
-def test_everybody_is_found_and_only_asked_who_they_are(modules: Modules) -> None:
+def test_bring_up_finds_every_module_with_identity_requests_only(modules: Modules) -> None:
     found = find_modules([modules.bus], 5.0)
-    assert [i.node for i in found] == [1, 2, 3, 4] and {i.channel for i in found} == {modules.channel}
+    assert [i.node for i in found] == [1, 2, 3, 4]
+    assert {i.channel for i in found} == {modules.channel}
     assert [i.serial for i in found] == [slot.module.serial for slot in modules.chain.slots]
     assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {("1.0", 1, True, True)}
     assert set(actions(modules.heard)) == {CommandAction.IDENTIFY}
@@ -125,7 +126,8 @@ def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Mo
 
     modules.to_host, modules.beside = watch_the_last, later
     found = find_modules([modules.bus], 5.0)
-    assert 0xBAD in [i.serial for i in found if i.node == 2] and len(found) == 5
+    assert 0xBAD in [i.serial for i in found if i.node == 2]
+    assert len(found) == 5
 
 
 def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None:
@@ -134,11 +136,12 @@ def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None
     assert time.monotonic() - began < 2.0
     began = time.monotonic()
     found = find_modules([ModuleBus(modules.near, range(1, 6))], 0.25)
-    assert 0.2 < time.monotonic() - began < 2.0 and len(found) == 4
+    assert 0.2 < time.monotonic() - began < 2.0
+    assert len(found) == 4
     assert 2 <= len(actions(modules.heard)) <= 6, "asks again, but not all the time"
 
 
-def test_an_answer_that_is_lost_is_asked_for_again(modules: Modules) -> None:
+def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> None:
     modules.to_host = losing(1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3)
     assert [i.node for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
     assert len(actions(modules.heard)) > 1, "asked again"
@@ -151,7 +154,8 @@ def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(module
         modules.far.send(frame)
     handed_on: list[Frame] = []
     assert [i.node for i in find_modules([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
-    assert [frame for frame in handed_on if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [cut] and beat in handed_on
+    assert [frame for frame in handed_on if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [cut]
+    assert beat in handed_on
 
 
 # --- what is wrong with them -------------------------------------------------------------------------------
@@ -200,7 +204,7 @@ def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[s
         ),
     ],
 )
-def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[ModuleIdentity], words: str) -> None:
+def test_bring_up_error_names_joint_node_and_bus(found: list[ModuleIdentity], words: str) -> None:
     (reported,) = wrong_with(found)
     assert reported.startswith(words)
 
@@ -210,7 +214,7 @@ def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
     assert reported == ["joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"]
 
 
-def test_everything_is_told_at_once() -> None:
+def test_bring_up_lists_all_problems_in_one_error() -> None:
     found = [
         replace(GOOD[0], protocol=3),
         replace(GOOD[0], protocol=3, serial=5),
@@ -240,19 +244,19 @@ def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) ->
     for node, values in in_force.items():
         assert set(values) == set(ModuleParameter)
         assert values == pytest.approx(modules.chain.slots[node - 1].module.parameters.values)
-    assert in_force[2][ModuleParameter.STIFFNESS] == 12.5 and in_force[1][ModuleParameter.STIFFNESS] == 40.0
+    assert in_force[2][ModuleParameter.STIFFNESS] == 12.5
+    assert in_force[1][ModuleParameter.STIFFNESS] == 40.0
     assert [in_force[node][ModuleParameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
     assert in_force[1][ModuleParameter.RATED_TORQUE] == pytest.approx(4.0)
     requests = [read(f) for f in modules.heard]
     assert {parse_opcode(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
     read_only = [r["index"] for r in requests if r["operation"] == ParameterOperation.READ]
-    assert set(read_only) == {ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED} and len(requests) == 4 * len(
-        ModuleParameter
-    )
+    assert set(read_only) == {ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED}
+    assert len(requests) == 4 * len(ModuleParameter)
 
 
 @pytest.mark.parametrize("way", ["to_modules", "to_host"])
-def test_what_is_lost_is_asked_again(modules: Modules, way: str) -> None:
+def test_bring_up_lost_parameter_answer_is_requested_again(modules: Modules, way: str) -> None:
     setattr(modules, way, losing(5))
     began = time.monotonic()
     in_force = configure_modules([modules.bus], wanted(), 5.0)
@@ -270,7 +274,8 @@ def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Mod
 
     modules.to_host = noisily
     in_force = configure_modules([modules.bus], wanted(damping=0.5), 5.0)
-    assert in_force[2][ModuleParameter.DAMPING] == 0.5 and in_force[2][ModuleParameter.STIFFNESS] == 40.0
+    assert in_force[2][ModuleParameter.DAMPING] == 0.5
+    assert in_force[2][ModuleParameter.STIFFNESS] == 40.0
     assert in_force[1][ModuleParameter.DAMPING] == 1.0
 
 
@@ -305,7 +310,7 @@ def test_bring_up_unknown_result_code_counts_as_refusal(modules: Modules) -> Non
         configure_modules([modules.bus], wanted(), 5.0)
 
 
-def test_who_does_not_answer_is_told_in_the_end(modules: Modules) -> None:
+def test_bring_up_silent_module_is_named_at_the_end(modules: Modules) -> None:
     modules.to_host = lambda frame: [] if parse_node(frame.id) in (2, 4) else [frame]
     with raises_error(BackendError, code="drive/silent"):
         configure_modules([modules.bus], wanted(), 0.3)

@@ -27,7 +27,8 @@ def test_module_fault_names_its_joint_and_stops_the_robot(kind: str, what: str, 
         stopped = max(tick for tick in range(START_TICK, run.tick) if run.true_speed_rad_s[tick] > AT_REST_RAD_S) + 1
         healthy = [i for i in range(4) if i != 2]
         assert fault.what in (what, "module_silent" if kind == "reboot" else what)
-        assert fault.joint == "joint_3" and "joint_3 (node 3 on " in fault.cause
+        assert fault.joint == "joint_3"
+        assert "joint_3 (node 3 on " in fault.cause
         assert what in [f.what for f in run.faults]
         assert stopped < run.tick - 5, "everything comes to rest"
         assert all(run.states()[i] == ModuleState.DISARMED for i in healthy), run.states()
@@ -47,13 +48,16 @@ def test_persistent_fault_is_reported_again_and_blocks_arming_until_gone() -> No
     with loop(faults=["leak:joint_1@0.3-0.8"]) as run:
         run.arm()
         run.run(60, run.waving)
-        assert [fault.what for fault in run.faults] == ["module_leak"] and run.lifecycle == "fault"
+        assert [fault.what for fault in run.faults] == ["module_leak"]
+        assert run.lifecycle == "fault"
         run.lifecycle = "disarmed"
         run.run(20)
-        assert [fault.what for fault in run.faults] == ["module_leak", "module_leak"] and run.lifecycle == "fault"
+        assert [fault.what for fault in run.faults] == ["module_leak", "module_leak"]
+        assert run.lifecycle == "fault"
         run.lifecycle = "disarmed"
         run.run(10)
-        assert run.states() == [ModuleState.DISARMED] * 4 and len(run.faults) == 2
+        assert run.states() == [ModuleState.DISARMED] * 4
+        assert len(run.faults) == 2
         before = list(run.samples[-1].joints.angle_rad)
         run.wanted = None
         run.arm()

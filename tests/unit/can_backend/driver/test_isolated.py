@@ -72,16 +72,19 @@ def lame_robot(max_isolated: int = 1) -> Iterator[Lame]:
 @pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
 def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within: int) -> None:
     with lame_robot() as robot:
-        assert robot.states() == [ModuleState.ARMED] * JOINTS and all(robot.turning())
+        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert all(robot.turning())
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(within + 1)
         if what in CONCERNS_ALL:
-            assert robot.authority.state == "fault" and robot.authority.isolated_joints == []
+            assert robot.authority.state == "fault"
+            assert robot.authority.isolated_joints == []
             return
         assert robot.authority.isolated_joints == [f"joint_{FAILS + 1}"], robot.authority.reason
         robot.wave(30)
         robot.assert_armed()
-        assert all(robot.turning()) and {fault.joint for fault in robot.faults} == {f"joint_{FAILS + 1}"}
+        assert all(robot.turning())
+        assert {fault.joint for fault in robot.faults} == {f"joint_{FAILS + 1}"}
         assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
 
 
@@ -103,7 +106,8 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
+        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.authority.isolated_joints == []
         assert len(robot.faults) == reported, robot.faults[reported:]
 
 
@@ -116,7 +120,8 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
-        assert all(robot.turning()) and robot.states()[FAILS] == ModuleState.DISARMED
+        assert all(robot.turning())
+        assert robot.states()[FAILS] == ModuleState.DISARMED
         assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
 
 
@@ -159,11 +164,13 @@ def test_isolated_joint_reset_within_one_period_still_clears(
             robot.ask("disarm")
             robot.idle(20)
         swallowed(robot, *joints)
-        assert robot.authority.state == "disarmed" and robot.states() == [ModuleState.DISARMED] * JOINTS
+        assert robot.authority.state == "disarmed"
+        assert robot.states() == [ModuleState.DISARMED] * JOINTS
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated_joints == []
+        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.authority.isolated_joints == []
 
 
 @pytest.mark.parametrize("then", ["reset", "estop", "fault"])
@@ -192,7 +199,8 @@ def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(VirtualWire, "send", overheard)
         robot.idle()
     stops = [make_command(CommandAction.DISARM), make_command(CommandAction.STOP), make_emergency()]
-    assert sent[0] == (make_emergency() if then == "estop" else stops[0]) and sent[0] in stops
+    assert sent[0] == (make_emergency() if then == "estop" else stops[0])
+    assert sent[0] in stops
 
 
 def test_a_lost_module_is_switched_off_at_once() -> None:

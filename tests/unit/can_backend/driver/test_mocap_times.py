@@ -40,7 +40,8 @@ def running(readings: int = 20) -> Camera:
 def test_the_first_samples_may_be_the_slowest_of_all() -> None:
     camera = Camera()
     assert camera.read(40.0) == [None] and camera.late_ms(camera.stamp(40.0)) == 0.0, "nothing faster is known yet"
-    assert camera.read(0.0) == [None] and camera.late_ms(camera.stamp(40.0)) == pytest.approx(40.0)
+    assert camera.read(0.0) == [None]
+    assert camera.late_ms(camera.stamp(40.0)) == pytest.approx(40.0)
 
 
 def test_mocap_reader_after_a_pause_uses_newest_pose_without_jump() -> None:
@@ -51,19 +52,20 @@ def test_mocap_reader_after_a_pause_uses_newest_pose_without_jump() -> None:
 
 
 @pytest.mark.parametrize(("late_ms", "why"), [(10.0, "duplicate"), (9.5, "duplicate"), (12.0, "reordered")])
-def test_what_is_not_newer_is_refused(late_ms: float, why: str) -> None:
+def test_mocap_pose_that_is_not_newer_is_refused(late_ms: float, why: str) -> None:
     camera = running()
     assert camera.read(late_ms) == [why]
     assert camera.read(0.0) == [None]
 
 
-def test_what_is_too_late_or_from_the_future_is_refused() -> None:
+def test_mocap_pose_too_old_or_in_future_is_refused() -> None:
     camera = running()
     camera.now_ns += 1000 * MS
     assert camera.read(MAX_LATE_NS / MS + 1) == ["late"]
     assert camera.read(MAX_LATE_NS / MS - 1) == [None]
     assert camera.read(-51.0) == ["future"]
-    assert camera.read(0.0) == [None] and camera.times.jumps == 0
+    assert camera.read(0.0) == [None]
+    assert camera.times.jumps == 0
 
 
 @pytest.mark.parametrize("jump_ms", [3_600_000, -3_600_000, 500, -500])
@@ -72,7 +74,8 @@ def test_a_clock_that_jumped_is_believed_after_some_readings(jump_ms: int) -> No
     camera.ahead_ns += jump_ms * MS
     verdicts = [camera.read(0.0)[0] for _ in range(READINGS_TO_BELIEVE + 5)]
     why = "future" if jump_ms > 0 else "reordered"
-    assert verdicts == [why] * (READINGS_TO_BELIEVE - 1) + [None] * 6 and camera.times.jumps == 1
+    assert verdicts == [why] * (READINGS_TO_BELIEVE - 1) + [None] * 6
+    assert camera.times.jumps == 1
     assert camera.late_ms(camera.stamp(3.0)) == pytest.approx(3.0), "by the new clock"
 
 
@@ -80,7 +83,8 @@ def test_strange_stamps_that_do_not_agree_are_never_believed() -> None:
     camera, rng = running(), random.Random(3)
     for _ in range(200):
         assert camera.read(-1000.0 * rng.randrange(1, 10**6)) == ["future"]
-    assert camera.times.jumps == 0 and camera.read(0.0) == [None]
+    assert camera.times.jumps == 0
+    assert camera.read(0.0) == [None]
 
 
 def test_one_stamp_for_ever_is_a_duplicate_and_no_jump() -> None:

@@ -47,9 +47,11 @@ def test_parameters_of_a_geared_module_describe_its_own_shaft() -> None:
     own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
     first, second = (plan_parameters(robot, CanSettings(), ReportSchedule(100.0))[node] for node in (1, 2))
-    assert first[ModuleParameter.TORQUE_LIMIT] == 7.0 and first[ModuleParameter.ANGLE_LIMIT] == 1.5708
+    assert first[ModuleParameter.TORQUE_LIMIT] == 7.0
+    assert first[ModuleParameter.ANGLE_LIMIT] == 1.5708
     assert second[ModuleParameter.STIFFNESS] == first[ModuleParameter.STIFFNESS] / 4
-    assert (second[ModuleParameter.TORQUE_LIMIT], second[ModuleParameter.SPEED_LIMIT]) == (3.0, 15.0)
+    assert second[ModuleParameter.TORQUE_LIMIT] == 3.0
+    assert second[ModuleParameter.SPEED_LIMIT] == 15.0
     assert second[ModuleParameter.ANGLE_LIMIT] == pytest.approx(1.9), "from 0.5 - 2.4 to 0.5 + 0.8 rad"
     check_ratings(robot, {2: {ModuleParameter.RATED_TORQUE: 3.0, ModuleParameter.RATED_SPEED: 15.0}})
 

@@ -29,7 +29,8 @@ def test_forces_of_another_sync_are_ignored_and_old_ones_dropped() -> None:
     made = reading()
     begin(made, contacts=True)
     made.process_frame(contact(2, made.sync - 1, force_x=9.0))
-    assert made.list_contacts() == [] and made.contacts_missing == JOINTS
+    assert made.list_contacts() == []
+    assert made.contacts_missing == JOINTS
     made.process_frame(contact(2, made.sync, force_x=1.0))
     made.process_frame(contact(2, made.sync, force_x=5.0))
     assert [raw[0] for _, raw in made.list_contacts()] == [20], "the first counts"
@@ -80,11 +81,14 @@ def test_a_heartbeat_tells_state_faults_and_reason() -> None:
     made = reading()
     made.process_frame(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1))
     module = made.modules[1]
-    assert (module.state, module.last_stop) == (ModuleState.FAULT, LastStop.LEAK)
-    assert module.fault_names() == ["leak", "voltage"] and module.needs_clearing
+    assert module.state == ModuleState.FAULT
+    assert module.last_stop == LastStop.LEAK
+    assert module.fault_names() == ["leak", "voltage"]
+    assert module.needs_clearing
     assert module.heartbeat_sync == made.sync
     made.process_frame(heartbeat(2, 1.1))
-    assert module.fault_names() == [] and not module.needs_clearing
+    assert module.fault_names() == []
+    assert not module.needs_clearing
 
 
 @pytest.mark.parametrize("state", [ModuleState.FAULT, ModuleState.EMERGENCY])
@@ -109,14 +113,16 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
         made.process_frame(Frame(frame.id, b""))
         assert made.malformed == 2 * (i + 1)
     before[1].frames = made.modules[1].frames
-    assert made.modules == before and made.health() == [None] * JOINTS
+    assert made.modules == before
+    assert made.health() == [None] * JOINTS
 
 
 def test_strangers_are_counted_by_node() -> None:
     made = reading()
     for node in (4, 4, LAST_NODE, 0):
         made.process_frame(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
-    assert made.unknown_nodes == {4: 2, LAST_NODE: 1, 0: 1} and not made.from_other_host
+    assert made.unknown_nodes == {4: 2, LAST_NODE: 1, 0: 1}
+    assert not made.from_other_host
 
 
 # --- whatever comes ----------------------------------------------------------------------------------------
@@ -143,7 +149,9 @@ def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(frames: list[F
         changed = np.flatnonzero((made.shaft_values() != before).any(axis=0)).tolist()
         assert changed in ([], [parse_node(frame.id) - 1] if is_state else [])
         assert made.complete in (True, False)
-        assert made.list_contacts() is not None and made.take_imu_reports() is not None and len(made.health()) == JOINTS
+        assert made.list_contacts() is not None
+        assert made.take_imu_reports() is not None
+        assert len(made.health()) == JOINTS
 
 
 @given(st.integers(1, JOINTS), st.integers(0, 63))
@@ -152,4 +160,5 @@ def test_no_single_wrong_bit_moves_a_joint(node: int, bit: int) -> None:
     begin(made)
     whole = int.from_bytes(joint_state(node, made.sync, 0.9).data, "little") ^ 1 << bit
     made.process_frame(Frame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
-    assert angles(made) == pytest.approx([0.1] * JOINTS) and made.modules[node - 1].corrupt == 1
+    assert angles(made) == pytest.approx([0.1] * JOINTS)
+    assert made.modules[node - 1].corrupt == 1

@@ -57,11 +57,13 @@ def test_joint_state_age_is_reported_and_valid_for_the_lease() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
     fresh = sensors.make_samples(7, 70 * 10**6).joints
-    assert (fresh.tick, fresh.timestamp_ns) == (7, 70 * 10**6)
+    assert fresh.tick == 7
+    assert fresh.timestamp_ns == 70 * 10**6
     assert fresh.angle_rad == pytest.approx([0.5] * JOINTS)
     assert fresh.velocity_rad_s == pytest.approx([-1.0] * JOINTS)
     assert fresh.torque_nm == pytest.approx([2.0] * JOINTS)
-    assert fresh.age_ns == [0] * JOINTS and fresh.valid == [True] * JOINTS
+    assert fresh.age_ns == [0] * JOINTS
+    assert fresh.valid == [True] * JOINTS
     for missed in range(1, 9):
         syncs(reading, 1, [1, 2, 4], angle=0.6)
         joints = sensors.make_samples(7 + missed, 0).joints
@@ -70,11 +72,12 @@ def test_joint_state_age_is_reported_and_valid_for_the_lease() -> None:
         assert joints.angle_rad == pytest.approx([0.6, 0.6, 0.5, 0.6])
 
 
-def test_what_was_never_heard_is_not_valid() -> None:
+def test_joint_state_never_received_is_invalid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
-    assert joints.valid == [True, True, False, True] and joints.age_ns[2] == NO_STATE_AGE_NS
+    assert joints.valid == [True, True, False, True]
+    assert joints.age_ns[2] == NO_STATE_AGE_NS
     assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), "a zero that nobody may believe"
 
 
@@ -93,7 +96,7 @@ def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
     assert not any(contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300))
 
 
-def test_nothing_touched_is_an_empty_list() -> None:
+def test_contacts_without_touch_are_an_empty_list() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     begin(reading, contacts=True)
     reading.process_frame(contact(2, reading.sync, touched=False, force_x=9.0))
@@ -102,22 +105,25 @@ def test_nothing_touched_is_an_empty_list() -> None:
     )
 
 
-def test_a_touch_is_told_in_the_frame_of_its_link() -> None:
+def test_contact_is_in_the_frame_of_its_link() -> None:
     run = config(**EVERYTHING)
     reading, sensors = sensors_of(run)
     begin(reading, contacts=True)
     reading.process_frame(contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2))
     (found,) = contacts_of(sensors.make_samples(3, 30)).contacts
     radius_m = run.robot.module.radius_m
-    assert found.link == 2 and found.obstacle is None and found.torque_l == (0.0, 0.0, 0.0)
+    assert found.link == 2
+    assert found.obstacle is None
+    assert found.torque_l == (0.0, 0.0, 0.0)
     assert found.position_l == pytest.approx((0.04, 0.0, radius_m))
     assert found.normal_l == pytest.approx((0.0, 0.0, -1.0)), "from the obstacle into the body"
     assert found.force_l == pytest.approx((1.0, -3.0, 0.0))
     frame = np.array((found.normal_l, found.tangent_1_l, found.tangent_2_l))
-    assert np.allclose(frame @ frame.T, np.eye(3)) and found.tangent_1_l[0] > 0
+    assert np.allclose(frame @ frame.T, np.eye(3))
+    assert found.tangent_1_l[0] > 0
 
 
-def test_what_is_weaker_than_the_robots_threshold_is_left_out() -> None:
+def test_contact_below_threshold_of_robot_is_omitted() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0))
     begin(reading, contacts=True)
     for node, force in ((1, 0.9), (2, 1.0), (3, -1.05)):
@@ -165,9 +171,7 @@ def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-4, 4), st.floats(0.01, 0.2), st.floats(0.005, 0.1))
-def test_whatever_is_told_is_a_place_on_the_capsule(
-    along_m: float, bearing: float, length_m: float, radius_m: float
-) -> None:
+def test_contact_position_is_on_the_capsule(along_m: float, bearing: float, length_m: float, radius_m: float) -> None:
     outward, point = locate_on_capsule(along_m, bearing, length_m, radius_m)
     assert math.hypot(*outward) == pytest.approx(1.0)
     axis_m = min(max(point[0], 0.0), length_m)
@@ -187,7 +191,10 @@ def test_an_imu_message_holds_only_what_is_new() -> None:
     reading.process_frame(accelerometer(3, 0, 9.81))
     reading.process_frame(gyro(1, 0, 0.5))
     found = sensors.make_samples(1, 10).others[keys.IMU]
-    assert isinstance(found, Imu) and (found.tick, found.timestamp_ns, found.link) == (1, 10, [3])
+    assert isinstance(found, Imu)
+    assert found.tick == 1
+    assert found.timestamp_ns == 10
+    assert found.link == [3]
     assert found.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
     assert found.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
     assert keys.IMU not in sensors.make_samples(2, 0).others
@@ -201,10 +208,15 @@ def test_power_sample_at_two_hertz_marks_unknown_values_invalid() -> None:
     due = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).others]
     assert due == [0, 50, 100]
     found = sensors.make_samples(50, 7).others[keys.POWER]
-    assert isinstance(found, Power) and (found.tick, found.timestamp_ns) == (50, 7)
-    assert found.valid == [False, True, False, True] and found.leak == [False, True, False, False]
-    assert found.voltage_v[1] == pytest.approx(23.5) and found.current_a[1] == pytest.approx(-1.5)
-    assert (found.motor_c[1], found.board_c[1]) == (-10.0, 40.0)
+    assert isinstance(found, Power)
+    assert found.tick == 50
+    assert found.timestamp_ns == 7
+    assert found.valid == [False, True, False, True]
+    assert found.leak == [False, True, False, False]
+    assert found.voltage_v[1] == pytest.approx(23.5)
+    assert found.current_a[1] == pytest.approx(-1.5)
+    assert found.motor_c[1] == -10.0
+    assert found.board_c[1] == 40.0
     assert all(len(column) == JOINTS for column in (found.voltage_v, found.current_a, found.motor_c, found.board_c))
 
 

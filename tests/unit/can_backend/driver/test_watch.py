@@ -76,7 +76,7 @@ def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, aft
 
 @pytest.mark.parametrize("speak", [quiet, frozen, miscounting, corrupt, doubled])
 @pytest.mark.parametrize("length", [1, 2])
-def test_glitches_tell_nothing_however_often(speak: Speak, length: int) -> None:
+def test_watch_glitches_report_nothing(speak: Speak, length: int) -> None:
     bench = Bench()
     for _ in range(20):
         assert bench.ticks(length, speak) == []
@@ -84,16 +84,18 @@ def test_glitches_tell_nothing_however_often(speak: Speak, length: int) -> None:
 
 
 @pytest.mark.parametrize("bad", [corrupt, miscounting])
-def test_a_module_that_talks_nonsense_is_not_silent(bad: Speak) -> None:
+def test_watch_module_with_invalid_frames_is_not_silent(bad: Speak) -> None:
     bench = Bench()
-    assert bench.ticks(2, bad) == [] and bench.tick(quiet) == []
+    assert bench.ticks(2, bad) == []
+    assert bench.tick(quiet) == []
     assert bench.ticks(1) == []
 
 
 def test_watch_module_never_received_is_reported_only_as_silent() -> None:
     reading, watch = ModuleReports(1), ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
     found = [f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]]
-    assert said(found) == [("module_silent", 0)] and found[0].cause.endswith("ms")
+    assert said(found) == [("module_silent", 0)]
+    assert found[0].cause.endswith("ms")
 
 
 def test_watch_silent_module_with_heartbeat_differs_from_dead_one() -> None:
@@ -121,8 +123,10 @@ def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
     bench = Bench()
     found = restarting(bench) + bench.ticks(10)
     assert said(found) == [("module_restarted", 1)]
-    assert found[0].cause.startswith(WHO + "has restarted") and "0.20 s" in found[0].cause
-    assert bench.watch.take_changed() == {1} and bench.watch.take_changed() == set()
+    assert found[0].cause.startswith(WHO + "has restarted")
+    assert "0.20 s" in found[0].cause
+    assert bench.watch.take_changed() == {1}
+    assert bench.watch.take_changed() == set()
     bench.reset()
     assert bench.ticks(10) == []
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
@@ -133,7 +137,8 @@ def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
     assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
     (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
-    assert said([found]) == [("module_not_configured", 1)] and not found.alone
+    assert said([found]) == [("module_not_configured", 1)]
+    assert not found.alone
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}) == []
 
 
@@ -160,7 +165,9 @@ def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
     bench.isolated = {1}
     assert bench.ticks(9, answering(ModuleState.FAULT)) == []
     (found,) = bench.ticks(9, HOT_AND_WET)
-    assert found.what == "module_overheat" and found.joint == 1 and not found.alone
+    assert found.what == "module_overheat"
+    assert found.joint == 1
+    assert not found.alone
 
 
 def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
@@ -168,7 +175,8 @@ def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
     bench.isolated = {1}
     stopped = reporting(ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1)
     (found,) = bench.ticks(9, stopped)
-    assert found.what == "module_overheat" and not found.alone
+    assert found.what == "module_overheat"
+    assert not found.alone
 
 
 def test_water_after_heat_is_told_again_with_all_reasons() -> None:

@@ -28,8 +28,10 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
     bench = Bench()
     error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
     (found,) = bench.tick(errors=[error])
-    assert (found.what, found.joint) == (kind, None)
-    assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
+    assert found.what == kind
+    assert found.joint is None
+    assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ")
+    assert advice in found.cause
     assert bench.tick(errors=[error]) == []
     assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
     bench.reset()
@@ -49,7 +51,8 @@ def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
     for unsent in ("can1", "can1", "", "can1", "can1"):
         assert bench.tick(unsent=unsent) == [], "full for a moment"
     (found,) = bench.tick(unsent="can1")
-    assert (found.what, found.joint) == ("bus_stuck", None)
+    assert found.what == "bus_stuck"
+    assert found.joint is None
     for words in ("can1: ", "no frames sent for 30 ms", "no node acknowledges", "txqueuelen is below 64"):
         assert words in found.cause
     assert bench.tick(unsent="can1") == []
@@ -81,10 +84,12 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
         (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
     ],
 )
-def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
+def test_bus_watch_reports_a_second_host(frame: Frame, what: str, words: str) -> None:
     bench, speak = Bench(), answering(ModuleState.DISARMED, frame)
     (found,) = bench.tick(speak)
-    assert (found.what, found.joint) == (what, None) and words in found.cause
+    assert found.what == what
+    assert found.joint is None
+    assert words in found.cause
     assert bench.tick(speak) == []
     bench.reset()
     assert bench.tick() == [], "it was there once and is no more"
@@ -98,10 +103,11 @@ def test_what_another_host_may_have_changed_is_written_anew() -> None:
     assert bench.watch.take_changed() == {0, 1, 2}
 
 
-def test_who_asks_who_is_there_is_no_second_host() -> None:
+def test_bus_watch_identity_request_is_no_second_host() -> None:
     bench = Bench()
     bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
-    assert bench.tick() == [] and bench.watch.take_changed() == set()
+    assert bench.tick() == []
+    assert bench.watch.take_changed() == set()
 
 
 def test_a_module_is_not_silent_that_was_not_asked() -> None:

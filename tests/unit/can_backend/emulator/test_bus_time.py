@@ -19,7 +19,8 @@ def frame(opcode: Opcode, node: int, mark: int = 0) -> Frame:
 def test_a_frame_is_there_when_its_last_bit_is():
     bus = BusTime()
     bus.enqueue(1, frame(Opcode.JOINT_STATE, 1), 100.0)
-    assert bus.take_sent_frames(100.0 + FULL - 1) == [] and bus.next_us() == 100.0 + FULL
+    assert bus.take_sent_frames(100.0 + FULL - 1) == []
+    assert bus.next_us() == 100.0 + FULL
     assert len(bus.take_sent_frames(100.0 + FULL)) == 1
 
 
@@ -82,18 +83,22 @@ def test_a_babbler_fills_what_the_others_leave():
 def test_bus_measured_load_equals_computed_and_no_answer_is_late(joints: int, rate_hz: int):
     late, before, after, _ = run_at(joints, rate_hz)
     assert after.load_since(before) == pytest.approx(bus_load(joints, ReportSchedule(rate_hz)), rel=0.05)
-    assert set(late) == {0} and after.replaced == 0
+    assert set(late) == {0}
+    assert after.replaced == 0
 
 
 @pytest.mark.parametrize("joints", [13, 30])
 def test_too_much_traffic_is_late_and_the_backlog_is_bounded(joints: int):
     _, before, after, backlog = run_at(joints, 200)
     assert after.load_since(before) == pytest.approx(1.0, abs=0.03)
-    assert after.replaced > 0 and backlog <= 9 * joints and after.late_us > 5000
+    assert after.replaced > 0
+    assert backlog <= 9 * joints
+    assert after.late_us > 5000
 
 
 def test_every_opcode_is_counted():
     _, before, after, _ = run_at(4, 100, 1.0)
     rows = {opcode: frames for opcode, frames, _ in traffic_by_opcode(before, after)}
-    assert rows[Opcode.SYNC] == 100 and rows[Opcode.SET_POINT] == 400
+    assert rows[Opcode.SYNC] == 100
+    assert rows[Opcode.SET_POINT] == 400
     assert rows[Opcode.JOINT_STATE] == pytest.approx(400, abs=4)

@@ -100,7 +100,8 @@ def test_chain_two_buses_with_same_sync_share_one_step():
     for tick in range(3):
         for channel in (0, 1):
             made.receive(channel, make_sync(tick, tick * 10_000))
-    assert physics_model.steps == 20 and made.modules_per_bus == [3, 2]
+    assert physics_model.steps == 20
+    assert made.modules_per_bus == [3, 2]
     assert [s["count"] for s in only(made.take_frames(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
     made.receive(1, make_command(CommandAction.ARM))
     assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
@@ -115,12 +116,14 @@ def test_chain_contact_force_is_measured_by_neighbor_links():
     frames = made.take_frames(0)
     contacts = only(frames, Opcode.CONTACT)
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
-    assert contacts[1]["force_y"] == pytest.approx(12.0) and contacts[1]["force_z"] == pytest.approx(204.75)
+    assert contacts[1]["force_y"] == pytest.approx(12.0)
+    assert contacts[1]["force_z"] == pytest.approx(204.75)
     assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(-np.pi), (
         "half a turn"
     )
     [tail] = only(frames, Opcode.TAIL_CONTACT)
-    assert tail["force_y"] == pytest.approx(-5.0) and tail["bearing"] == 0.0
+    assert tail["force_y"] == pytest.approx(-5.0)
+    assert tail["bearing"] == 0.0
 
 
 def test_neighbours_take_turns_with_their_imus():
@@ -130,7 +133,8 @@ def test_neighbours_take_turns_with_their_imus():
     for tick in range(4):
         made.receive(0, make_sync(tick, 0))
         gyros = only(made.take_frames(0), Opcode.GYRO)
-        assert len(gyros) == 1 and gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
+        assert len(gyros) == 1
+        assert gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
     made.receive(0, make_sync(4, 0))
     frames = made.take_frames(0)
     assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
@@ -145,7 +149,8 @@ def test_the_pose_is_sent_once_a_sync_before_the_answers():
             made.receive(channel, make_sync(tick, tick * 10_000))
     assert len(sent) == 3
     sample = msgspec.json.decode(sent[0], type=MocapSample)
-    assert sample.position_w == POSE.position_w and sample.angular_velocity_w == POSE.angular_velocity_w
+    assert sample.position_w == POSE.position_w
+    assert sample.angular_velocity_w == POSE.angular_velocity_w
 
 
 def run_of(seed: int) -> tuple[list, list]:
@@ -157,7 +162,8 @@ def run_of(seed: int) -> tuple[list, list]:
 
 def test_the_same_commands_give_the_same_frames():
     frames, states = run_of(1)
-    assert (frames, states) == run_of(1) and states == [ModuleState.ARMED] * 4
+    assert (frames, states) == run_of(1)
+    assert states == [ModuleState.ARMED] * 4
     assert frames != run_of(2)[0]
     angles = [s["angle"] for s in only(frames[49], Opcode.JOINT_STATE)]
     assert angles == pytest.approx([0.3] * 4, abs=0.01)
@@ -180,7 +186,8 @@ def test_chain_in_real_time_catches_up_only_short_pauses():
     made.advance_to(150_000.0)
     assert physics_model.steps == 150
     made.advance_to(1_150_000.0)
-    assert physics_model.steps == 350 and made.skipped_us == 1e6 - MAX_AT_ONCE_US
+    assert physics_model.steps == 350
+    assert made.skipped_us == 1e6 - MAX_AT_ONCE_US
     made.advance_to(1_160_000.0)
     assert physics_model.steps == 360
 
@@ -192,10 +199,13 @@ def test_overheating_fades_torque_before_it_stops():
     frames = host.ticks(10, 4.0, Mode.TORQUE)
     states = only(frames, Opcode.JOINT_STATE)
     assert [s["derated"] for s in states] == [0, 1, 0, 0]
-    assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01) and states[0]["torque"] > 3.9
+    assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01)
+    assert states[0]["torque"] > 3.9
 
 
 def test_chain_values_out_of_range_saturate_without_error():
-    assert ANGLE.to_raw(99.0) == 32767 and ANGLE.to_raw(-99.0) == -32768
+    assert ANGLE.to_raw(99.0) == 32767
+    assert ANGLE.to_raw(-99.0) == -32768
     assert ANGLE.to_raw_array(np.array([np.nan, np.inf, -np.inf, 0.1])) == [0, 32767, -32768, 1000]
-    assert FORCE.to_raw(float("inf")) == 4095 and ALONG.to_raw(float("nan")) == 0
+    assert FORCE.to_raw(float("inf")) == 4095
+    assert ALONG.to_raw(float("nan")) == 0

@@ -25,6 +25,6 @@ def test_emulator_typed_fault_starts_or_ends_immediately():
         "kill:control@1",
     ],
 )
-def test_wrong_texts_are_told_what_is_allowed(text: str):
+def test_emulator_invalid_fault_text_is_refused(text: str):
     with raises_error(ConfigError, code=("injection/unknown-fault", "injection/unknown-target")):
         parse_fault(text, 4)

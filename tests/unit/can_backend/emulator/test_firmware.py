@@ -49,10 +49,12 @@ def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
     module.receive(make_command(CommandAction.ARM), 50 * MS)
     module.sync(1, QUIET)
     module.poll(99 * MS)
-    assert module.frames == [] and module.state == ModuleState.BOOT
+    assert module.frames == []
+    assert module.state == ModuleState.BOOT
     module.poll(100 * MS)
     [beat] = only(module.frames, Opcode.HEARTBEAT)
-    assert beat["state"] == ModuleState.DISARMED and beat["uptime"] == pytest.approx(0.1)
+    assert beat["state"] == ModuleState.DISARMED
+    assert beat["uptime"] == pytest.approx(0.1)
     assert len(module.frames) == 1
 
 
@@ -76,7 +78,8 @@ def test_firmware_fault_remains_until_cause_is_gone_and_cleared(sensed: str, fau
     module.health.leak, module.health.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
     module.poll(BOOTED + MS)
     [beat] = only(module.frames, Opcode.HEARTBEAT)
-    assert beat[f"fault_{fault.name.lower()}"] == 1 and beat["last_stop"] == LastStop[fault.name]
+    assert beat[f"fault_{fault.name.lower()}"] == 1
+    assert beat["last_stop"] == LastStop[fault.name]
     module.health.winding_c = 80.0 if sensed == "hot" else 20.0
     module.receive(make_command(CommandAction.CLEAR), BOOTED + 2 * MS)
     assert module.state == ModuleState.FAULT
@@ -84,7 +87,8 @@ def test_firmware_fault_remains_until_cause_is_gone_and_cleared(sensed: str, fau
     module.poll(BOOTED + 3 * MS)
     assert module.state == ModuleState.FAULT, "latched"
     module.receive(make_command(CommandAction.CLEAR), BOOTED + 3 * MS)
-    assert module.state == ModuleState.DISARMED and module.faults == 0
+    assert module.state == ModuleState.DISARMED
+    assert module.faults == 0
 
 
 @pytest.mark.parametrize(
@@ -103,9 +107,11 @@ def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(fir
     module = armed()
     drive(module, first, BOOTED, target=1.0)
     drive(module, count, BOOTED, target=2.0)
-    assert module.demand.target == pytest.approx(2.0 if taken else 1.0) and module.refused == (not taken)
+    assert module.demand.target == pytest.approx(2.0 if taken else 1.0)
+    assert module.refused == (not taken)
     drive(module, count + 1, BOOTED, target=3.0)
-    assert module.demand.target == pytest.approx(3.0) and module.state == ModuleState.ARMED
+    assert module.demand.target == pytest.approx(3.0)
+    assert module.state == ModuleState.ARMED
 
 
 def test_set_points_without_syncs_do_not_keep_a_module_alive():
@@ -114,7 +120,8 @@ def test_set_points_without_syncs_do_not_keep_a_module_alive():
     for k in range(1, 30):
         module.receive_setpoint(setpoint(k, Mode.PASSIVE), BOOTED + k * 10 * MS)
         module.poll(BOOTED + k * 10 * MS)
-    assert module.state == ModuleState.FAULT and module.last_stop == LastStop.WATCHDOG
+    assert module.state == ModuleState.FAULT
+    assert module.last_stop == LastStop.WATCHDOG
     assert module.demand.mode == Mode.PASSIVE
 
 
@@ -123,7 +130,9 @@ def test_a_wrong_checksum_is_as_if_nothing_had_come():
     drive(module, 0, BOOTED, target=1.0)
     module.receive_setpoint(corrupted(setpoint(1, target=2.0)), BOOTED + 50 * MS)
     module.sync(1, QUIET)
-    assert module.demand.target == pytest.approx(1.0) and module._fed_us == BOOTED and module.refused == 1
+    assert module.demand.target == pytest.approx(1.0)
+    assert module._fed_us == BOOTED
+    assert module.refused == 1
 
 
 def test_stopping_damps_until_at_rest():
@@ -131,13 +140,15 @@ def test_stopping_damps_until_at_rest():
     drive(module, 0, BOOTED)
     module.health.speed_rad_s = 3.0
     module.receive(make_command(CommandAction.STOP), BOOTED)
-    assert module.state == ModuleState.STOPPING and module.demand[:2] == (Mode.VELOCITY, 0.0)
+    assert module.state == ModuleState.STOPPING
+    assert module.demand[:2] == (Mode.VELOCITY, 0.0)
     assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == Mode.VELOCITY
     module.poll(BOOTED + 50 * MS)
     assert module.state == ModuleState.STOPPING
     module.health.speed_rad_s = 0.04
     module.poll(BOOTED + 51 * MS)
-    assert module.state == ModuleState.DISARMED and module.demand.mode == Mode.PASSIVE
+    assert module.state == ModuleState.DISARMED
+    assert module.demand.mode == Mode.PASSIVE
     assert module.last_stop == LastStop.STOP
 
 
@@ -170,7 +181,8 @@ def test_a_reboot_forgets_what_was_not_saved():
     [beat] = only(module.frames, Opcode.HEARTBEAT)
     assert beat["uptime"] == pytest.approx(0.1)
     values = module.parameters.values
-    assert values[ModuleParameter.STIFFNESS] == 0.0 and values[ModuleParameter.DAMPING] == 2.0
+    assert values[ModuleParameter.STIFFNESS] == 0.0
+    assert values[ModuleParameter.DAMPING] == 2.0
 
 
 def test_firmware_uptime_saturates_at_end_of_range() -> None:
@@ -200,7 +212,8 @@ def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bri
     module.frames.clear()
     module.sync(4, QUIET)
     [state] = only(module.frames, Opcode.JOINT_STATE)
-    assert state["count"] == 3 and module.demand.mode == Mode.TORQUE
+    assert state["count"] == 3
+    assert module.demand.mode == Mode.TORQUE
     for k in range(1, 300):
         module.poll(BOOTED + k * MS)
         assert (module.demand.mode == Mode.PASSIVE) == (k >= 100)
@@ -246,7 +259,8 @@ def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
         before, state, refused = module._fed_us, module.state, module.refused
         give(module, frame, now_us)
         if module._fed_us != before and state == ModuleState.ARMED and module.state == ModuleState.ARMED:
-            assert frame.id >> 6 == Opcode.SET_POINT and module.refused == refused
+            assert frame.id >> 6 == Opcode.SET_POINT
+            assert module.refused == refused
         if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
             assert module.demand.mode == Mode.PASSIVE
 
@@ -256,4 +270,5 @@ def test_it_is_driven_down_to_18_v_and_not_below(voltage_v: float, faults: int) 
     module = armed()
     module.health.voltage_v = voltage_v
     module.poll(BOOTED + 10 * MS)
-    assert (module.faults, module.state) == (faults, ModuleState.FAULT if faults else ModuleState.ARMED)
+    assert module.faults == faults
+    assert module.state == (ModuleState.FAULT if faults else ModuleState.ARMED)

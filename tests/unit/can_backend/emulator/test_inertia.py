@@ -32,13 +32,15 @@ def test_released_joint_comes_to_rest_without_reversing():
     for _ in range(200):
         made.advance(np.zeros(3))
         speeds.append(made.velocity_rad_s[0])
-    assert min(speeds) == 0.0 and speeds[-1] == 0.0
+    assert min(speeds) == 0.0
+    assert speeds[-1] == 0.0
 
 
 def test_an_end_stop_takes_all_motion():
     made = physics_model()
     push(made, 4.0, 0.5)
-    assert made.angle_rad == pytest.approx([1.5] * 3) and made.velocity_rad_s == pytest.approx([0.0] * 3)
+    assert made.angle_rad == pytest.approx([1.5] * 3)
+    assert made.velocity_rad_s == pytest.approx([0.0] * 3)
     push(made, -4.0, 0.005)
     assert (made.velocity_rad_s < 0).all()
 
@@ -49,6 +51,8 @@ def test_a_whole_number_of_steps_makes_a_period():
     assert steps == pytest.approx(4.0)
 
 
-def test_there_is_no_world():
+def test_inertia_emulator_has_no_world():
     made = physics_model()
-    assert made.loads() == [] and made.imu() is None and made.pose() is None
+    assert made.loads() == []
+    assert made.imu() is None
+    assert made.pose() is None

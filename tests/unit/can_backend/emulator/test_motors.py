@@ -49,7 +49,8 @@ def test_motor_mode_change_moves_torque_at_motor_response(mode):
         motors.step(REST, REST)
     drive(motors, mode, -3.0)
     after = motors.step(REST, REST)[0]
-    assert abs(after - 3.0) <= 2 * RATED_NM * (10 + 1) * (1 - np.exp(-STEP_S / RESPONSE_S)) and after > -RATED_NM
+    assert abs(after - 3.0) <= 2 * RATED_NM * (10 + 1) * (1 - np.exp(-STEP_S / RESPONSE_S))
+    assert after > -RATED_NM
     motors, _ = motor()
     drive(motors, Mode.TORQUE, 3.0)
     motors.torque_nm[:] = 3.0

@@ -27,7 +27,8 @@ def test_parameter_range_ends_can_be_written_in_single_precision(index):
     module = booted()
     for end in (PARAMETERS[index].low, PARAMETERS[index].high):
         result, value = ask(module, index, end)
-        assert result == ParameterResult.DONE and value == pytest.approx(end, rel=1e-6)
+        assert result == ParameterResult.DONE
+        assert value == pytest.approx(end, rel=1e-6)
 
 
 @pytest.mark.parametrize(

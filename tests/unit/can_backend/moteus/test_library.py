@@ -79,7 +79,8 @@ def test_moteus_command_frame_equals_that_of_its_library(law: dict[str, float]) 
         protocol.encode_subframe(protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0),
     )
     assert parse_registers(ours.data).command == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
-    assert as_frame(sent, 5).id == ours.id and len(ours.data) == 48
+    assert as_frame(sent, 5).id == ours.id
+    assert len(ours.data) == 48
     read = [one for one in protocol.decode_subframes(bytes(sent.data)) if one.kind == protocol.WRITE]
     values = {one.register + k: value for one in read for k, value in enumerate(one.values)}
     assert values == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
@@ -90,8 +91,10 @@ def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
     assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
     asked = protocol.make_frame(0, 1, *MOTION, reply=True)
     assert asked.id == as_frame(theirs().make_query()).id == 0x8001
-    assert to_python_can(asked, fd=True).is_extended_id and not to_python_can(Frame(0x100, b""), fd=True).is_extended_id
-    assert len(protocol.make_frame(0, 1, *HEALTH).data) == 6 and len(protocol.make_frame(0, 1, *MOTION).data) == 5
+    assert to_python_can(asked, fd=True).is_extended_id
+    assert not to_python_can(Frame(0x100, b""), fd=True).is_extended_id
+    assert len(protocol.make_frame(0, 1, *HEALTH).data) == 6
+    assert len(protocol.make_frame(0, 1, *MOTION).data) == 5
     assert parse_registers(protocol.make_frame(0, 1, *IDENTITY).data).query == [
         (0x102, moteus.INT32),
         (0x00C, moteus.INT8),
@@ -118,7 +121,8 @@ def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
         if (message := ours.recv(0)) is None:
             return {}
         result = parse_message(message)
-        assert result.id == number and message.is_fd
+        assert result.id == number
+        assert message.is_fd
         return result.values
 
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
@@ -129,7 +133,8 @@ def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
     for kind, close in zip(TYPES, (0.01, 0.0002, 0.0002, 0.0002), strict=True):
         fields = dict.fromkeys((0, 1, 2, 3, 13, 14, 15), kind)
         said = ask(client.make_custom_query(fields))
-        assert said[moteus.Register.MODE] == moteus.Mode.POSITION and said[moteus.Register.FAULT] == 0
+        assert said[moteus.Register.MODE] == moteus.Mode.POSITION
+        assert said[moteus.Register.FAULT] == 0
         assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
         assert said[moteus.Register.VOLTAGE] == pytest.approx(emulator.body.read_supply(2)[0], abs=0.3)
     clock.robot_ns += 150_000_000
@@ -159,13 +164,15 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
         backend.advance()
     backend.close()
     read = [parse_registers(frame.data) for frame in sent]
-    assert all(one.command or one.query for one in read) and not any(one.errors for one in read)
+    assert all(one.command or one.query for one in read)
+    assert not any(one.errors for one in read)
     command = next(one.command for one in read if len(one.command) > 2)
     motor = CONFIG.robot.joint_table[0].motor
     kp = command[moteus.Register.COMMAND_KP_SCALE] * configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
     assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
     assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
-    assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5 and joints.valid == [True] * JOINTS
+    assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5
+    assert joints.valid == [True] * JOINTS
 
 
 @pytest.mark.parametrize("number", [0, 127])

@@ -49,22 +49,23 @@ def test_odrive_database_and_our_codec_read_each_other(message: MessageId) -> No
     spare = [0, 0] if message is MessageId.HEARTBEAT else []
     frame = encode_message(0, message, *ours, *spare)
     read = theirs.decode(frame.data.ljust(8, b"\0"), decode_choices=False)
-    assert frame.id == theirs.frame_id and {key: read[key] for key in values} == pytest.approx(values)
+    assert frame.id == theirs.frame_id
+    assert {key: read[key] for key in values} == pytest.approx(values)
     data = theirs.encode({signal.name: 0 for signal in theirs.signals} | values)
     assert PAYLOADS[message].unpack(data[: PAYLOADS[message].size])[: len(ours)] == pytest.approx(ours)
 
 
 def test_messages_without_data_and_ids_of_other_axes_are_theirs() -> None:
     assert DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id == encode_message(0, MessageId.CLEAR_ERRORS).id
-    assert encode_message(0, MessageId.CLEAR_ERRORS) == Frame(24, b"") and encode_request(3, MessageId.MOTION) == Frame(
-        3 << 5 | 9, b""
-    )
+    assert encode_message(0, MessageId.CLEAR_ERRORS) == Frame(24, b"")
+    assert encode_request(3, MessageId.MOTION) == Frame(3 << 5 | 9, b"")
     assert split_id(Frame(62 << 5 | 0x1B, b"")) == (62, MessageId.SET_VELOCITY_GAINS)
 
 
 def test_states_modes_and_senders_are_theirs() -> None:
     states = DATABASE.get_message_by_name("Axis0_Heartbeat").get_signal_by_name("Axis_State").choices
-    assert (states[AxisState.IDLE].name, states[AxisState.CLOSED_LOOP].name) == ("IDLE", "CLOSED_LOOP_CONTROL")
+    assert states[AxisState.IDLE].name == "IDLE"
+    assert states[AxisState.CLOSED_LOOP].name == "CLOSED_LOOP_CONTROL"
     modes = DATABASE.get_message_by_name("Axis0_Set_Controller_Mode").get_signal_by_name("Control_Mode").choices
     assert [modes[one].name for one in ControlMode] == ["TORQUE_CONTROL", "VELOCITY_CONTROL", "POSITION_CONTROL"]
     theirs = {message: DATABASE.get_message_by_name(f"Axis0_{name}") for message, (name, _) in SAME.items()}

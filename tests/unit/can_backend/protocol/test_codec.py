@@ -73,7 +73,9 @@ def test_every_value_comes_back_within_half_a_step(
     layout, signal = of
     value = data.draw(st.floats(signal.low, signal.high))
     frame = layout.encode(node, **{signal.name: value})
-    assert (parse_opcode(frame.id), parse_node(frame.id), len(frame.data)) == (layout.opcode, node, layout.length)
+    assert parse_opcode(frame.id) == layout.opcode
+    assert parse_node(frame.id) == node
+    assert len(frame.data) == layout.length
     assert abs(layout.decode(frame.data)[signal.name] - value) <= slack(signal, value)
 
 
@@ -88,7 +90,7 @@ def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: S
 
 @each_signal
 @pytest.mark.parametrize("wrong", ["above", "below", math.nan, math.inf, -math.inf])
-def test_what_does_not_fit_is_refused_in_words(layout: MessageLayout, signal: Signal, wrong: float | str) -> None:
+def test_codec_value_out_of_range_is_refused(layout: MessageLayout, signal: Signal, wrong: float | str) -> None:
     step = 1e32 if signal.is_float else signal.scale
     value = {"above": signal.high + step, "below": signal.low - step}[wrong] if isinstance(wrong, str) else wrong
     with pytest.raises(CodecError) as caught:
@@ -137,11 +139,12 @@ def test_a_writer_writes_what_a_reader_reads(layout: MessageLayout, data: st.Dat
     frame = layout.make_writer(*names)(node, [numbers[name] for name in names])
     assert layout.make_reader(*names)(frame.data) == tuple(numbers[name] for name in names)
     if layout.opcode in WITH_CHECKSUM:
-        assert has_valid_checksum(frame) and frame.data[-1] == checksum(frame.id, frame.data[:-1])
+        assert has_valid_checksum(frame)
+        assert frame.data[-1] == checksum(frame.id, frame.data[:-1])
 
 
 @each_layout
-def test_what_is_not_named_is_zero(layout: MessageLayout) -> None:
+def test_codec_unnamed_signals_are_zero(layout: MessageLayout) -> None:
     frame = layout.encode(7)
     payload = frame.data[:-1] if layout.opcode in WITH_CHECKSUM else frame.data
     assert not any(payload)

@@ -83,14 +83,14 @@ TOLD: dict[tuple[LifecycleState, LifecycleState], list[Frame]] = {
 
 @pytest.mark.parametrize("before", LIFECYCLES)
 @pytest.mark.parametrize("now", LIFECYCLES)
-def test_what_all_modules_are_told_at_a_change(before: LifecycleState, now: LifecycleState) -> None:
+def test_commands_on_state_change_address_all_modules(before: LifecycleState, now: LifecycleState) -> None:
     assert commands.make_transition_frames(before, now) == TOLD.get((before, now), [])
     assert before == now or (before, now) in TOLD
 
 
 @pytest.mark.parametrize("lifecycle", LIFECYCLES)
 @pytest.mark.parametrize("state", list(ModuleState))
-def test_what_a_module_is_reminded_of(lifecycle: LifecycleState, state: ModuleState) -> None:
+def test_commands_repeat_state_to_a_module_that_differs(lifecycle: LifecycleState, state: ModuleState) -> None:
     expected: Frame | None = None
     if (lifecycle, state) == ("armed", ModuleState.DISARMED):
         expected = commands.make_command(CommandAction.ARM, 3)

@@ -115,7 +115,8 @@ def test_the_table_of_parameters() -> None:
 def test_the_worked_example_of_the_checksum() -> None:
     frame = commands.make_command(CommandAction.ARM, NODE)
     text = section("Checksum")
-    assert f"`{frame.id:03X}`" in text and f"`{frame.data.hex(' ').upper()}`" in text
+    assert f"`{frame.id:03X}`" in text
+    assert f"`{frame.data.hex(' ').upper()}`" in text
     crc = frame.id
     for byte in frame.data[:-1]:  # as the C code there does it
         crc ^= byte << 8
@@ -224,7 +225,8 @@ EVENTS: dict[str, Callable[[ModuleFirmware], None]] = {
 @pytest.mark.parametrize("state", list(ModuleState))
 def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: ModuleState) -> None:
     table = {row[0]: row[1:] for row in rows("States and events")}
-    assert table["motor"][:2] == ["off", "off"] and set(EVENTS) | {"motor"} == set(table)
+    assert table["motor"][:2] == ["off", "off"]
+    assert set(EVENTS) | {"motor"} == set(table)
     said = table[event][state]
     module = module_in(state)
     happens = EVENTS[event]

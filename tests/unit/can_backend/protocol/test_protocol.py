@@ -74,7 +74,7 @@ def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
     assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
 
 
-def test_directions() -> None:
+def test_protocol_messages_have_the_declared_direction() -> None:
     for message in DATABASE.messages:
         host = Opcode(message.frame_id >> NODE_BITS) in FROM_HOST
         assert message.senders == (["Host"] if host else ["Module"]), message.name
@@ -86,7 +86,8 @@ def test_checksum_is_last_byte_of_messages_that_have_one() -> None:
         assert ("checksum" in layout.signals) == (opcode in WITH_CHECKSUM)
         if opcode in WITH_CHECKSUM:
             signal = layout.signals["checksum"]
-            assert (signal.shift, signal.bits) == (8 * layout.length - 8, 8)
+            assert signal.shift == 8 * layout.length - 8
+            assert signal.bits == 8
 
 
 def test_signals_of_a_message_overlap_only_for_setpoint_targets() -> None:

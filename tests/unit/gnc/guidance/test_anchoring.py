@@ -35,7 +35,7 @@ def pegs(apart_m: float = 0.0) -> list[Obstacle]:
     return found
 
 
-def felt(side: int = 1, force_n: float = 10.0) -> list[Contact]:
+def pushes(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     """side: -1 for pushes from where no peg is."""
     return [
         contact(
@@ -62,7 +62,7 @@ def held(off_w, obstacles, contacts, trust=ESTIMATED, turns: int = 20) -> Locali
 @pytest.mark.parametrize(("trust", "turns"), [(ESTIMATED, 20), (MEASURED, 1000)])
 @pytest.mark.parametrize("off_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
 def test_three_contacts_on_known_pegs_bring_the_pose_back(trust, turns, off_w):
-    localizer = held(np.array(off_w), pegs(), felt(), trust, turns)
+    localizer = held(np.array(off_w), pegs(), pushes(), trust, turns)
     assert np.abs(localizer.base.planar_w - TRUE_W).max() < 0.006
     assert localizer.position_sd_m < 0.02
 
@@ -73,7 +73,7 @@ def test_anchoring_body_never_overlaps_a_peg():
     assert np.linalg.norm((after - TRUE_W)[:2]) < 0.7 * np.linalg.norm((before - TRUE_W)[:2])
 
 
-@pytest.mark.parametrize("contacts", [[], felt(side=-1), felt(force_n=0.1)], ids=["none", "other side", "weak"])
+@pytest.mark.parametrize("contacts", [[], pushes(side=-1), pushes(force_n=0.1)], ids=["none", "other side", "weak"])
 def test_pegs_that_are_not_felt_move_nothing(contacts):
     start = held(np.zeros(3), pegs(apart_m=0.02), contacts, turns=0)
     later = held(np.zeros(3), pegs(apart_m=0.02), contacts)
@@ -82,4 +82,4 @@ def test_pegs_that_are_not_felt_move_nothing(contacts):
 
 
 def test_without_obstacles_there_is_nothing_to_hold_on_to():
-    assert held(np.zeros(3), [], felt()).base.planar_w.tolist() == TRUE_W.tolist()
+    assert held(np.zeros(3), [], pushes()).base.planar_w.tolist() == TRUE_W.tolist()

@@ -37,12 +37,14 @@ def errors_m(scan, obstacles) -> np.ndarray:
 )
 def test_points_lie_on_what_stands_there(ground, eye, median_m, max_m):
     off = errors_m(look(SCENE, turned(0.1), ground=ground, eye=eye), SCENE)
-    assert len(off) > 20 and np.median(off) < median_m and off.max() < max_m
+    assert len(off) > 20
+    assert np.median(off) < median_m
+    assert off.max() < max_m
 
 
 @pytest.mark.slow
 @given(st.floats(-0.6, 0.6), st.floats(-0.1, 0.15), st.floats(-0.15, 0.15))
-def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
+def test_depth_scan_points_are_right_with_rotated_head(yaw, pitch, roll):
     scan = look(SCENE, turned(yaw, pitch, roll))
     off = errors_m(scan, SCENE)
     assert len(off) == 0 or (np.median(off) < 0.004 and off.max() < 0.02)
@@ -51,13 +53,14 @@ def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
 def test_depth_scan_averages_noise_and_bridges_dropouts():
     scan = look(SCENE, turned(0.0), eye=Eye(0.004, 0.004, 0.1))
     off = errors_m(scan, SCENE)
-    assert len(off) > 20 and np.median(off) < 0.003
+    assert len(off) > 20
+    assert np.median(off) < 0.003
     hits = np.flatnonzero(np.isfinite(scan.range_m) & (scan.range_m < 0.7))
     assert set(np.diff(hits)) == {1}
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_hills_are_ground(seed):
+def test_depth_scan_hills_are_ground(seed):
     ground = hills(0.02 + 0.01 * seed, 1.5)
     at = (0.7 * seed, 0.3 * seed)
     scan = look([], turned(0.4 * seed), ground=ground, eye=Eye(0.002, 0.003, 0.01, np.random.default_rng(seed)), at=at)
@@ -75,7 +78,8 @@ def test_free_space_ends_at_the_first_obstacle():
 
 def test_nothing_seen_is_nothing_known():
     dark = look(SCENE, turned(0.0), eye=Eye(dropout=1.0))
-    assert not np.isfinite(dark.range_m).any() and not dark.free_m.any()
+    assert not np.isfinite(dark.range_m).any()
+    assert not dark.free_m.any()
 
 
 def test_a_lidar_sees_the_same_shapes_all_around():
@@ -83,7 +87,8 @@ def test_a_lidar_sees_the_same_shapes_all_around():
     around = [*SCENE, cylinder("left", 0.1, 0.5)]
     scan = make_scan(lidar(around, position, rotation), position, rotation, 0.0, Noise())
     off = errors_m(scan, around)
-    assert len(off) > 30 and off.max() < 1e-6
+    assert len(off) > 30
+    assert off.max() < 1e-6
     names = {min(around, key=lambda o: abs(outline_distance_m(o, p))).name for p in scan.points_w if np.isfinite(p[0])}
     assert names == {"near", "far", "block", "left"}
 

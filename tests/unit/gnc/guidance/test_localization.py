@@ -19,14 +19,16 @@ def errors_m(drive: Drive, places) -> list[float]:
 def test_localization_with_pose_sensor_is_at_least_as_certain():
     drive = Drive([])
     off = errors_m(drive, drive.turns(100, images=False))
-    assert np.median(off[5:]) < 0.0008 and drive.world.localizer.position_sd_m < 0.001
+    assert np.median(off[5:]) < 0.0008
+    assert drive.world.localizer.position_sd_m < 0.001
 
 
 def test_dead_reckoning_knows_how_wrong_it_is():
     drive = Drive([])
     off = errors_m(drive, drive.turns(250, pose=False, images=False))
     sd = drive.world.localizer.position_sd_m
-    assert off[-1] < 0.15 and off[-1] < 3 * sd  # of 1 m that it has gone
+    assert off[-1] < 0.15
+    assert off[-1] < 3 * sd  # of 1 m that it has gone
     assert drive.world.localizer.position_sd_m > 0.02
     assert abs(drive.world.localizer.base.planar_w[2] - drive.place(drive.turn - 1).base_w[2]) < 0.02
 
@@ -46,7 +48,8 @@ def test_the_map_corrects_dead_reckoning():
         drive.world.localizer.pose_timestamp_ns = None
         off[images] = errors_m(drive, drive.turns(250, pose=False, images=images))[-1]
         assert off[images] < 4 * drive.world.localizer.position_sd_m
-    assert off[True] < 0.5 * off[False] and off[True] < 0.03
+    assert off[True] < 0.5 * off[False]
+    assert off[True] < 0.03
 
 
 def test_a_pose_that_jumps_is_not_believed_until_it_stays():
@@ -54,7 +57,8 @@ def test_a_pose_that_jumps_is_not_believed_until_it_stays():
     *_, here = drive.turns(50, images=False)
     for here in drive.turns(10, pose=False, images=False):
         drive.world.add_pose(drive.pose(here, off_m=0.3))
-    assert abs(drive.world.localizer.base.planar_w[0] - here.base_w[0]) < 0.03 and drive.world.localizer.refused == 10
+    assert abs(drive.world.localizer.base.planar_w[0] - here.base_w[0]) < 0.03
+    assert drive.world.localizer.refused == 10
     for here in drive.turns(20, pose=False, images=False):
         drive.world.add_pose(drive.pose(here, off_m=0.3))
     assert drive.world.localizer.base.planar_w[0] == pytest.approx(here.base_w[0] + 0.3, abs=0.005)
@@ -84,7 +88,8 @@ def test_localization_history_returns_body_only_at_stored_timestamps():
     assert history.body_at(59 * STEP_NS + 10 * STEP_NS) is None
     history.shift(np.array(places[50].base_w[:2]), np.array([0.1, 0.0, 0.0]))
     moved = history.base_at(55 * STEP_NS)
-    assert moved is not None and moved.planar_w[0] == pytest.approx(places[55].base_w[0] + 0.1)
+    assert moved is not None
+    assert moved.planar_w[0] == pytest.approx(places[55].base_w[0] + 0.1)
 
 
 def test_quaternions_go_there_and_back():

@@ -35,11 +35,13 @@ def only(map_, now_ns=0) -> Obstacle:
     return reported
 
 
-def test_what_is_seen_again_and_again_is_believed_more():
+def test_map_obstacle_seen_repeatedly_gains_confidence():
     once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
     reported = only(often)
     assert only(once).confidence < 0.65
-    assert reported.confidence > 0.9 and reported.last_seen_ns == 5 * S // 20 and not reported.touched
+    assert reported.confidence > 0.9
+    assert reported.last_seen_ns == 5 * S // 20
+    assert not reported.touched
     assert only(often, now_ns=120 * S).confidence < reported.confidence  # belief fades
 
 
@@ -50,7 +52,9 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     for angle in angles:
         touch(map_, (0.5, 0.2), radius, angle)
     reported = only(map_)
-    assert reported.touched and reported.name.startswith("touched") and reported.shape == "cylinder"
+    assert reported.touched
+    assert reported.name.startswith("touched")
+    assert reported.shape == "cylinder"
     off = math.dist(reported.position_w[:2], (0.5, 0.2))
     assert off < 3 * reported.position_sd_m + 0.005
 
@@ -60,13 +64,15 @@ def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
     reported = only(map_)
-    assert reported.touched and reported.name == name
-    assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0] and map_.find_track(np.array([0.5, 0.5])) is None
+    assert reported.touched
+    assert reported.name == name
+    assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0]
+    assert map_.find_track(np.array([0.5, 0.5])) is None
     touch(map_, (0.8, 0.4), 0.05, 3.0)
     assert len(map_.obstacles(0, 0.0)) == 2
 
 
-def test_what_one_can_see_through_is_dropped():
+def test_map_obstacle_seen_through_is_dropped():
     map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
     for k in range(8):
         map_.add_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k))
@@ -74,7 +80,7 @@ def test_what_one_can_see_through_is_dropped():
     assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
-def test_what_is_hidden_or_out_of_view_is_kept():
+def test_map_obstacle_hidden_or_out_of_view_is_kept():
     map_ = mapped(cylinder("a", 1.2, 0.0))
     for k in range(20):
         map_.add_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
@@ -84,13 +90,14 @@ def test_what_is_hidden_or_out_of_view_is_kept():
     assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
-def test_what_the_body_passes_through_does_not_exist():
+def test_map_obstacle_inside_the_body_is_dropped():
     map_ = mapped(cylinder("smoke", 0.6, 0.0), cylinder("beside", 0.6, 0.3))
     for k in range(40):
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
         map_.carve_body(axis, BODY_M)
     reported = map_.obstacles(0, 0.0)
-    assert len(reported) == 1 and math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
+    assert len(reported) == 1
+    assert math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
 
 
 def test_where_the_body_lies_nothing_reaches():
@@ -98,7 +105,9 @@ def test_where_the_body_lies_nothing_reaches():
     for k in range(4):  # one face of a box: how deep it is, is a guess
         map_.add_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
     axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
-    assert (outer := only(map_)).half_size_m and _depth_beyond(outer, axis) > 0.02
+    outer = only(map_)
+    assert outer.shape == "box"
+    assert _depth_beyond(outer, axis) > 0.02
     for _ in range(5):
         map_.carve_body(axis, BODY_M)
     assert _depth_beyond(only(map_), axis) < 0.012

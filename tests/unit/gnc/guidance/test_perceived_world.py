@@ -34,17 +34,22 @@ def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
 @pytest.mark.slow  # a lidar maps the same below
 def test_a_field_is_mapped_to_millimetres():
     total = scored(Drive(random_field(1)), 200)
-    assert len(total.position_m) > 30 and total.visible > 20
-    assert np.median(total.position_m) < 0.005 and np.median(total.surface_m) < 0.003
-    assert total.misses <= 0.05 * total.visible and total.ghosts <= 0.02 * total.reported
-    assert np.median(total.in_sd) < 1.5 and np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be
+    assert len(total.position_m) > 30
+    assert total.visible > 20
+    assert np.median(total.position_m) < 0.005
+    assert np.median(total.surface_m) < 0.003
+    assert total.misses <= 0.05 * total.visible
+    assert total.ghosts <= 0.02 * total.reported
+    assert np.median(total.in_sd) < 1.5
+    assert np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be
 
 
 @pytest.mark.slow  # a whole run on hills is in tests/system/physics/test_locomotion.py
-def test_so_it_is_on_hills():
+def test_perceived_field_on_hills_is_mapped():
     total = scored(Drive(random_field(2), ground=hills(0.02, 1.5)), 200)
     assert np.median(total.position_m) < 0.008
-    assert total.misses <= 0.1 * total.visible and total.ghosts <= 0.05 * total.reported
+    assert total.misses <= 0.1 * total.visible
+    assert total.ghosts <= 0.05 * total.reported
 
 
 @pytest.mark.slow
@@ -73,9 +78,11 @@ def test_perceived_samples_without_body_pose_are_counted_and_ignored():
     )
     drive.world.add_joints(broken, None, None)
     drive.world.add_look(image, NOISE)
-    assert sum(drive.world.refused.values()) == 3 and len(drive.world.refused) == 3
+    assert sum(drive.world.refused.values()) == 3
+    assert len(drive.world.refused) == 3
     after = reported(drive)
-    assert after.depth_timestamp_ns == before.depth_timestamp_ns and len(after.obstacles) == len(before.obstacles)
+    assert after.depth_timestamp_ns == before.depth_timestamp_ns
+    assert len(after.obstacles) == len(before.obstacles)
 
 
 @pytest.mark.slow
@@ -87,7 +94,8 @@ def test_perceived_world_after_streams_end_grows_uncertain():
     assert len(before.obstacles) > 3
     list(drive.turns(100, pose=False, images=False, imu=False))
     after = reported(drive)
-    assert after.pose_timestamp_ns == before.pose_timestamp_ns and after.depth_timestamp_ns == before.depth_timestamp_ns
+    assert after.pose_timestamp_ns == before.pose_timestamp_ns
+    assert after.depth_timestamp_ns == before.depth_timestamp_ns
     assert after.base_confidence < before.base_confidence
     assert (after.base_position_sd_m or 0) > 5 * (before.base_position_sd_m or 1)
     seen = {o.name: o for o in before.obstacles}
@@ -103,9 +111,11 @@ def test_perceived_contact_has_the_name_used_in_the_map():
     for _ in drive.turns(10, images=False):
         drive.world.add_contacts(Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch]))
     world = drive.world.make_world(9, 9 * STEP_NS)
-    assert world is not None and world.contacts
+    assert world is not None
+    assert world.contacts
     assert {c.obstacle for c in world.contacts} <= {o.name for o in world.obstacles}
-    assert all(o.touched for o in world.obstacles) and "simulator" not in repr(world)
+    assert all(o.touched for o in world.obstacles)
+    assert "simulator" not in repr(world)
 
 
 def test_a_lidar_maps_as_a_camera_does():
@@ -115,7 +125,9 @@ def test_a_lidar_maps_as_a_camera_does():
         beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], timestamp_ns=drive.turn * STEP_NS)
         drive.world.add_look(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
     total = score(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
-    assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
+    assert len(total.position_m) == 2
+    assert max(total.position_m) < 0.005
+    assert not total.ghosts
 
 
 def test_before_the_first_joint_state_there_is_no_world():

@@ -17,7 +17,7 @@ from snakesim_testing.gnc.rendered import box, cylinder, scanned
 NOISE_M = 0.002
 
 
-def seen(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
+def track_shape(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
     """A track of what a lidar saw of one obstacle, from some places."""
     track = Track(1, "it")
     for x, y in views:
@@ -33,7 +33,7 @@ def seen(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
     return track
 
 
-def test_things_apart_are_find_clusters_their_own():
+def test_shapes_of_separate_objects_are_separate_clusters():
     things = [
         cylinder("a", 0.8, 0.3),
         cylinder("b", 0.8, 0.1),
@@ -58,18 +58,19 @@ def test_a_concave_corner_is_two_things():
 @given(st.floats(0.03, 0.08), st.floats(0.3, 1.2), st.floats(-0.5, 0.5), st.integers(0, 1000))
 @settings(max_examples=60)
 def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
-    track = seen(cylinder("it", x, y, radius), random=np.random.default_rng(seed))
+    track = track_shape(cylinder("it", x, y, radius), random=np.random.default_rng(seed))
     off = math.dist(track.center_w, (x, y))
     assert off < 5 * track.position_sd_m
     if track.shape == "cylinder":  # seen by five beams, one in thousands is taken for a box
-        assert off < 0.02 and abs(track.radius_m - radius) < 5 * track.size_sd_m
+        assert off < 0.02
+        assert abs(track.radius_m - radius) < 5 * track.size_sd_m
 
 
 @given(st.floats(0.08, 0.3), st.floats(0.08, 0.3), st.floats(0.35, 1.2), st.integers(0, 1000))
 @settings(max_examples=60)
 def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
     truth = box("it", 0.8, 0.1, (length, width), yaw)
-    track = seen(truth, random=np.random.default_rng(seed), views=((0.0, 0.0), (0.0, 0.5), (0.0, -0.3)))
+    track = track_shape(truth, random=np.random.default_rng(seed), views=((0.0, 0.0), (0.0, 0.5), (0.0, -0.3)))
     assert track.shape == "box"
     assert math.dist(track.center_w, (0.8, 0.1)) < 0.025
     assert sorted(2 * track.half_m) == pytest.approx(sorted((length, width)), abs=0.04)
@@ -78,23 +79,26 @@ def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
 
 
 def test_shape_with_single_visible_face_marks_depth_as_guess():
-    one = seen(box("it", 0.8, 0.0, (0.1, 0.16)))
-    assert one.shape == "box" and one.position_sd_m > 0.015  # its back side is open
+    one = track_shape(box("it", 0.8, 0.0, (0.1, 0.16)))
+    assert one.shape == "box"
+    assert one.position_sd_m > 0.015  # its back side is open
     face = one.center_w[0] - min(one.half_m)
-    assert abs(one.center_w[1]) < 0.01 and (
-        abs(face - 0.75) < 0.01 or abs(one.center_w[0] - max(one.half_m) - 0.75) < 0.01
-    )
-    around = seen(box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6)))
-    assert around.position_sd_m < 0.01 and math.dist(around.center_w, (0.8, 0.0)) < 0.01
+    assert abs(one.center_w[1]) < 0.01
+    assert abs(face - 0.75) < 0.01 or abs(one.center_w[0] - max(one.half_m) - 0.75) < 0.01
+    around = track_shape(box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6)))
+    assert around.position_sd_m < 0.01
+    assert math.dist(around.center_w, (0.8, 0.0)) < 0.01
 
 
 def test_a_long_face_is_a_thin_wall():
-    wall = seen(box("it", 0.8, 0.0, (0.04, 1.0)))
-    assert wall.shape == "box" and min(wall.half_m) < 0.04 and max(wall.half_m) == pytest.approx(0.5, abs=0.05)
+    wall = track_shape(box("it", 0.8, 0.0, (0.04, 1.0)))
+    assert wall.shape == "box"
+    assert min(wall.half_m) < 0.04
+    assert max(wall.half_m) == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_short_arc_leaves_the_line_of_sight_uncertain():
-    whole, part = seen(cylinder("it", 0.8, 0.0)), Track(2, "part")
+    whole, part = track_shape(cylinder("it", 0.8, 0.0)), Track(2, "part")
     few = slice(len(whole.surface) // 2 - 2, len(whole.surface) // 2 + 2)
     part.surface.add(whole.surface.points_w[few], np.full(4, NOISE_M), whole.surface.outward_w[few])
     fit_shapes([part])
@@ -114,11 +118,12 @@ def test_fusing_looks_lowers_the_scatter_and_the_told_error():
     random, truth = np.random.default_rng(3), cylinder("it", 0.8, 0.1)
 
     def scatter_m(looks: int) -> tuple[float, float]:
-        found = [seen(truth, random=random, views=((0.0, 0.0),) * looks, noise_m=0.005) for _ in range(30)]
+        found = [track_shape(truth, random=random, views=((0.0, 0.0),) * looks, noise_m=0.005) for _ in range(30)]
         return float(np.std([t.center_w[0] for t in found])), float(np.median([t.position_sd_m for t in found]))
 
     once, often = scatter_m(1), scatter_m(10)
-    assert often[0] < 0.5 * once[0] and often[1] < 0.7 * once[1]
+    assert often[0] < 0.5 * once[0]
+    assert often[1] < 0.7 * once[1]
     assert often[1] > often[0]  # it is not thought better than it is
 
 

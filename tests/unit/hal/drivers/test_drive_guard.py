@@ -52,7 +52,8 @@ def test_guard_driver_pause_counts_until_states_are_read(bench: Bench) -> None:
 
 def test_guard_enables_only_armed_drives_and_keeps_damped_ones(bench: Bench) -> None:
     assert bench.in_fault() == NONE
-    assert bench.armed() == BOTH and bench.in_fault() == BOTH
+    assert bench.armed() == BOTH
+    assert bench.in_fault() == BOTH
     assert bench.guard.drives_to_command(frozenset({0}), may_enable=False) == {0}
     assert bench.in_fault() == {0}, "the other one was let go"
 
@@ -62,7 +63,8 @@ def test_guard_faulty_drive_is_disabled_until_reset(bench: Bench) -> None:
     bench.finds(None)
     assert bench.armed() == BOTH, "a finding of the bus"
     bench.finds(1)
-    assert bench.armed() == {0} and bench.in_fault() == {0}
+    assert bench.armed() == {0}
+    assert bench.in_fault() == {0}
     bench.guard.reset(frozenset({0}))
     assert bench.armed() == {0}, "another joint was reset"
     bench.guard.reset(BOTH)
@@ -82,8 +84,10 @@ def test_guard_stale_drive_report_right_after_reset_is_ignored(bench: Bench) -> 
 
 def test_guard_drives_disabled_by_bus_stay_off_until_reset(bench: Bench) -> None:
     assert not bench.guard.release_drives(), "none was driven"
-    assert bench.armed() == BOTH and bench.guard.release_drives()
-    assert bench.armed() == NONE and bench.in_fault() == NONE
+    assert bench.armed() == BOTH
+    assert bench.guard.release_drives()
+    assert bench.armed() == NONE
+    assert bench.in_fault() == NONE
     bench.guard.reset(BOTH)
     assert bench.armed() == BOTH
 

@@ -35,7 +35,7 @@ def sent(way: Disturbance, messages: list[bytes] = MESSAGES, step_s: float = STE
     out: list[tuple[float, bytes]] = []
     for i, message in enumerate(messages):
         now_s = i * step_s
-        out += [(now_s, payload) for payload in way.due(now_s) + way.put(message, now_s)]
+        out += [(now_s, payload) for payload in way.due(now_s) + way.disturb(message, now_s)]
     while (now_s := way.next_s()) < inf:
         out += [(now_s, payload) for payload in way.due(now_s)]
     return out
@@ -71,16 +71,17 @@ def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[Inje
 def test_when_all_is_over_everything_is_as_before(chosen: list[Injection], at: int) -> None:
     way = disturbed(*chosen)
     for message in MESSAGES[:at]:
-        way.put(message, 0.0)
+        way.disturb(message, 0.0)
     for fault in chosen:
         way.end(fault.kind, 0.0)
     while way.next_s() < inf:
         way.due(way.next_s())
     assert way.over
-    assert way.put(b"new", 9.0) == [b"new"] and way.over
+    assert way.disturb(b"new", 9.0) == [b"new"]
+    assert way.over
 
 
-def test_the_seed_decides() -> None:
+def test_disturbance_depends_only_on_its_seed() -> None:
     first, again, other = (sent(disturbed(on("drop", 0.5), seed=seed)) for seed in ("1", "1", "2"))
     assert first == again != other
 
@@ -101,32 +102,39 @@ def test_disturbance_reordered_message_follows_its_successor() -> None:
 
 def test_a_held_message_goes_out_when_the_reordering_ends() -> None:
     way = disturbed(on("reorder"))
-    assert way.put(b"1", 0.0) == []
-    assert way.end("reorder", 0.0) == [b"1"] and way.over
+    assert way.disturb(b"1", 0.0) == []
+    assert way.end("reorder", 0.0) == [b"1"]
+    assert way.over
 
 
 def test_disturbance_delay_has_configured_length_and_keeps_order() -> None:
     way = disturbed(on("delay", 0.05))
     out = sent(way)
     late_s = [when - int(payload) * STEP_S for when, payload in out]
-    assert len(late_s) == len(MESSAGES) and min(late_s) > 0.0499 and max(late_s) < 0.0501 + STEP_S
-    way.put(b"late", 10.0)
-    assert way.end("delay", 10.01) == [] and not way.over
-    assert way.put(b"prompt", 10.02) == []
-    assert way.due(10.049) == [] and way.due(10.05) == [b"late", b"prompt"] and way.over
+    assert len(late_s) == len(MESSAGES)
+    assert min(late_s) > 0.0499
+    assert max(late_s) < 0.0501 + STEP_S
+    way.disturb(b"late", 10.0)
+    assert way.end("delay", 10.01) == []
+    assert not way.over
+    assert way.disturb(b"prompt", 10.02) == []
+    assert way.due(10.049) == []
+    assert way.due(10.05) == [b"late", b"prompt"]
+    assert way.over
 
 
 def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
     way = disturbed(on("flood", 1000.0))
     assert way.next_s() == inf, "there is nothing to repeat yet"
-    assert way.put(b"1", 1.0) == [b"1"]
+    assert way.disturb(b"1", 1.0) == [b"1"]
     repeated = [way.due(1.0 + i / 1000) for i in range(100)]
     assert 100 <= sum(map(len, repeated)) <= 101
-    way.put(b"2", 1.2)
+    way.disturb(b"2", 1.2)
     assert set(way.due(1.3)) == {b"2"} and len(way.due(99.0)) == MAX_AT_ONCE, "a hiccup is not made up for"
     assert way.due(99.0) == []
     way.end("flood", 99.0)
-    assert way.over and way.due(100.0) == []
+    assert way.over
+    assert way.due(100.0) == []
 
 
 # --- bytes ---------------------------------------------------------------------------------------------------
@@ -148,7 +156,9 @@ def test_disturbance_corrupted_payloads_are_refused_by_decoders() -> None:
             taken += 1
         except WireError:
             refused += 1
-    assert min(lengths) == 0 and max(lengths) > len(payload) and len(lengths) > 100
+    assert min(lengths) == 0
+    assert max(lengths) > len(payload)
+    assert len(lengths) > 100
     assert refused > 5_000 and taken > 1_000, "some still make sense: what those ask for is the limiter's to judge"
 
 

@@ -64,7 +64,8 @@ def bench() -> Bench:
 
 def test_without_a_fault_everything_is_the_backends(bench: Bench) -> None:
     assert bench.sample().angle_rad == [0.02] * 3
-    assert bench.backend.describe().backend == "lag" and bench.backend.faults() == []
+    assert bench.backend.describe().backend == "lag"
+    assert bench.backend.faults() == []
 
 
 def test_a_mute_joint_says_nothing_and_its_age_grows(bench: Bench) -> None:
@@ -73,16 +74,20 @@ def test_a_mute_joint_says_nothing_and_its_age_grows(bench: Bench) -> None:
     assert [joints.angle_rad[1] for joints in reported] == [0.01] * 3
     assert [joints.valid for joints in reported] == [[True, False, True]] * 3
     assert [joints.age_ns[1] for joints in reported] == [PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS]
-    assert reported[-1].angle_rad[0] == pytest.approx(0.04) and reported[-1].age_ns[0] == 0
+    assert reported[-1].angle_rad[0] == pytest.approx(0.04)
+    assert reported[-1].age_ns[0] == 0
     bench.inject("mute:joint_2", begins=False)
     back = bench.sample()
-    assert back.valid == [True] * 3 and back.age_ns == [0] * 3 and back.angle_rad[1] == pytest.approx(0.05)
+    assert back.valid == [True] * 3
+    assert back.age_ns == [0] * 3
+    assert back.angle_rad[1] == pytest.approx(0.05)
 
 
 def test_a_frozen_joint_repeats_itself_and_grows_old(bench: Bench) -> None:
     bench.inject("freeze:joint_1")
     reported = [bench.sample() for _ in range(3)]
-    assert [joints.angle_rad[0] for joints in reported] == [0.01] * 3 and all(joints.valid[0] for joints in reported)
+    assert [joints.angle_rad[0] for joints in reported] == [0.01] * 3
+    assert all(joints.valid[0] for joints in reported)
     assert reported[-1].age_ns == [3 * PERIOD_NS, 0, 0]
 
 
@@ -90,7 +95,8 @@ def test_an_angle_can_be_off_and_can_be_no_number(bench: Bench) -> None:
     bench.inject("wrong:joint_3")
     bench.inject("nan:joint_1")
     reported = bench.sample()
-    assert math.isnan(reported.angle_rad[0]) and reported.angle_rad[1:] == [pytest.approx(0.02), pytest.approx(0.52)]
+    assert math.isnan(reported.angle_rad[0])
+    assert reported.angle_rad[1:] == [pytest.approx(0.02), pytest.approx(0.52)]
     bench.inject("wrong:joint_3", begins=False)
     bench.inject("nan:joint_1", begins=False)
     assert bench.sample().angle_rad == [pytest.approx(0.03)] * 3
@@ -103,7 +109,8 @@ def test_slow_simulator_sample_takes_the_amount(bench: Bench, monkeypatch: pytes
     bench.sample()
     bench.inject("slow:simulator", begins=False)
     bench.sample()
-    assert [seconds > 0.0 for seconds in slept_s] == [True, *[False] * (len(slept_s) - 1)] and slept_s[0] <= 0.05
+    assert [seconds > 0.0 for seconds in slept_s] == [True, *[False] * (len(slept_s) - 1)]
+    assert slept_s[0] <= 0.05
 
 
 def test_injection_is_offered_to_backend_first_else_refused(bench: Bench) -> None:

@@ -116,7 +116,8 @@ def test_cable_turns_are_counted_only_for_declared_real_joints(tmp_path: Path) -
     assert open_cable_file(tmp_path, bench.joints, msgspec.structs.replace(bench.robot, emulated=True)) is None
     bench.file("angle_max_rad = 3.1415\nangle_min_rad = -3.1415")
     no_stops = open_cable_file(tmp_path, bench.joints, bench.robot)
-    assert no_stops is not None and "leave no room for end stops" in no_stops.cables.list_arming_obstacles()[0]
+    assert no_stops is not None
+    assert "leave no room for end stops" in no_stops.cables.list_arming_obstacles()[0]
     bench.file("")
     assert open_cable_file(tmp_path, bench.joints, bench.robot) is None
 

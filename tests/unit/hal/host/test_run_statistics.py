@@ -33,8 +33,11 @@ def test_histogram_counts_each_value_from_shortest_to_longest() -> None:
     for took_us in [100.0] * 90 + [200.0] * 9 + [10_000.0]:
         durations.add(took_us)
     timing = durations.timing()
-    assert timing is not None and timing.count == sum(timing.bins) == 100 and len(timing.bins) <= 16
-    assert timing.median_us == pytest.approx(100, rel=0.05) and timing.p99_us == pytest.approx(200, rel=0.05)
+    assert timing is not None
+    assert timing.count == sum(timing.bins) == 100
+    assert len(timing.bins) <= 16
+    assert timing.median_us == pytest.approx(100, rel=0.05)
+    assert timing.p99_us == pytest.approx(200, rel=0.05)
     assert timing.max_us == pytest.approx(10_000, rel=0.05)
     ends_us = [timing.low_us * 10 ** (timing.bin_decades * (place + 1)) for place in range(len(timing.bins))]
     assert next(sum(timing.bins[: place + 1]) for place, end in enumerate(ends_us) if end > 120) == 90

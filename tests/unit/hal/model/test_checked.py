@@ -44,7 +44,7 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
         (msgspec.structs.replace(CHECKED, joints="0"), robot(), "was changed in its file since anna"),
     ],
 )
-def test_it_counts_for_the_joints_and_drives_that_were_judged(
+def test_check_counts_only_for_judged_joints_and_drives(
     checked: StartCheckRecord | None, here: Description, words: str
 ) -> None:
     found = why_unchecked(checked, JOINTS, here)

@@ -102,7 +102,9 @@ class Wave:
     (tmp_path / "wave.py").write_text(code)
     settings = find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave").Settings
     (doc,) = document_fields(settings)
-    assert (doc.description, doc.unit, doc.default) == ("Phase from joint to joint.", "rad", "0.5")
+    assert doc.description == "Phase from joint to joint."
+    assert doc.unit == "rad"
+    assert doc.default == "0.5"
 
 
 @pytest.mark.parametrize(
@@ -123,7 +125,10 @@ def test_type_unit_range_and_default(
     struct: type[msgspec.Struct], field: str, type_words: str, unit: str, range_words: str, default: str | None
 ) -> None:
     doc = docs_of(struct)[field]
-    assert (doc.type_words, doc.unit, doc.range_words, doc.default) == (type_words, unit, range_words, default)
+    assert doc.type_words == type_words
+    assert doc.unit == unit
+    assert doc.range_words == range_words
+    assert doc.default == default
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,9 @@ def test_fitting_scene_for_same_or_longer_robot_is_unchanged() -> None:
     as_it_is = clutter().scene
     for joints in (8, 13, 30):
         scene = clutter(f"robot.chain.modules={joints}").scene
-        assert (scene.route, scene.pegs_along_route, scene.reference_robot) == (
-            as_it_is.route,
-            as_it_is.pegs_along_route,
-            as_it_is.reference_robot,
-        )
+        assert scene.route == as_it_is.route
+        assert scene.pegs_along_route == as_it_is.pegs_along_route
+        assert scene.reference_robot == as_it_is.reference_robot
 
 
 def test_fitting_scene_for_other_joints_and_radius_scales_it() -> None:
@@ -39,9 +37,8 @@ def test_fitting_scene_for_other_joints_and_radius_scales_it() -> None:
     assert row.corridor_m == pytest.approx(0.035 + share * 0.005)
     beyond_m = before.scene.random_field[0].min_corner_m[0] - sine(before).length_m
     assert field.min_corner_m == pytest.approx((sine(config).length_m + beyond_m, -1.0))
-    assert field.max_corner_m[0] - field.min_corner_m[0] == pytest.approx(4.6) and field.clearance_m == pytest.approx(
-        0.11
-    )
+    assert field.max_corner_m[0] - field.min_corner_m[0] == pytest.approx(4.6)
+    assert field.clearance_m == pytest.approx(0.11)
     assert len(place_obstacles(config)) > 40  # and it lies clear of them
 
 

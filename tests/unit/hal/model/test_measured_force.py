@@ -10,7 +10,8 @@ def test_measured_force_of_blow_equals_push_of_same_impulse() -> None:
     for step in range(25):
         blow.add({"peg": 100.0} if step == 3 else {})
         push.add({"peg": 4.0})
-    assert blow.max_n == pytest.approx(4.0) and push.max_n == pytest.approx(4.0)
+    assert blow.max_n == pytest.approx(4.0)
+    assert push.max_n == pytest.approx(4.0)
 
 
 def test_measured_force_of_each_contact_expires_after_50_ms() -> None:

@@ -51,7 +51,8 @@ def test_plugin_unknown_name_lists_installed_ones_and_how_to_add() -> None:
 def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text(WAVE)
     wave = find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave")
-    assert wave.__name__ == "Wave" and plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
+    assert wave.__name__ == "Wave"
+    assert plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
 
 
 TRAP = """\

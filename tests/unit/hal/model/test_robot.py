@@ -49,14 +49,16 @@ def test_the_description_says_what_the_file_says() -> None:
     assert [joint.axis for joint in described.joints] == ["yaw", "pitch", "yaw"]
     joint = described.joints[1]
     limits, motor = ROBOT["limits"], ROBOT["motor"]
-    assert (joint.angle_min_rad, joint.angle_max_rad) == (-limits["angle_rad"], limits["angle_rad"])
+    assert joint.angle_min_rad == -limits["angle_rad"]
+    assert joint.angle_max_rad == limits["angle_rad"]
     assert joint.speed_limit_rad_s == limits["speed_rad_s"]
     assert joint.acceleration_limit_rad_s2 == limits["acceleration_rad_s2"]
     assert joint.torque_limit_nm == limits["torque_nm"]
     assert joint.torque_rate_limit_nm_s == limits["torque_rate_nm_s"]
     assert joint.stiffness_nm_per_rad == motor["stiffness_nm_per_rad"]
     assert joint.damping_nm_s_per_rad == motor["damping_nm_s_per_rad"]
-    assert (described.stop_mode, described.max_step_rad) == ("damp", 0.3)
+    assert described.stop_mode == "damp"
+    assert described.max_step_rad == 0.3
 
 
 def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
@@ -71,7 +73,10 @@ def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
     for field, value in own.items():
         found = [part for part in (second, *(getattr(second, s) for s in SECTIONS)) if hasattr(part, field)]
         assert {getattr(part, field) for part in found} == {value}, field
-    assert (first.id, third.id, first.drive.gear, first.supply.voltage_v) == (1, 3, 9.0, 24.0)
+    assert first.id == 1
+    assert third.id == 3
+    assert first.drive.gear == 9.0
+    assert first.supply.voltage_v == 24.0
     assert (first.limits.lower_rad, first.limits.upper_rad) == (-1.5, 1.0) == (third.limits.lower_rad, 1.0)
     joints = description(joints={"joint_2": own}, limits__angle_max_rad=1.0).joints
     assert [(joint.angle_min_rad, joint.angle_max_rad) for joint in joints] == [(-1.5, 1.0), (-0.4, 1.2), (-1.5, 1.0)]
@@ -85,8 +90,10 @@ def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
 def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
     own = {"joint_2": {"modes": ["torque", "position"], "measures": ["torque"]}}
     first, second, third = description(drive__modes=["position"], drive__measures=[], joints=own).joints
-    assert first.modes == third.modes == [Mode.PASSIVE, Mode.POSITION] and first.measures == []
-    assert second.modes == [Mode.PASSIVE, Mode.POSITION, Mode.TORQUE] and second.measures == ["torque"]
+    assert first.modes == third.modes == [Mode.PASSIVE, Mode.POSITION]
+    assert first.measures == []
+    assert second.modes == [Mode.PASSIVE, Mode.POSITION, Mode.TORQUE]
+    assert second.measures == ["torque"]
     assert description().joints[0].modes == list(Mode), "all, where nothing is said"
     assert description().joints[0].measures == ["torque", "temperature", "voltage"]
 
@@ -127,14 +134,19 @@ def test_a_robot_may_extend_another_and_say_only_what_differs(tmp_path: Path) ->
     )
     table, plain = read_part(str(file), "robots"), decode(read_part("planar13", "robots"), RobotFile)
     robot = decode(table, RobotFile)
-    assert (robot.name, robot.limits.torque_nm, robot.sensors.range[0].name) == ("worm", 3.0, "front")
-    assert robot.chain == plain.chain and robot.sensors.imu == plain.sensors.imu
+    assert robot.name == "worm"
+    assert robot.limits.torque_nm == 3.0
+    assert robot.sensors.range[0].name == "front"
+    assert robot.chain == plain.chain
+    assert robot.sensors.imu == plain.sensors.imu
     assert table.origin_of("limits.torque_nm") == str(file)
     assert table.origin_of("limits.angle_rad").endswith("planar13.toml")
     more = tmp_path / "more.toml"
     more.write_text('extends = "./worm.toml"\nname = "more"')
     further = decode(read_part(str(more), "robots"), RobotFile)
-    assert (further.name, further.limits.torque_nm, further.chain) == ("more", 3.0, plain.chain)
+    assert further.name == "more"
+    assert further.limits.torque_nm == 3.0
+    assert further.chain == plain.chain
     file.write_text('extends = "./more.toml"')
     with raises_error(ConfigError, code="config/conflict", field="extends"):
         read_part(str(more), "robots")

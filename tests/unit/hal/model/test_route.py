@@ -155,7 +155,8 @@ def test_degenerate_routes_are_refused(points: list[tuple[float, float]]) -> Non
 
 def test_sine_points_begin_at_the_origin_and_end_where_told() -> None:
     points = sine_points(0.1, 0.8, 1.23)
-    assert points[0].tolist() == [0.0, 0.0] and points[-1][0] == pytest.approx(1.23)
+    assert points[0].tolist() == [0.0, 0.0]
+    assert points[-1][0] == pytest.approx(1.23)
     assert np.diff(points[:, 0]).max() <= 0.01 + 1e-12
     assert len(sine_points(0.1, 0.8, 0.001)) == 2
 
@@ -190,7 +191,8 @@ def test_a_laid_chain_bends_the_way_the_route_does() -> None:
     lay = lay_chain(circle(1.0, 3.0), 0.2, [0.1] * 10)
     assert lay.angles_rad == pytest.approx([2 * math.asin(0.05)] * 9, rel=1e-3)
     straight = lay_chain(Route([(0, 0), (0, 5)]), 1.0, [0.1] * 5)
-    assert straight.heading_rad == pytest.approx(math.pi / 2) and np.abs(straight.angles_rad).max() < 1e-9
+    assert straight.heading_rad == pytest.approx(math.pi / 2)
+    assert np.abs(straight.angles_rad).max() < 1e-9
     backwards = lay_chain(circle(1.0, 6.0), 2.8, [0.2] * 5)  # headings pass half a turn: no joint turns by 2 pi
     assert backwards.angles_rad == pytest.approx([2 * math.asin(0.1)] * 4, rel=1e-3)
 

@@ -45,10 +45,15 @@ def with_flags(path: str, *flags: str) -> Loaded:
 
 def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     config = load(write_files(tmp_path)).config
-    assert (config.name, config.robot.name, config.scene.name) == ("crawl", "worm", "bend")
+    assert config.name == "crawl"
+    assert config.robot.name == "worm"
+    assert config.scene.name == "bend"
     assert config.services == {"control": ServiceSchedule(), "guidance": ServiceSchedule(decimation=2)}
-    assert config.robot.sensors.pose is not None and config.robot.sensors.contacts is None
-    assert (config.clock_mode, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
+    assert config.robot.sensors.pose is not None
+    assert config.robot.sensors.contacts is None
+    assert config.clock_mode == "lockstep"
+    assert config.seed == 1
+    assert config.start.tail_s_m == 0.1
     assert config.period_ns == 10_000_000
 
 
@@ -66,7 +71,8 @@ def test_scenario_survey_error_is_the_same_for_all_services() -> None:
     truth = np.array([placed.obstacle.position_w for placed in place_obstacles(off)])
     assert np.array_equal([one.position_w for one in survey_obstacles(exact)], truth)
     errors_m = np.array([one.position_w for one in survey_obstacles(off)]) - truth
-    assert 0.003 < errors_m[:, :2].std() < 0.007 and not errors_m[:, 2].any()
+    assert 0.003 < errors_m[:, :2].std() < 0.007
+    assert not errors_m[:, 2].any()
     assert survey_obstacles(off) == survey_obstacles(off)
     with raises_error(ConfigError, code="config/invalid-value"):
         with_flags("clutter", "mission.map_error_m=0.005")
@@ -90,7 +96,8 @@ def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(
     write_config(config, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == config
     again = load(str(tmp_path / "config.json")).config
-    assert again == config and config_hash(again) == config_hash(config)
+    assert again == config
+    assert config_hash(again) == config_hash(config)
 
 
 def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Path) -> None:
@@ -114,8 +121,11 @@ def test_the_hash_follows_everything_that_matters(change: dict[str, Any], same: 
 
 def test_an_external_service_is_waited_for_and_not_started() -> None:
     own, external = (with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"]))
-    assert own.has_own_control and own.commander == "obstacle_triplet" and "control" in own.own_services
-    assert not external.has_own_control and external.commander == "external"
+    assert own.has_own_control
+    assert own.commander == "obstacle_triplet"
+    assert "control" in own.own_services
+    assert not external.has_own_control
+    assert external.commander == "external"
     policies = [with_flags("triplet", f"controller=policy:{model}").config for model in ("clutter", "./mine.onnx")]
     assert [policy.commander for policy in policies] == ["policy:clutter", "policy:./mine.onnx"]
     assert set(external.services) - set(external.own_services) == {"control"}
@@ -138,7 +148,8 @@ def test_scenario_lease_is_five_periods_between_50_and_100_ms(rate_hz: float) ->
 def test_scenario_samples_at_a_tick_are_due_and_aged(tick: int, every: int, lag: int) -> None:
     service = ServiceSchedule(decimation=every, latency_ticks=lag)
     counting = service.used_output_tick(tick)
-    assert counting % every == 0 and counting >= 0
+    assert counting % every == 0
+    assert counting >= 0
     assert counting == 0 or counting <= tick - lag
     assert tick - lag - counting < every  # and it is the newest such
     assert service.used_output_tick(tick + 1) >= counting
@@ -208,7 +219,8 @@ def test_scenario_control_alias_means_chosen_controller_in_any_flag_order(tmp_pa
     for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):
         config = with_flags(path, *flags).config
         assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
-        assert config.controller_parameters == {"gain": 3} and config.control_section == "controllers.Wave"
+        assert config.controller_parameters == {"gain": 3}
+        assert config.control_section == "controllers.Wave"
     assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
     assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {"emulator": {"step": 1}}
 
@@ -297,9 +309,12 @@ def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> Non
 def test_off_the_route_the_snake_lies_straight_where_told() -> None:
     config = run_config(start={"on_route": False, "position_m": [1.0, 2.0], "yaw_rad": 0.5})
     pose = find_start_pose(config)
-    assert pose.position_w == (1.0, 2.0) and pose.yaw_rad == 0.5 and not pose.angles_rad.any()
+    assert pose.position_w == (1.0, 2.0)
+    assert pose.yaw_rad == 0.5
+    assert not pose.angles_rad.any()
     capsules = capsules_at_start(config)
-    assert len(capsules) == 4 and capsules[0].rear_m == (1.0, 2.0)
+    assert len(capsules) == 4
+    assert capsules[0].rear_m == (1.0, 2.0)
     assert capsules[-1].front_m == pytest.approx((1.0 + 0.3 * np.cos(0.5), 2.0 + 0.3 * np.sin(0.5)))
     assert all(a.front_m == pytest.approx(b.rear_m) for a, b in itertools.pairwise(capsules))
 

@@ -61,13 +61,17 @@ def test_every_kind_of_obstacle_is_placed_as_described() -> None:
         obstacle=Obstacle(name="post", shape="cylinder", position_w=(1, 2, 0.2), radius_m=0.1, height_m=0.4),
         friction=0.3,
     )
-    assert box.obstacle.half_size_m == pytest.approx((0.2, 0.1, 0.3)) and box.obstacle.position_w[2] == 0.3
-    assert box.obstacle.yaw_rad == 0.5 and box.obstacle.name == "box_0"
-    assert ball.obstacle.position_w == (0, 3, 0.05) and ball.obstacle.radius_m == 0.2
+    assert box.obstacle.half_size_m == pytest.approx((0.2, 0.1, 0.3))
+    assert box.obstacle.position_w[2] == 0.3
+    assert box.obstacle.yaw_rad == 0.5
+    assert box.obstacle.name == "box_0"
+    assert ball.obstacle.position_w == (0, 3, 0.05)
+    assert ball.obstacle.radius_m == 0.2
     assert wall.obstacle.position_w == pytest.approx((1.5, 7, 0.25))
     assert wall.obstacle.half_size_m == pytest.approx((2.5, 0.05, 0.25))
     assert wall.obstacle.yaw_rad == pytest.approx(math.atan2(4, 3))
-    assert step.walkable and not any(item.walkable for item in placed[:4])
+    assert step.walkable
+    assert not any(item.walkable for item in placed[:4])
 
 
 def test_scene_row_material_applies_to_all_and_keeps_places() -> None:
@@ -79,11 +83,15 @@ def test_scene_row_material_applies_to_all_and_keeps_places() -> None:
     assert [item.obstacle for item in loose] == [item.obstacle for item in plain]
     assert {(item.friction, item.slides_at_n) for item in plain} == {(0.2, None)}
     assert {(item.friction, item.slides_at_n) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
-    assert not any(item.yields for item in plain) and all(item.yields for item in loose)
+    assert not any(item.yields for item in plain)
+    assert all(item.yields for item in loose)
     assert [item.lean_rad for item in loose[:3]] == [0.3] * 3
     leans = np.array([(item.lean_rad, item.lean_towards_rad) for item in loose[3:]])
-    assert len(set(leans[:, 0])) == len(leans) and leans[:, 0].min() >= 0.0 and leans[:, 0].max() <= 0.2
-    assert leans[:, 1].min() < -1.0 and leans[:, 1].max() > 1.0
+    assert len(set(leans[:, 0])) == len(leans)
+    assert leans[:, 0].min() >= 0.0
+    assert leans[:, 0].max() <= 0.2
+    assert leans[:, 1].min() < -1.0
+    assert leans[:, 1].max() > 1.0
 
 
 def test_scene_leaning_peg_that_overlaps_snake_start_is_refused() -> None:
@@ -150,7 +158,8 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
     for i, peg in enumerate(placed):
         center = np.array(peg.position_w[:2])
         assert 0.02 <= peg.radius_m <= 0.05
-        assert -1e-9 <= center[0] <= 2 and -1 <= center[1] <= 1
+        assert -1e-9 <= center[0] <= 2
+        assert -1 <= center[1] <= 1
         for other in [pegs[0], *placed[:i]]:
             assert outline_distance_m(other, center) - peg.radius_m >= clearance_m - 1e-9
         assert LINKS.distance_m(center).min() - peg.radius_m >= clearance_m - 1e-9

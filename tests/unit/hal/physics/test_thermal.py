@@ -48,7 +48,8 @@ def test_a_motor_at_stall_fades_and_never_overheats() -> None:
         shares.append(LIMITS.remaining_fraction(float(heat.winding_c[0])))
         heat.pass_time(0.01, np.array([(4.0 * shares[-1]) ** 2]))
     assert np.abs(np.diff(shares)).max() < 0.01
-    assert heat.winding_c[0] < LIMITS.stop_at_c - 5 and shares[-1] < 0.8
+    assert heat.winding_c[0] < LIMITS.stop_at_c - 5
+    assert shares[-1] < 0.8
 
 
 def test_injected_heat_stays_only_while_it_is_held() -> None:
@@ -57,7 +58,8 @@ def test_injected_heat_stays_only_while_it_is_held() -> None:
     heat.inject(1, heat=True, hold=True)
     assert heat.winding_c.tolist() == [110.0, 110.0], "5 K above where the robot stops"
     heat.pass_time(30.0, np.zeros(2))
-    assert heat.winding_c[0] < 80 and heat.winding_c[1] == 110.0
+    assert heat.winding_c[0] < 80
+    assert heat.winding_c[1] == 110.0
     heat.inject(1, heat=False, hold=False)
     assert heat.winding_c[1] == 110.0, "it cools from there"
     heat.pass_time(30.0, np.zeros(2))

@@ -55,14 +55,17 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
         box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
     columns = all_rows(box)
     assert compute_digest(columns) == box.command_digest
-    assert box.ticks == count and all(len(column) == count for column in columns.values())
+    assert box.ticks == count
+    assert all(len(column) == count for column in columns.values())
     assert columns["time_s"] == pytest.approx(0.01 * np.arange(count))
     assert columns["angle_rad"][-1].tolist() == pytest.approx([0.1, 0.2, 0.001 * (count - 1)])
-    assert columns["velocity_rad_s"][7].tolist() == [2.0] * 3 and columns["torque_nm"][7].tolist() == [3.0, 4.0, 5.0]
+    assert columns["velocity_rad_s"][7].tolist() == [2.0] * 3
+    assert columns["torque_nm"][7].tolist() == [3.0, 4.0, 5.0]
     assert columns["target"][4321] == pytest.approx([0.4321] * 3)
-    assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3 and set(columns["mode"].flat) == {3}
-    assert np.isnan(columns["position_w"][:2]).all()  # unknown until the first pose
-    assert columns["position_w"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
+    assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3
+    assert set(columns["mode"].flat) == {3}
+    assert np.isnan(columns["position_w_m"][:2]).all()  # unknown until the first pose
+    assert columns["position_w_m"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
     assert columns["orientation_wxyz"][5].tolist() == [1.0, 0.0, 0.0, 0.0]
     assert columns["contact_peak_n"][:8].tolist() == [0, 0, 0, 5, 5, 5, 0, 0]
     assert columns["contact_count"][:8].tolist() == [0, 0, 0, 2, 2, 2, 0, 0]
@@ -94,9 +97,11 @@ def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int
     for tick in range(5):
         box.record(tick, tick * 10_000_000, Samples(state(ROBOT, 0.3 * tick)), decision())
     layout, columns = read_black_box(on_disk(box, tmp_path / "box", torn))
-    assert (layout.robot, layout.joints) == ("worm", ["joint_1", "joint_2", "joint_3"])
+    assert layout.robot == "worm"
+    assert layout.joints == ["joint_1", "joint_2", "joint_3"]
     whole = all_rows(box)
-    assert set(columns) == set(whole) and columns["tick"].tolist() == list(range(5 - bool(torn)))
+    assert set(columns) == set(whole)
+    assert columns["tick"].tolist() == list(range(5 - bool(torn)))
     for name, column in columns.items():
         assert np.array_equal(column, whole[name][: len(column)], equal_nan=True), name
     assert (compute_digest(columns) == box.command_digest) == (not torn)
@@ -104,7 +109,8 @@ def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int
 
 def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
     _, columns = read_black_box(on_disk(BlackBox(ROBOT), tmp_path / "box"))
-    assert columns["angle_rad"].shape == (0, 3) and compute_digest(columns) == BlackBox(ROBOT).command_digest
+    assert columns["angle_rad"].shape == (0, 3)
+    assert compute_digest(columns) == BlackBox(ROBOT).command_digest
 
 
 @pytest.mark.parametrize(
@@ -137,7 +143,9 @@ def test_when_nobody_takes_them_the_newest_rows_are_kept() -> None:
     for tick in range(25):
         box.record(tick, tick, Samples(state(ROBOT, 0.001 * tick)), decision())
     first, rows = box.read_rows(3)
-    assert first == 16 and all_rows(box)["tick"].tolist() == list(range(16, 25)) and box.ticks == 25
+    assert first == 16
+    assert all_rows(box)["tick"].tolist() == list(range(16, 25))
+    assert box.ticks == 25
     assert box.layout.arrays(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
     assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))  # of all, kept or not
 
@@ -182,7 +190,8 @@ def test_black_box_tick_has_constant_cost_and_memory() -> None:
         peaks[i] = tracemalloc.get_traced_memory()[1] - before - 36 * i  # the list's own numbers
     kept = tracemalloc.get_traced_memory()[0] - before - 36 * len(peaks)
     tracemalloc.stop()
-    assert max(peaks) < 20_000 and kept < 2_000
+    assert max(peaks) < 20_000
+    assert kept < 2_000
 
 
 def test_black_box_keeps_mean_force_where_sensor_measures_it() -> None:

@@ -286,7 +286,8 @@ class Everything(Model):
         refusal = self.authority.offer_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
         self.offered += 1
         if expected is not None:
-            assert refusal == expected and self.authority.rejected_counts[expected] == counted + 1
+            assert refusal == expected
+            assert self.authority.rejected_counts[expected] == counted + 1
             self.rejected += 1
             return
         if self.state == "armed" and asked.arm_session != self.arm_session:
@@ -359,6 +360,8 @@ class Everything(Model):
             if self.aside:
                 self.aside, self.doubt = set(), None
         self.check(answer, ok)
+        if not ok:
+            assert answer.refusal == "wrong_state"
 
     @rule(who=st.text(min_size=1, max_size=64))
     def estop(self, who: str) -> None:
@@ -366,6 +369,7 @@ class Everything(Model):
         self.leave_for("estop")
         self.note_fault()
         self.check(answer, True)
+        assert self.authority.faults[-1] == Fault(tick=self.tick, what="estop", cause=f"emergency stop by {who}")
 
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
@@ -384,7 +388,10 @@ class Everything(Model):
     def record_fault(self, precedes_stop: bool) -> None:
         """A fault that is only recorded, so that it is not taken for the reason of a stop."""
         fault = Fault(tick=self.tick, what="service_lost", cause="guidance is gone", reach="robot")
-        self.authority.record_fault(fault, precedes_stop=precedes_stop)
+        if precedes_stop:
+            self.authority.record_fault(fault, precedes_stop=True)
+        else:
+            self.authority.record_fault(fault)
         self.note_fault()
         assert self.authority.faults[-1].reach == ("robot" if precedes_stop else "none")
 
@@ -411,6 +418,7 @@ class Everything(Model):
             self.ask_for_the_lease("control", "acquire", 100, 0)
         self.end_a_tick(0)
         self.stay()
+        self.now_ns += 1
         self.arm("worm", "lag", "0" * 16)
 
     @precondition(lambda self: self.state == "armed")
@@ -438,6 +446,32 @@ class Everything(Model):
             self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0, 0, later_ns)
             self.send_commands(wanted, mode, torque_limit, False, set(), False, 0, 0, 1)
             self.end_a_tick(PERIOD_NS)
+
+    @precondition(lambda self: self.state == "armed")
+    @rule(passes_ns=TIMES_NS)
+    def renew_while_armed(self, passes_ns: int) -> None:
+        """While armed only commands renew the lease."""
+        self.now_ns += passes_ns
+        self.ask_for_the_lease(str(self.holder), "renew", 100, 0)
+
+    @precondition(lambda self: self.state == "armed")
+    @rule()
+    def finish_while_armed(self) -> None:
+        self.ask_for_less("finish")
+
+    @precondition(lambda self: self.state == "armed")
+    @rule()
+    def disarm_and_arm_without_a_command(self) -> None:
+        self.ask_for_less("disarm")
+        self.end_a_tick(0)
+        self.arm("worm", "lag", "0" * 16)
+
+    @precondition(lambda self: self.state == "armed" and self.live)
+    @rule(later=st.integers(0, 1))
+    def send_for_the_arm_session_before(self, later: int) -> None:
+        """Only a command that answers a state after the arming counts as rejected."""
+        back = self.tick - self.armed_tick - later
+        self.send_commands([0.0] * JOINTS, [Mode.POSITION] * JOINTS, None, False, set(), False, -1, max(back, 0), 1)
 
     # --- time, and what goes out -------------------------------------------------------------------------------
 
@@ -469,7 +503,9 @@ class Everything(Model):
             self.reported = True
             self.check_safe(decision)
         else:
-            assert self.live and self.doubt is not None and self.doubt <= self.aside
+            assert self.live
+            assert self.doubt is not None
+            assert self.doubt <= self.aside
             for sent in self.since_arming[-KEPT:]:
                 self.counting = sent if up_to is None or sent.tick <= up_to else self.counting
             assert decision.sequence == (None if self.counting is None else self.counting.sequence)
@@ -488,15 +524,19 @@ class Everything(Model):
         assert found.arm_session == self.arm_session
         expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
         assert found.lease.epoch == self.epoch  # the model's only ever grows
-        assert (found.lease.holder, found.lease.is_live(self.now_ns)) == (self.holder, self.live)
+        assert found.lease.holder == self.holder
+        assert found.lease.is_live(self.now_ns) == self.live
         assert not self.holder or found.lease == expected
-        assert found.reason and len(found.reason) <= 500
-        assert len(found.faults) == self.faults and all(len(fault.cause) <= 500 for fault in found.faults)
+        assert found.reason
+        assert len(found.reason) <= 500
+        assert len(found.faults) == self.faults
+        assert all(len(fault.cause) <= 500 for fault in found.faults)
         assert found.rejected_counts.total() == self.rejected
         assert found.accepted_count == len(self.since_arming) or found.arm_session > 1
         assert found.accepted_count + found.standby_count + found.rejected_counts.total() == self.offered
 
 
+@pytest.mark.timeout(600)  # a busy computer may take minutes, which is no failure
 @pytest.mark.parametrize("batch", range(-(-SEQUENCES // PER_TEST)))
 def test_whatever_happens_the_robot_does_only_what_it_may(batch: int) -> None:
     """In batches, because hypothesis keeps every sequence of a test in memory."""

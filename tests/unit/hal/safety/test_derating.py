@@ -49,14 +49,19 @@ class Bench:
 
 def test_nothing_is_derated_before_anything_is_known() -> None:
     bench = Bench()
-    assert bench.shares == [1.0] * JOINTS and bench.derating.present_faults == []
-    assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated_joints() == {}
+    assert bench.shares == [1.0] * JOINTS
+    assert bench.derating.present_faults == []
+    assert bench.look(0) == []
+    assert bench.shares == [1.0] * JOINTS
+    assert bench.derating.derated_joints() == {}
 
 
 def test_derating_joint_without_heat_or_voltage_sensor_never_stops() -> None:
     bench = Bench(joints={"joint_2": {"measures": ["torque"]}, "joint_3": {"measures": ["voltage"]}})
     assert bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 24.0]) == []
-    assert bench.look(100 * MS) == [] and bench.shares == [1.0] * JOINTS and bench.against_arming == []
+    assert bench.look(100 * MS) == []
+    assert bench.shares == [1.0] * JOINTS
+    assert bench.against_arming == []
     low = bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 12.0]) + bench.look(100 * MS)
     assert [(fault.what, fault.joint) for fault in low] == [("undervoltage", "joint_3")]
 
@@ -74,7 +79,8 @@ def test_torque_fades_linearly(celsius: float, share: float) -> None:
 
 def test_the_robot_file_says_from_where_to_where() -> None:
     bench = Bench(limits__derate_from_c=50.0, limits__stop_at_c=60.0)
-    assert bench.receive(55.0) == [] and bench.shares == pytest.approx([0.6] * JOINTS)
+    assert bench.receive(55.0) == []
+    assert bench.shares == pytest.approx([0.6] * JOINTS)
     assert len(bench.receive(60.0)) == JOINTS
 
 
@@ -82,26 +88,35 @@ def test_derating_overheated_winding_stops_robot_until_it_has_cooled() -> None:
     bench = Bench()
     assert bench.receive([20.0, 104.9, 20.0]) == []
     (fault,) = bench.receive([20.0, 105.0, 20.0])
-    assert (fault.what, fault.joint, fault.tick) == ("overheated", "joint_2", 3)
+    assert fault.what == "overheated"
+    assert fault.joint == "joint_2"
+    assert fault.tick == 3
     assert fault.cause == ("the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C")
-    assert bench.receive([20.0, 104.0, 20.0]) == [] and len(bench.derating.present_faults) == 1
-    assert bench.receive([20.0, 80.0, 20.0]) == [] and len(bench.derating.present_faults) == 1
-    assert bench.receive([20.0, 79.9, 20.0]) == [] and bench.derating.present_faults == []
+    assert bench.receive([20.0, 104.0, 20.0]) == []
+    assert len(bench.derating.present_faults) == 1
+    assert bench.receive([20.0, 80.0, 20.0]) == []
+    assert len(bench.derating.present_faults) == 1
+    assert bench.receive([20.0, 79.9, 20.0]) == []
+    assert bench.derating.present_faults == []
     assert len(bench.receive([20.0, 110.0, 20.0])) == 1
 
 
 def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:
     bench = Bench()
     bench.receive([20.0, 110.0, 20.0])
-    assert bench.look(10 * S) == [] and [fault.what for fault in bench.derating.present_faults] == ["overheated"]
+    assert bench.look(10 * S) == []
+    assert [fault.what for fault in bench.derating.present_faults] == ["overheated"]
     assert bench.shares == [1.0] * JOINTS
 
 
 def test_water_stops_the_robot() -> None:
     bench = Bench()
     (fault,) = bench.receive(leak=[False, False, True])
-    assert (fault.what, fault.joint, fault.cause) == ("leak", "joint_3", "joint_3 reports water inside")
-    assert bench.receive() == [] and bench.derating.present_faults == []
+    assert fault.what == "leak"
+    assert fault.joint == "joint_3"
+    assert fault.cause == "joint_3 reports water inside"
+    assert bench.receive() == []
+    assert bench.derating.present_faults == []
 
 
 def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
@@ -109,10 +124,13 @@ def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     assert bench.receive(voltage_v=[24.0, 17.9, 18.0]) == []
     assert bench.look(50 * MS - 1) == []
     (fault,) = bench.look(1)
-    assert (fault.what, fault.joint) == ("undervoltage", "joint_2")
+    assert fault.what == "undervoltage"
+    assert fault.joint == "joint_2"
     assert fault.cause == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {MIN_VOLTAGE_FIELD}"
-    assert bench.look(1) == [] and len(bench.derating.present_faults) == 1
-    assert bench.receive() == [] and bench.derating.present_faults == []
+    assert bench.look(1) == []
+    assert len(bench.derating.present_faults) == 1
+    assert bench.receive() == []
+    assert bench.derating.present_faults == []
 
 
 WAY_OUT = "check the supply, or set `min_voltage_v` under [limits] in the robot file of 'worm'"
@@ -141,7 +159,8 @@ def test_a_robot_is_not_armed_before_its_supply_is_known() -> None:
     bench.look(REPORT_TIMEOUT_NS)
     assert bench.against_arming == ["joint_2 has not reported its supply yet"]
     bench.look(1)
-    assert bench.against_arming == [] and bench.notes != []  # it is noted, and ignored from now on
+    assert bench.against_arming == []
+    assert bench.notes != []  # it is noted, and ignored from now on
     for other in (Bench(expected=True), Bench(awaits_reports=True)):  # whose time may stand; without such a sensor
         assert other.against_arming == []
 
@@ -159,7 +178,8 @@ def test_what_is_not_valid_or_no_number_says_nothing() -> None:
     bench = Bench()
     nan = float("nan")
     assert bench.receive([300.0, nan, 300.0], [5.0, 24.0, nan], leak=True, valid=[False, True, True]) == []
-    assert bench.look(1 * S) == [] and bench.shares == [1.0] * JOINTS
+    assert bench.look(1 * S) == []
+    assert bench.shares == [1.0] * JOINTS
 
 
 @pytest.mark.parametrize("column", ["motor_c", "voltage_v", "leak", "valid"])
@@ -175,17 +195,21 @@ def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
     valid = [True, False, False]
     for _ in range(6):
         bench.receive(90.0, valid=valid)
-    assert bench.notes == [] and bench.shares[1] < 1.0
+    assert bench.notes == []
+    assert bench.shares[1] < 1.0
     bench.receive(90.0, valid=valid, after_ns=1)
     (note,) = bench.notes
-    assert (note.what, note.joint, note.tick) == ("power_unknown", None, 3)
+    assert note.what == "power_unknown"
+    assert note.joint is None
+    assert note.tick == 3
     assert note.cause == "supply and heat are unknown, and ignored, for joint_2, joint_3"
     assert bench.shares == pytest.approx([0.68, 1.0, 1.0])
     bench.receive(90.0, valid=[True, True, False])
     bench.look(3 * S)
     assert len(bench.notes) == 1
     bench.look(1)
-    assert len(bench.notes) == 2 and bench.notes[1].cause.endswith("for joint_1, joint_2")
+    assert len(bench.notes) == 2
+    assert bench.notes[1].cause.endswith("for joint_1, joint_2")
 
 
 @pytest.mark.parametrize("reported", [{"leak": True}, {"voltage_v": 12.0}])
@@ -206,7 +230,8 @@ def test_derating_missing_reports_are_recorded_where_sensor_is_described() -> No
         assert bench.notes == []
         bench.look(1)
     assert absent.notes == []
-    assert silent.notes[0].cause.endswith("for joint_1, joint_2, joint_3") and silent.notes[0].joint is None
+    assert silent.notes[0].cause.endswith("for joint_1, joint_2, joint_3")
+    assert silent.notes[0].joint is None
 
 
 def test_one_silent_module_is_named() -> None:

@@ -12,7 +12,7 @@ def add_faults(log: FaultLog, ticks: range) -> None:
 
 
 def kept_ticks(log: FaultLog) -> list[int]:
-    return [fault.tick for fault in log.kept]
+    return [fault.tick for fault in log.stored]
 
 
 def test_fault_log_when_full_keeps_the_first_and_newest() -> None:

@@ -83,8 +83,10 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
 def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
     asked, measured, last = case
     applied = limited(asked, measured, last)
-    assert np.isfinite(applied.target).all() and np.isfinite(applied.torque_limit_nm).all()
-    assert (applied.torque_limit_nm >= 0).all() and (applied.torque_limit_nm <= LIMITS.torque_nm).all()
+    assert np.isfinite(applied.target).all()
+    assert np.isfinite(applied.torque_limit_nm).all()
+    assert (applied.torque_limit_nm >= 0).all()
+    assert (applied.torque_limit_nm <= LIMITS.torque_nm).all()
     if asked.torque_limit_nm is not None:
         assert (applied.torque_limit_nm <= np.array(asked.torque_limit_nm)).all()
     start = np.where(applied.mode == last.mode, last.target, bumpless(asked.mode, measured))
@@ -106,12 +108,15 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[Joi
                 assert moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY or np.abs(edges - target).min() < TINY
             case Mode.VELOCITY:
                 low, high = ends(asked.mode[i], measured, i)
-                assert abs(target) <= 5.0 and low - TINY <= target <= high + TINY
+                assert abs(target) <= 5.0
+                assert low - TINY <= target <= high + TINY
                 assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, 5.0, low, high)
             case Mode.TORQUE:
                 low, high = ends(asked.mode[i], measured, i)
                 most = applied.torque_limit_nm[i]
-                assert abs(target) <= most and target <= max(high, -most) and target >= min(low, most)
+                assert abs(target) <= most
+                assert target <= max(high, -most)
+                assert target >= min(low, most)
                 assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, most, low, high)
 
 
@@ -286,7 +291,8 @@ def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) 
         angle += reported[0] * 0.01
         speeds.append(abs(reported[0]))
         assert abs(angle) <= 1.5
-    assert max(speeds) == 5.0 and abs(angle) > 1.49
+    assert max(speeds) == 5.0
+    assert abs(angle) > 1.49
     assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY  # what outranks the rate limit hardly needs to
 
 
@@ -313,7 +319,8 @@ def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
 def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
     low, high = torque_bounds_at_ends(weak, 0.0, 0.0, 0.01)
-    assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01)) and high > 4.0
+    assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01))
+    assert high > 4.0
     slow = msgspec.structs.replace(weak, speed_limit_rad_s=0.5)
     low, high = torque_bounds_at_ends(slow, 0.0, 0.0, 0.01)
     assert high == -low == pytest.approx(4.0 / 0.5 * stoppable_speed(1.5, 100.0, 0.01))
@@ -375,4 +382,5 @@ def test_a_range_without_width_leaves_no_torque() -> None:
     stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
     for velocity in (-3.0, 0.0, 3.0):
         low, high = torque_bounds_at_ends(stuck, 0.0, velocity, 0.01)
-        assert low <= 0.0 >= high and low <= high
+        assert low <= 0.0 >= high
+        assert low <= high

@@ -6,21 +6,22 @@ import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire.messages import Fault, Mode
-from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
+from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, report_power
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
 
 
-def lame(**robot: Any) -> Rig:
+def armed_without_joint_2(**robot: Any) -> Rig:
     """An armed robot that has lost joint_2."""
     rig = armed(safety__max_isolated_joints=1, **robot)
     rig.observe(0.1, valid=SAYS_NO)
     rig.tick_with(0.1)
-    assert rig.authority.state == "armed" and rig.authority.isolated_joints == ["joint_2"]
+    assert rig.authority.state == "armed"
+    assert rig.authority.isolated_joints == ["joint_2"]
     return rig
 
 
-def broken(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
+def fault_in(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
     return Fault(tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, reach=reach)
 
 
@@ -28,15 +29,19 @@ def test_by_default_one_joint_stops_the_robot() -> None:
     rig = armed()
     rig.observe(0.1, valid=SAYS_NO)
     rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
     (fault,) = rig.authority.faults
-    assert fault.joint == "joint_2" and fault.reach == "robot"
+    assert fault.joint == "joint_2"
+    assert fault.reach == "robot"
 
 
 def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     (fault,) = rig.authority.faults
-    assert (fault.what, fault.joint, fault.reach) == ("state_invalid", "joint_2", "joint")
+    assert fault.what == "state_invalid"
+    assert fault.joint == "joint_2"
+    assert fault.reach == "joint"
     assert rig.authority.reason == "armed, without joint_2: no valid and fresh state of joint_2"
     for _ in range(20):
         rig.observe(0.1, valid=SAYS_NO)
@@ -44,22 +49,25 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
         decision = rig.pass_tick()
         points = decision.setpoints
         assert points.mode == [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]
-        assert points.target == [0.12, 0.0, 0.12] and points.torque_limit_nm == [3.0, 0.0, 3.0]
-        assert points.isolated == {1} and decision.limited == {1: "isolated"}
-    assert rig.authority.state == "armed" and len(rig.authority.faults) == 1
+        assert points.target == [0.12, 0.0, 0.12]
+        assert points.torque_limit_nm == [3.0, 0.0, 3.0]
+        assert points.isolated == {1}
+        assert decision.limited == {1: "isolated"}
+    assert rig.authority.state == "armed"
+    assert len(rig.authority.faults) == 1
     assert rig.authority.limited_counts["isolated"] == 21
 
 
 def test_nothing_is_limited_where_nothing_is_asked() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     assert rig.tick_with([0.1, 0.0, 0.1], [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]).limited == {}
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_one_joint_too_many_stops_the_robot(known: bool) -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     if known:
-        rig.authority.fault(broken("joint_3"))
+        rig.authority.fault(fault_in("joint_3"))
     else:
         rig.observe(0.1, valid=[True, False, False])
         rig.pass_tick()
@@ -74,20 +82,25 @@ def test_two_that_fail_at_once_are_two() -> None:
     rig = armed(safety__max_isolated_joints=1)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
     rig = armed(safety__max_isolated_joints=2)
     rig.observe(0.1, valid=[True, False, False])
     rig.pass_tick()
-    assert rig.authority.state == "armed" and rig.authority.isolated_joints == ["joint_2", "joint_3"]
+    assert rig.authority.state == "armed"
+    assert rig.authority.isolated_joints == ["joint_2", "joint_3"]
 
 
 @pytest.mark.parametrize(
-    "fault", [broken(reach="robot"), broken(joint=None), broken(joint="joint_9")], ids=["robot", "nobody", "unknown"]
+    "fault",
+    [fault_in(reach="robot"), fault_in(joint=None), fault_in(joint="joint_9")],
+    ids=["robot", "nobody", "unknown"],
 )
 def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
     rig = armed(safety__max_isolated_joints=3)
     rig.authority.fault(fault)
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
 
 
 def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
@@ -98,11 +111,12 @@ def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
 
 
 def test_what_a_lost_joint_complains_of_is_no_news() -> None:
-    rig = lame()
-    rig.authority.fault(broken())
+    rig = armed_without_joint_2()
+    rig.authority.fault(fault_in())
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
-    rig.authority.fault(broken())
-    assert rig.authority.state == "disarmed" and len(rig.authority.faults) == 1
+    rig.authority.fault(fault_in())
+    assert rig.authority.state == "disarmed"
+    assert len(rig.authority.faults) == 1
 
 
 def test_while_disarmed_no_joint_is_set_aside() -> None:
@@ -111,13 +125,15 @@ def test_while_disarmed_no_joint_is_set_aside() -> None:
     rig.acquire()
     rig.send(0.1)
     answer = rig.arm()
-    assert answer.refusal == "not_ready" and "joint_2" in answer.reason
-    rig.authority.fault(broken())
-    assert rig.authority.state == "fault" and rig.authority.isolated_joints == []
+    assert answer.refusal == "not_ready"
+    assert "joint_2" in answer.reason
+    rig.authority.fault(fault_in())
+    assert rig.authority.state == "fault"
+    assert rig.authority.isolated_joints == []
 
 
 def test_it_may_be_armed_again_without_the_joint() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.observe(0.1, valid=SAYS_NO)
@@ -127,14 +143,15 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
 
 
 def test_isolation_ends_after_reset_and_a_new_state() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)  # not while it moves
     assert answer.refusal == "wrong_state"
     assert answer.reason == "nothing to reset in state armed; disarm first, then a reset ends the isolation of joint_2"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
-    assert rig.authority.isolated_joints == [] and rig.authority.faults == []
+    assert rig.authority.isolated_joints == []
+    assert rig.authority.faults == []
     rig.send(0.1)
     assert "no joint state since the reset" in rig.arm().reason
     rig.observe(0.1)
@@ -145,41 +162,47 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
 
 @pytest.mark.parametrize("action", ["passive", "damp", "hold"])
 def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
-    rig = lame(safety__action=action)
+    rig = armed_without_joint_2(safety__action=action)
     rig.pass_tick(6)
     assert rig.authority.state == "fault"
     points = rig.pass_tick().setpoints
-    assert points.isolated == {1} and points.mode[1] is Mode.PASSIVE and points.torque_limit_nm[1] == 0.0
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
+    assert points.isolated == {1}
+    assert points.mode[1] is Mode.PASSIVE
+    assert points.torque_limit_nm[1] == 0.0
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    assert rig.authority.isolated_joints == []
 
 
 def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
-    rig = lame()
+    rig = armed_without_joint_2()
     rig.authority.on_estop(ESTOP, rig.tick)
     assert rig.authority.isolated_joints == ["joint_2"]
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated_joints == []
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    assert rig.authority.isolated_joints == []
 
 
 def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     rig = armed(safety__max_isolated_joints=1)
-    receive(rig, [20.0, 110.0, 20.0])
-    assert rig.tick_with(0.1).setpoints.isolated == {1} and rig.authority.state == "armed"
+    report_power(rig, [20.0, 110.0, 20.0])
+    assert rig.tick_with(0.1).setpoints.isolated == {1}
+    assert rig.authority.state == "armed"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok  # it stays hot, and is not asked
-    receive(rig, [20.0, 110.0, 20.0], volts=12.0)
+    report_power(rig, [20.0, 110.0, 20.0], volts=12.0)
     for _ in range(7):
         rig.tick_with(0.1)
-    assert rig.authority.state == "fault" and rig.authority.faults[-1].what == "undervoltage"
+    assert rig.authority.state == "fault"
+    assert rig.authority.faults[-1].what == "undervoltage"
 
 
 def test_isolation_silent_health_of_lost_joint_is_not_recorded() -> None:
-    rig = lame()
-    receive(rig, [20.0] * JOINTS)
+    rig = armed_without_joint_2()
+    report_power(rig, [20.0] * JOINTS)
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick(250)
-    receive(rig, [20.0] * JOINTS, valid=[True, False, True])
+    report_power(rig, [20.0] * JOINTS, valid=[True, False, True])
     rig.pass_tick(100)
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
     rig.pass_tick(250)
@@ -196,6 +219,20 @@ def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None
     log = getattr(rig.authority, kept)
     for tick in range(2000, 2100):
         rig.authority.fault(Fault(tick=tick, what="follows", cause=""))
-        assert 1000 in [fault.tick for fault in log.stored] and log.stored[-1].tick == tick
-        assert len(log.stored) <= MAX_FAULTS and len(log.stored) + log.left_out == before + 1 + tick - 1999
+        assert 1000 in [fault.tick for fault in log.stored]
+        assert log.stored[-1].tick == tick
+        assert len(log.stored) <= MAX_FAULTS
+        assert len(log.stored) + log.left_out == before + 1 + tick - 1999
     assert [fault.tick for fault in log.stored] == sorted(fault.tick for fault in log.stored)
+
+
+def test_isolation_fault_in_a_full_log_is_dropped_like_others() -> None:
+    """Only the fault that stopped the robot is always kept."""
+    rig = armed(safety__max_isolated_joints=1)
+    for tick in range(16):
+        rig.authority.record_fault(Fault(tick=tick, what="noted", cause=""))
+    rig.authority.fault(Fault(tick=16, what="module_frozen", cause="", joint="joint_2", reach="joint"))
+    assert rig.authority.isolated_joints == ["joint_2"]
+    for tick in range(17, 100):
+        rig.authority.record_fault(Fault(tick=tick, what="noted", cause=""))
+    assert 16 not in [fault.tick for fault in rig.authority.faults]

@@ -59,20 +59,26 @@ REFUSED = {
 def test_refused_and_nothing_changed(case: str) -> None:
     lease, asked, now, words = REFUSED[case]
     ruling = decide_lease_request(lease, asked, now, TERM)
-    assert ruling.lease == lease and not ruling.changed_hands
-    assert ruling.refusal is not None and words in ruling.refusal
+    assert ruling.lease == lease
+    assert not ruling.changed_hands
+    assert ruling.refusal is not None
+    assert words in ruling.refusal
     assert ruling.refusal_word == ("lease_held" if asked.action == "acquire" else "not_holder")
 
 
 def test_the_refusal_says_how_long_it_may_take() -> None:
     lease = Lease("control", 4, 100, 50_000_000)
     ruling = decide_lease_request(lease, request("acquire", "teleop"), 20_000_000, TERM)
-    assert ruling.refusal is not None and "for another 30 ms" in ruling.refusal
+    assert ruling.refusal is not None
+    assert "for another 30 ms" in ruling.refusal
 
 
 def test_live_until_the_last_nanosecond() -> None:
-    assert HELD.is_live(1000) and not HELD.is_live(1001) and not FREE.is_live(0)
-    assert free_lease(HELD) == Lease(epoch=4) and renew_lease(HELD, 2000, TERM).expires_ns == 2050
+    assert HELD.is_live(1000)
+    assert not HELD.is_live(1001)
+    assert not FREE.is_live(0)
+    assert free_lease(HELD) == Lease(epoch=4)
+    assert renew_lease(HELD, 2000, TERM).expires_ns == 2050
 
 
 def test_nobody_changes_a_lease_in_place() -> None:

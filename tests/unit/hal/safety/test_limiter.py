@@ -152,7 +152,8 @@ def test_set_points_for_the_backend_are_plain_python() -> None:
     applied = applied_for(command(ROBOT, 0.01))
     points = make_safe_setpoints(applied, frozenset({1}))
     assert points.isolated == {1}
-    assert points.mode == [Mode.POSITION] * JOINTS and all(type(m) is Mode for m in points.mode)
+    assert points.mode == [Mode.POSITION] * JOINTS
+    assert all(type(m) is Mode for m in points.mode)
     assert all(type(value) is float for value in points.target + points.torque_limit_nm)
 
 

@@ -67,7 +67,10 @@ def test_a_glitch_is_not_believed_and_named(applied: Applied | None, side: int) 
     bench = Bench()
     assert bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied) is None
     fault = bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
-    assert fault is not None and (fault.what, fault.joint, fault.tick) == (WORD, "joint_2", 7)
+    assert fault is not None
+    assert fault.what == WORD
+    assert fault.joint == "joint_2"
+    assert fault.tick == 7
     assert fault.cause == f"faster than any joint turns: a jump of joint_2 by {side * 0.75:+.2f} rad in 10 ms"
     assert bench.angles == pytest.approx([0.01, side * REACH, 0.0], abs=1e-5)
     assert bench.watch.measured.velocity_rad_s.tolist() == [1.0, 0.0, 1.0]
@@ -77,7 +80,8 @@ def test_a_glitch_is_not_believed_and_named(applied: Applied | None, side: int) 
 
 def test_a_jump_of_several_joints_names_them_all() -> None:
     fault = Bench().see([0.5, 0.0, -0.6])
-    assert fault is not None and fault.joint is None
+    assert fault is not None
+    assert fault.joint is None
     assert fault.cause.endswith("joint_1 by +0.50 rad in 10 ms, joint_3 by -0.60 rad in 10 ms")
 
 
@@ -117,7 +121,8 @@ def test_places_that_do_not_agree_are_not_believed() -> None:
         assert bench.see((5.0, -5.0)[k % 2]) is not None
     for _ in range(3):  # the newest place, once more than before
         assert bench.see(-5.0) is not None
-    assert bench.see(0.0) is None and bench.see(-5.0) is not None  # one good sample, and counting begins again
+    assert bench.see(0.0) is None
+    assert bench.see(-5.0) is not None  # one good sample, and counting begins again
     for _ in range(3):
         assert bench.see(-5.0) is not None
     assert bench.see(-5.0) is None
@@ -157,7 +162,9 @@ def test_joints_are_judged_each_by_itself() -> None:
     for _ in range(4):
         assert bench.see([1.4, 0.0, 0.0]) is not None
     fault = bench.see([1.4, 0.0, 1.4])
-    assert fault is not None and fault.joint == "joint_3" and bench.angles == [1.4, 0.0, 0.0]
+    assert fault is not None
+    assert fault.joint == "joint_3"
+    assert bench.angles == [1.4, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -167,7 +174,9 @@ def test_plausibility_unknown_joint_leaves_others_unchanged(bad: dict[str, Any])
     bench = Bench()
     values: dict[str, Any] = {"angle": 0.1, **bad}
     fault = bench.see(**values)
-    assert fault is not None and fault.joint == "joint_2" and fault.cause == "no valid and fresh state of joint_2"
+    assert fault is not None
+    assert fault.joint == "joint_2"
+    assert fault.cause == "no valid and fresh state of joint_2"
     assert bench.angles == [0.1, 0.0, 0.1]
 
 
@@ -177,7 +186,9 @@ def test_a_long_story_fits_into_a_message() -> None:
     nobody = np.zeros(100, dtype=np.bool_)
     watch.check(state(robot), now_ns=0, applied=None, isolated=nobody)
     doubt = watch.check(state(robot, 1.0), now_ns=0, applied=None, isolated=nobody)
-    assert doubt is not None and len(doubt.fault.cause) == 400 and doubt.joints.all()
+    assert doubt is not None
+    assert len(doubt.fault.cause) == 400
+    assert doubt.joints.all()
 
 
 @pytest.mark.parametrize("at", [1, 2])
@@ -186,19 +197,28 @@ def test_who_is_set_aside_is_not_looked_at(at: int) -> None:
     aside[1] = True
     valid = [i != at for i in range(JOINTS)]
     found = bench.see(valid=valid, aside=aside)
-    assert (found is None) == (at == 1) and bench.doubted == [2] * (at == 2)
+    assert (found is None) == (at == 1)
+    assert bench.doubted == [2] * (at == 2)
     jumped = [0.0, 0.0, 0.0]
     jumped[at] = 1.0
-    assert (bench.see(jumped, aside=aside) is None) == (at == 1) and bench.doubted == [2] * (at == 2)
+    assert (bench.see(jumped, aside=aside) is None) == (at == 1)
+    assert bench.doubted == [2] * (at == 2)
 
 
 def test_plausibility_fault_reaches_joints_or_the_whole_robot() -> None:
     bench = Bench()
     fault = bench.see(valid=[True, False, False])
-    assert fault is not None and fault.reach == "joint" and bench.doubted == [1, 2]
+    assert fault is not None
+    assert fault.reach == "joint"
+    assert bench.doubted == [1, 2]
     fault = bench.see(valid=[])
-    assert fault is not None and fault.reach == "robot" and bench.doubted == [0, 1, 2]
-    assert (fault.tick, fault.what, fault.cause, fault.joint) == (7, WORD, "no joint state of 3 joints", None)
+    assert fault is not None
+    assert fault.reach == "robot"
+    assert bench.doubted == [0, 1, 2]
+    assert fault.tick == 7
+    assert fault.what == WORD
+    assert fault.cause == "no joint state of 3 joints"
+    assert fault.joint is None
 
 
 def test_plausibility_angle_exactly_at_reach_is_accepted() -> None:
@@ -214,8 +234,10 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
     corrupted = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
     published = replace_unreadable(corrupted, bench.watch.measured)
     assert published.valid == [True, False, True]
-    assert published.angle_rad[1] == 0.1 and published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
-    assert getattr(published, column)[::2] == [0.5, 0.7] and published.age_ns == sound.age_ns
+    assert published.angle_rad[1] == 0.1
+    assert published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
+    assert getattr(published, column)[::2] == [0.5, 0.7]
+    assert published.age_ns == sound.age_ns
     assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [0.1, 0.0, 0.0]
     assert replace_unreadable(
         msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured
@@ -250,7 +272,8 @@ def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 1) is None  # for a lease, and no longer
     fault = bench.see(0.0, 0.0, 0.5, applied=targets(0.2))
-    assert fault is not None and fault.what == "joint_frozen"
+    assert fault is not None
+    assert fault.what == "joint_frozen"
     assert fault.cause == "the same state repeated while its target moves: joint_1, joint_2, joint_3"
 
 
@@ -268,7 +291,8 @@ def test_plausibility_rested_joint_has_one_lease_to_follow_a_jump() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, 100, 0.0) is None
     seen = [bench.see(0.0, 0.0, 0.5, applied=targets(0.3)) for _ in range(LEASE_PERIODS + 2)]
-    assert seen[:LEASE_PERIODS] == [None] * LEASE_PERIODS and seen[-1] is not None
+    assert seen[:LEASE_PERIODS] == [None] * LEASE_PERIODS
+    assert seen[-1] is not None
 
 
 def test_plausibility_saturated_motor_may_repeat_its_state() -> None:

@@ -65,7 +65,8 @@ def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
     angle: float, velocity: float, torque: float, mode: Mode, target: float
 ) -> None:
     way = np.array(targets(beginning(angle, velocity, torque, mode, target), 60))
-    assert np.abs(way).max() <= 1.5 and np.abs(np.diff(way)).max() <= ANGLE_STEP + TINY
+    assert np.abs(way).max() <= 1.5
+    assert np.abs(np.diff(way)).max() <= ANGLE_STEP + TINY
     assert way[-1] == way[-2] == way[-10]
     stops_at = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
     assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP / 2  # it slows down in whole periods

@@ -43,7 +43,7 @@ def take(message: type[Message], payload: bytes) -> Message | None:
 @each_message
 @given(data=st.data())
 @settings(max_examples=25)
-def test_round_trip(message: type[Message], data: st.DataObject) -> None:
+def test_codec_round_trip_returns_an_equal_message(message: type[Message], data: st.DataObject) -> None:
     sent = data.draw(messages_of(message))
     payload = encode(sent)
     assert take(message, payload) == sent
@@ -149,7 +149,8 @@ def test_codec_accepts_largest_images_and_no_other_large_message() -> None:
     for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColorImage, "rgb", b"\1\2\3")):
         largest = {**plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
         taken = take(message, encode(largest))
-        assert taken is not None and getattr(taken, field) == largest[field]
+        assert taken is not None
+        assert getattr(taken, field) == largest[field]
         assert take(message, encode({**largest, field: largest[field] + b"\1"})) is None
         assert take(JointState, encode({**plain_example(JointState), "other": largest[field]})) is None
 

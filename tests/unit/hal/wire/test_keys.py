@@ -20,7 +20,9 @@ def test_every_key_of_the_space_parses_back(row: keys.KeyRow) -> None:
     key = concrete(row.key)
     assert keys.find_message(key) is row.message
     assert keys.split_namespace(key) is None  # without a namespace there is nothing to split off
-    assert row.kind in ("stream", "latched", "query", "liveliness") and row.writer and row.about
+    assert row.kind in ("stream", "latched", "query", "liveliness")
+    assert row.writer
+    assert row.about
 
 
 def test_keys_are_unique_without_outer_slashes() -> None:
@@ -44,7 +46,7 @@ def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
 
 
 @given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))
-def test_namespaces_split_off(namespace: str, row: keys.KeyRow) -> None:
+def test_keys_split_into_namespace_and_key(namespace: str, row: keys.KeyRow) -> None:
     key = concrete(row.key)
     assert keys.split_namespace(f"{namespace}/{key}") == (namespace, key)
 

@@ -24,7 +24,7 @@ each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: 
 @each_message
 @given(data=st.data())
 @settings(max_examples=10)
-def test_what_readers_accept_is_sent_as_it_is(message: type[Message], data: st.DataObject) -> None:
+def test_outgoing_valid_message_is_sent_unchanged(message: type[Message], data: st.DataObject) -> None:
     sent = data.draw(messages_of(message))
     assert encode_checked(STREAMED[message], sent) == encode(sent)
 

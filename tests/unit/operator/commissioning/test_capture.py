@@ -36,7 +36,9 @@ def turns(*parts: Iterator[Floats]) -> list[HandTurn]:
 
 def test_capture_slow_turn_is_one_turn_with_its_size() -> None:
     (turn,) = turns(samples(1, 0, 0), samples(3, 0, 0.6), samples(2, 0.6, 0.6))
-    assert turn.joint == 1 and turn.alone and abs(turn.by_rad - 0.6) < 1e-6
+    assert turn.joint == 1
+    assert turn.alone
+    assert abs(turn.by_rad - 0.6) < 1e-6
 
 
 def test_a_pause_within_a_turn_is_no_end_of_it() -> None:

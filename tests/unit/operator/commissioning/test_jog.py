@@ -25,7 +25,8 @@ def test_jog_moves_at_its_speed_only_while_key_repeats() -> None:
     assert held(jog, "up", 1.0) == pytest.approx(0.1)
     for _ in range(100):
         jog.advance(PERIOD_S, jog.target_rad)
-    assert not jog.moves and 0.1 < jog.target_rad <= 0.1 + 0.1 * KEY_HOLD_S
+    assert not jog.moves
+    assert 0.1 < jog.target_rad <= 0.1 + 0.1 * KEY_HOLD_S
     assert held(jog, "down", 0.5) < 0.07
     at = jog.target_rad
     jog.on_key("x")
@@ -35,12 +36,13 @@ def test_jog_moves_at_its_speed_only_while_key_repeats() -> None:
 def test_jog_stays_within_travel_and_near_a_blocked_joint() -> None:
     assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(-0.2)
     ends = JogTarget(JogRequest(joint="joint_1", travel_rad=3.0), JOINT, 0.0)
-    assert (ends.lower_rad, ends.upper_rad) == (JOINT.angle_min_rad, JOINT.angle_max_rad)
+    assert ends.lower_rad == JOINT.angle_min_rad
+    assert ends.upper_rad == JOINT.angle_max_rad
     assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "up", 5.0, blocked_rad=0.0) == pytest.approx(
         MAX_LEAD_RAD
     )
 
 
-def test_too_fast_is_refused() -> None:
+def test_jog_speed_above_limit_is_refused() -> None:
     with raises_error(ConfigError, code="command/invalid-option", field="--speed"):
         JogRequest(joint="joint_1", speed_rad_s=2.0)

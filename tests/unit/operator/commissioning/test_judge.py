@@ -93,7 +93,8 @@ def test_judge_without_imus_confirms_only_encoders_and_detects_wrong_zero() -> N
     rows = [row.confirmed_by_hand(["order", "sign"]) for row in judge_joints(run, straight=True)]
     assert states(rows[0]) == {"gear": "unknown", "zero": "wrong"}
     assert rows[0].summary == "its zero is off by +0.150 rad: zero_rad = 0.150"
-    assert states(rows[1]) == {"gear": "unknown"} and not rows[1].all_confirmed
+    assert states(rows[1]) == {"gear": "unknown"}
+    assert not rows[1].all_confirmed
     lines = report_lines(rows)
     assert "0 of 3 joints match the robot file; 1 wrong; 2 unknown" in lines[JOINTS]
     assert lines[JOINTS + 1].startswith("unknown: gear of every joint: ")
@@ -102,7 +103,8 @@ def test_judge_without_imus_confirms_only_encoders_and_detects_wrong_zero() -> N
 
 def test_judge_zeros_are_unknown_until_straight_or_measured_by_gravity() -> None:
     first, second, third = judge_joints(measurements())
-    assert states(first) == states(third) == {"zero": "unknown"} and "--straight" in first.findings["zero"].reason
+    assert states(first) == states(third) == {"zero": "unknown"}
+    assert "--straight" in first.findings["zero"].reason
     assert second.all_confirmed  # a pitch joint
 
 
@@ -115,7 +117,9 @@ def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
     if allowed:
         assert "backlash" not in verdict
     else:
-        assert verdict.startswith("backlash of 0.03") and "gear =" not in verdict and "--allow-backlash" in verdict
+        assert verdict.startswith("backlash of 0.03")
+        assert "gear =" not in verdict
+        assert "--allow-backlash" in verdict
 
 
 def test_a_gear_of_another_ratio_is_no_backlash() -> None:
@@ -142,14 +146,16 @@ def test_judge_torque_against_its_motion_has_wrong_sign() -> None:
 @pytest.mark.parametrize("link", [0, 1])
 def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
     row = judge_joints(without_imus(measurements(), link), straight=True)[0]
-    assert row.turned is None and not row.all_confirmed
+    assert row.turned is None
+    assert not row.all_confirmed
     assert states(row) == {"sign": "unknown", "gear": "unknown"}
 
 
 def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:
     run = replace(measurements(), axes=["yaw", "yaw", "yaw"])
     row = judge_joints(without_imus(run, 2, 3), straight=True)[0]
-    assert states(row) == {"order": "unknown"} and "joint_2, joint_3" in row.findings["order"].reason
+    assert states(row) == {"order": "unknown"}
+    assert "joint_2, joint_3" in row.findings["order"].reason
 
 
 def test_judge_joint_without_its_motion_is_not_confirmed() -> None:
@@ -160,9 +166,8 @@ def test_judge_joint_without_its_motion_is_not_confirmed() -> None:
     dead = judge_joints(
         replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), straight=True
     )[0]
-    assert (
-        dead.summary.startswith("did not move") and not dead.confirmed_by_hand(["order", "sign", "gear"]).all_confirmed
-    )
+    assert dead.summary.startswith("did not move")
+    assert not dead.confirmed_by_hand(["order", "sign", "gear"]).all_confirmed
 
 
 def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
@@ -176,7 +181,8 @@ def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
     swung = replace(run, angle_rad=angle_rad, target_rad=target_rad, link_rate_rad_s=run.link_rate_rad_s)
     rows = judge_joints(swung, straight=True)
     assert [row.findings["zero"].state for row in rows] == ["confirmed"] * JOINTS
-    assert rows[0].all_confirmed and not rows[2].all_confirmed
+    assert rows[0].all_confirmed
+    assert not rows[2].all_confirmed
 
 
 def test_motion_capture_of_the_base_stands_for_its_imu() -> None:

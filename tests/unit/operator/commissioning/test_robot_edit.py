@@ -29,7 +29,9 @@ def test_robot_edit_follows_symbolic_link_and_keeps_permissions_and_text(tmp_pat
     real.chmod(0o640)
     link.symlink_to(real)
     change_joints(link, {"joint_1": {"zero_rad": 0.25}}, "straight pose")
-    assert link.is_symlink() and "zero_rad = 0.25" in real.read_text() and "# ours" in real.read_text()
+    assert link.is_symlink()
+    assert "zero_rad = 0.25" in real.read_text()
+    assert "# ours" in real.read_text()
     assert stat.S_IMODE(real.stat().st_mode) == 0o640
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["robots.git", "snake.toml", "snake.toml"]
 
@@ -40,7 +42,8 @@ def test_robot_edit_invalid_change_leaves_file_unchanged(tmp_path: Path) -> None
     before = path.read_bytes()
     with raises_error(ConfigError, code="config/out-of-range"):
         change_joints(path, {"joint_1": {"gear": -1.0}}, "by mistake")
-    assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
 
 
 def test_robot_edit_checks_are_read_back_as_written(tmp_path: Path) -> None:

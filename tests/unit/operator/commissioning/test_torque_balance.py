@@ -36,7 +36,7 @@ def found(seed: int, *, scaled: bool) -> TorqueBalance:
 
 
 @pytest.mark.parametrize("scaled", [True, False])
-def test_intervals_cover_what_they_say(scaled: bool) -> None:
+def test_torque_balance_intervals_have_their_coverage(scaled: bool) -> None:
     trials = [found(seed, scaled=scaled) for seed in range(60)]
     truth = TRUTH | {"torque_scale": SCALE if scaled else 1.0}
     for name, value in truth.items():

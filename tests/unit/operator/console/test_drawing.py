@@ -31,12 +31,14 @@ def test_without_joints_there_is_nothing_to_draw():
     assert draw(RobotSnapshot(robot=ROBOT), None) is None
 
 
-def test_forces_and_their_resultant():
+def test_drawing_has_forces_and_their_resultant():
     point = contact((0.0, 10.0, 0.0))
     control = pushing([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
     seen = world([point, point], [])
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=seen, control=control), None)
-    assert drawing is not None and drawing.propulsion_joint == COUNT - 1 and drawing.pushed_obstacles == {"peg"}
+    assert drawing is not None
+    assert drawing.propulsion_joint == COUNT - 1
+    assert drawing.pushed_obstacles == {"peg"}
     spans = [
         arrows[:, 1] - arrows[:, 0] for arrows in (drawing.measured_forces, drawing.resultant, drawing.desired_forces)
     ]
@@ -51,15 +53,16 @@ def test_drawing_requested_force_without_contact_is_no_contact_force():
     control = pushing(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
     drawing = draw(snapshot, None)
-    assert drawing is not None and drawing.pushed_obstacles == {"felt"}
-    assert drawing.desired_forces[:, 0, 0] == pytest.approx([0.1]) and drawing.forces_without_contact[
-        :, 0, 0
-    ] == pytest.approx([0.3])
+    assert drawing is not None
+    assert drawing.pushed_obstacles == {"felt"}
+    assert drawing.desired_forces[:, 0, 0] == pytest.approx([0.1])
+    assert drawing.forces_without_contact[:, 0, 0] == pytest.approx([0.3])
     assert drawing.forces_without_contact[0, 1] - drawing.forces_without_contact[0, 0] == pytest.approx(
         [0.0, LONGEST_M, 0.0]
     )
     table = push_point_table(control)
-    assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table and "<td>clear</td><td>30.0</td><td>0.0</td>" in table
+    assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table
+    assert "<td>clear</td><td>30.0</td><td>0.0</td>" in table
     assert push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
 
 
@@ -68,7 +71,8 @@ def test_drawing_strong_force_has_arrow_of_limited_length():
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([point], [])), None)
     assert drawing is not None
     start, end = drawing.measured_forces[0]
-    assert end - start == pytest.approx([0.0, LONGEST_M, 0.0]) and start[2] > ROBOT.links[0].radius_m
+    assert end - start == pytest.approx([0.0, LONGEST_M, 0.0])
+    assert start[2] > ROBOT.links[0].radius_m
     assert drawing.contacts_w[0] == pytest.approx(point.position_w)
 
 
@@ -85,7 +89,8 @@ def test_what_a_map_tells_is_not_drawn_as_perceived():
     found = Obstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
     felt = Obstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
-    assert drawing is not None and [o.name for o in drawing.perceived] == ["b", "c"]
+    assert drawing is not None
+    assert [o.name for o in drawing.perceived] == ["b", "c"]
 
 
 def test_a_camera_that_looks_along_its_link_looks_along_x():
@@ -97,8 +102,10 @@ def test_a_camera_that_looks_along_its_link_looks_along_x():
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None)
     assert drawing is not None
     looks = rotation_from_quaternion(drawing.cameras[0].wxyz)
-    assert looks[:, 2] == pytest.approx([1.0, 0.0, 0.0]) and looks[:, 1] == pytest.approx([0.0, 0.0, -1.0])
-    assert drawing.cameras[0].fov_rad == pytest.approx(math.pi / 2) and drawing.cameras[0].aspect == 2.0
+    assert looks[:, 2] == pytest.approx([1.0, 0.0, 0.0])
+    assert looks[:, 1] == pytest.approx([0.0, 0.0, -1.0])
+    assert drawing.cameras[0].fov_rad == pytest.approx(math.pi / 2)
+    assert drawing.cameras[0].aspect == 2.0
 
 
 def test_quaternions_give_back_their_rotations():

@@ -19,7 +19,8 @@ from snakesim_operator.features.console.scene.meshes import Mesh, make_box, make
 )
 def test_a_shape_has_its_size_and_faces_outwards(mesh: Mesh, half_m: tuple[float, ...], volume_m3: float):
     vertices, faces = mesh
-    assert vertices.max(axis=0) == pytest.approx(half_m) and vertices.min(axis=0) == pytest.approx(np.negative(half_m))
+    assert vertices.max(axis=0) == pytest.approx(half_m)
+    assert vertices.min(axis=0) == pytest.approx(np.negative(half_m))
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     # Tetrahedra from the origin to each face: their sum is the volume, and negative for a shape inside out.
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(volume_m3, rel=0.03)

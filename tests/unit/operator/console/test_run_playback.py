@@ -17,14 +17,18 @@ def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> Non
     simulate(load("triplet", [parse_set(one) for one in sets]).config, tmp_path / "run")
     recorded = RunPlayback(tmp_path / "run")
     moving, (_, end_s) = recorded.snapshot_at(0.5), recorded.span_s
-    assert moving.status is not None and moving.status.lifecycle == "armed" and not moving.status.faults
-    assert moving.power is not None and "armed by" in page_html.format_header(moving, recorded="run")
+    assert moving.status is not None
+    assert moving.status.lifecycle == "armed"
+    assert not moving.status.faults
+    assert moving.power is not None
+    assert "armed by" in page_html.format_header(moving, recorded="run")
     over = recorded.snapshot_at(end_s)
-    assert over.status is not None and over.status.lifecycle == "fault"
-    assert "joint_3" in page_html.format_state_table(over) and "FAULT" in page_html.format_header(over, recorded="run")
-    assert any("robot fault" in line for line in over.log[:3]) and any(
-        "control Locomoting" in line for line in moving.log
-    )
+    assert over.status is not None
+    assert over.status.lifecycle == "fault"
+    assert "joint_3" in page_html.format_state_table(over)
+    assert "FAULT" in page_html.format_header(over, recorded="run")
+    assert any("robot fault" in line for line in over.log[:3])
+    assert any("control Locomoting" in line for line in moving.log)
     assert len(moving.log) < len(over.log)  # what came later is not known yet
 
 
@@ -34,8 +38,12 @@ def test_cameras_rates_and_charts_are_those_of_the_instant(tmp_path: Path) -> No
     recorded = RunPlayback(tmp_path / "run")
     early, late = recorded.snapshot_at(0.3), recorded.snapshot_at(1.4)
     (seen,), (later,) = early.images.values(), late.images.values()
-    assert [*early.images] == ["sensor/depth/head"] and abs(seen.timestamp_ns * 1e-9 - 0.3) < 0.1
-    assert draw_picture(seen).std() > 0 and (draw_picture(later) != draw_picture(seen)).any()
+    assert [*early.images] == ["sensor/depth/head"]
+    assert abs(seen.timestamp_ns * 1e-9 - 0.3) < 0.1
+    assert draw_picture(seen).std() > 0
+    assert (draw_picture(later) != draw_picture(seen)).any()
     assert late.streams["sensor/joints"].rate_hz == approx(100, abs=2)
     charted = [snapshot.time_s or 0.0 for snapshot in recorded.iterate_snapshots_before(1.0)]
-    assert charted == sorted(charted) and charted[0] == recorded.span_s[0] and 0.98 < charted[-1] < 1.0
+    assert charted == sorted(charted)
+    assert charted[0] == recorded.span_s[0]
+    assert 0.98 < charted[-1] < 1.0

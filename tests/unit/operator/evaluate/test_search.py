@@ -112,7 +112,7 @@ def test_search_file_of_unknown_search_stays_unchanged(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a?b 50%20.db", "{x}#&ä.db"])
-def test_any_file_name_will_do(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_search_accepts_any_file_name(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     searched(tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     printed(capsys)
@@ -121,7 +121,7 @@ def test_any_file_name_will_do(tmp_path: Path, name: str, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("what", ["text", "folder"])
-def test_what_is_no_search_is_named(tmp_path: Path, what: str) -> None:
+def test_search_invalid_request_is_named(tmp_path: Path, what: str) -> None:
     storage = tmp_path / "search.db"
     storage.mkdir() if what == "folder" else storage.write_text("mine\n" * 1000)
     with raises_error(ConfigError, code="file/not-writable", field="search.db"):
@@ -151,4 +151,5 @@ def test_search_printout_for_several_seeds_names_the_first(tmp_path: Path, capsy
     words = shlex.split(command)
     propulsion = float(next(word for word in words if word.startswith(PROPULSION)).partition("=")[2])
     assert best.startswith(f"best path_distance_m: {propulsion + 600:.4g}, trial ")
-    assert "seed=5" in words and about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"
+    assert "seed=5" in words
+    assert about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"

@@ -44,19 +44,24 @@ def config(case: Case) -> RunConfig:
     return msgspec.json.decode(case.config, type=RunConfig)
 
 
-def test_every_row_in_every_combination(tmp_path: Path) -> None:
+def test_suite_contains_every_row_in_every_combination(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
     names = [setting.name for setting in make_settings(suite, source)]
-    assert len(names) == 12 and names[0] == "as shipped, density_per_m2 4, friction 0.1"
+    assert len(names) == 12
+    assert names[0] == "as shipped, density_per_m2 4, friction 0.1"
     assert names[-1] == "pegs only, density_per_m2 8, friction 0.3"
     cases = make_cases(suite, source, ["hold", "path_following"], 2, seed=7)
     assert len(cases) == 12 * 2 * 2
     assert len({case.id for case in cases}) == len(cases)
     last = config(cases[-1])
-    assert last.duration_s == 20 and last.clock_mode == "lockstep" and last.controller == "path_following"
+    assert last.duration_s == 20
+    assert last.clock_mode == "lockstep"
+    assert last.controller == "path_following"
     assert last.scene.ground.friction == pytest.approx(0.3)
-    assert (last.seed, last.scene.random_field[0].seed) == (8, 8)
-    assert last.scene.random_field[0].density_per_m2 == 8 and last.scene.random_field[0].box_fraction == 0
+    assert last.seed == 8
+    assert last.scene.random_field[0].seed == 8
+    assert last.scene.random_field[0].density_per_m2 == 8
+    assert last.scene.random_field[0].box_fraction == 0
 
 
 def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
@@ -112,7 +117,7 @@ def test_a_wrong_suite_is_told_what_and_where(
     assert not (tmp_path / "out").exists()
 
 
-def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
+def test_suite_has_a_maximum_number_of_cases(tmp_path: Path) -> None:
     suite, source = read(tmp_path, 'scenario = "jam"\n[vary]\nseed = "1:1000:1000"')
     with raises_error(ConfigError, code="command/invalid-option"):
         make_cases(suite, source, [], 300, 1)
@@ -137,7 +142,8 @@ def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
     cases = make_cases(suite, source, ["hold", "path_following"], 3, seed=7)
     drawn = [(case.field, config(case).scene) for case in cases]
     of_field = {field: scene.random_field[0].friction for field, scene in drawn}
-    assert len(set(of_field.values())) == 3 and all(0.1 <= one <= 0.3 for one in of_field.values())
+    assert len(set(of_field.values())) == 3
+    assert all(0.1 <= one <= 0.3 for one in of_field.values())
     assert all(scene.random_field[0].friction == of_field[field] for field, scene in drawn)
     launch = [scene.pegs_along_route[0].friction for _, scene in drawn]
     assert launch == [of_field[field] for field, _ in drawn[:6]] + [0.0] * 6

@@ -30,7 +30,7 @@ def outcome(advance_m: float, speed_m_s: float = 0.1) -> CaseOutcome:
 @pytest.mark.parametrize(
     ("successes", "trials", "low", "high"), [(8, 10, 0.490, 0.943), (0, 20, 0.0, 0.161), (100, 100, 0.963, 1.0)]
 )
-def test_wilson_as_tabulated(successes: int, trials: int, low: float, high: float) -> None:
+def test_table_wilson_interval_equals_tables(successes: int, trials: int, low: float, high: float) -> None:
     assert wilson_interval(successes, trials) == (pytest.approx(low, abs=5e-4), pytest.approx(high, abs=5e-4))
 
 
@@ -41,7 +41,9 @@ def test_speed_is_of_the_runs_that_crossed() -> None:
     assert [line.controller for line in lines] == ["poal"]  # of hold nothing is known yet
     head, row = table_lines(lines)
     assert head.split()[:3] == ["setting", "controller", "crossed"]
-    assert "1/3" in row and "0.200" in row and row.endswith(" 1")
+    assert "1/3" in row
+    assert "0.200" in row
+    assert row.endswith(" 1")
 
 
 def test_without_a_goal_the_advance_has_an_interval() -> None:
@@ -50,19 +52,20 @@ def test_without_a_goal_the_advance_has_an_interval() -> None:
     done = {one.id: CaseOutcome(numbers={"advance_m": 0.2 + 0.01 * one.field, "ended": "complete"}) for one in cases}
     head, two_runs, one_run = table_lines(group_results(cases, done))
     assert head.split()[-5:] == ["m", "95", "%", "of", "m"]
-    assert two_runs.endswith("0.15 to 0.28") and one_run.endswith(UNKNOWN)
+    assert two_runs.endswith("0.15 to 0.28")
+    assert one_run.endswith(UNKNOWN)
     assert "95 %" not in table_lines(group_results([cases[2]], done))[0]
 
 
 @pytest.mark.parametrize(("runs", "quantile"), [(2, 12.706), (4, 3.182), (11, 2.228), (31, 2.042), (1001, 1.962)])
-def test_students_t_as_tabulated(runs: int, quantile: float) -> None:
+def test_table_student_t_equals_tables(runs: int, quantile: float) -> None:
     values = [0.0, 1.0] * (runs // 2) + [0.5] * (runs % 2)
     low, high = mean_interval(values)
     standard_error = float(np.std(values, ddof=1)) / math.sqrt(runs)
     assert (high - low) / 2 / standard_error == pytest.approx(quantile, rel=2e-3)
 
 
-def test_the_worst_come_first() -> None:
+def test_table_lists_worst_cases_first() -> None:
     cases = [case(field) for field in (1, 2, 3, 4)]
     done = {"poal-1-1": outcome(2.0), "poal-1-2": outcome(3.0), "poal-1-3": CaseOutcome(error="no room")}
     done["poal-1-4"] = outcome(0.5)

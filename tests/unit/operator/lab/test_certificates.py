@@ -41,7 +41,8 @@ def test_certificate_is_renewed_in_last_third_of_its_life(tmp_path: Path) -> Non
     at.write_bytes(certificate)
     at.with_suffix(".key").write_bytes(key)
     after = states(tmp_path)
-    assert after.pop("gnc.planar13.ws1") == "renewed" and set(after.values()) == {"kept"}
+    assert after.pop("gnc.planar13.ws1") == "renewed"
+    assert set(after.values()) == {"kept"}
     assert read_certificate(at).not_valid_after_utc > datetime.now(UTC) + timedelta(days=29)
     assert set(states(tmp_path, rotate=True).values()) == {"renewed"}
 

@@ -104,7 +104,8 @@ def test_units_bring_interfaces_up_and_grant_device_access(tmp_path: Path, name:
     assert ("AF_CAN" in host) == bool(wanted)
     devices = DEVICES.get(name, [])
     allowed = re.findall(r"^DeviceAllow=(/\S+) rw$", host, re.MULTILINE)
-    assert allowed == devices and service.get("devices", []) == [f"{path}:{path}" for path in devices]
+    assert allowed == devices
+    assert service.get("devices", []) == [f"{path}:{path}" for path in devices]
     assert ("SupplementaryGroups=dialout" in host) == bool(devices) == ("group_add" in service)
     assert ("PrivateDevices=yes" in host) != bool(devices) == ("DevicePolicy=closed" in host)
     for path, text in files.items():
@@ -175,4 +176,5 @@ def test_check_marks_robot_that_contradicts_lab_file(
     said: list[str] = []
     found = Findings(said.append)
     check_what_moves(load_lab(path).file.robots["planar13"], described, found)
-    assert found.wrong == bool(wrong) and wrong in said[0]
+    assert found.wrong == bool(wrong)
+    assert wrong in said[0]

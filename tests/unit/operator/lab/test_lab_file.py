@@ -34,7 +34,7 @@ def test_lab_example_assigns_every_role() -> None:
         ("faults = false", 'set = ["a=1\\nExecStart=evil"]'),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path: Path, old: str, new: str) -> None:
+def test_lab_file_errors_name_the_conflict(tmp_path: Path, old: str, new: str) -> None:
     assert old in TEXT
     path = tmp_path / "lab.toml"
     path.write_text(TEXT.replace(old, new, 1))

@@ -93,7 +93,8 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     at_ns, update = moving[-1]
     row = record.row_at(at_ns * 1e-9)
     nodes = record.nodes_w(row)
-    assert nodes is not None and len(update.transforms) == len(record.description.links)
+    assert nodes is not None
+    assert len(update.transforms) == len(record.description.links)
     behind = ["world", *(link.name for link in record.description.links[:-1])]
     assert [one.parent_frame_id for one in update.transforms] == behind
     reported, forward = in_the_world(update.transforms)
@@ -143,7 +144,8 @@ def test_raw_only_leaves_out_what_is_for_viewers(tmp_path: Path) -> None:
         summary = make_reader(file).get_summary()
     assert summary is not None
     topics = {channel.topic for channel in summary.channels.values()}
-    assert keys.JOINTS in topics and not {topic for topic in topics if topic.startswith("/")}
+    assert keys.JOINTS in topics
+    assert not {topic for topic in topics if topic.startswith("/")}
 
 
 def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
@@ -156,19 +158,24 @@ def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
     assert len(scene["path"][0].lines[0].points) in {len(reported.path_w) for reported in record.trajectories}
     arrows = [arrow for _, update in found[f"{ROBOT}/scene/forces"] for arrow in update.entities[0].arrows]
     turns = [arrow.pose.orientation for arrow in arrows]
-    assert arrows and all(math.hypot(q.w, q.x, q.y, q.z) == pytest.approx(1.0) for q in turns)
+    assert arrows
+    assert all(math.hypot(q.w, q.x, q.y, q.z) == pytest.approx(1.0) for q in turns)
 
 
 def test_images_come_with_their_camera(run: Path) -> None:
     found = shown(run / RECORDING)
     at_ns, image = found[f"{ROBOT}/head/depth/image_raw"][-1]
     pinhole = dict(found[f"{ROBOT}/head/depth/camera_info"])[at_ns]
-    assert image.encoding == "16UC1" and len(image.data) == image.step * image.height == 2 * image.width * image.height
-    assert (pinhole.width, pinhole.height) == (image.width, image.height) and pinhole.K[0] == pinhole.P[0] > 0
+    assert image.encoding == "16UC1"
+    assert len(image.data) == image.step * image.height == 2 * image.width * image.height
+    assert pinhole.width == image.width
+    assert pinhole.height == image.height
+    assert pinhole.K[0] == pinhole.P[0] > 0
     mount = next(t for at, one in found[f"{ROBOT}/tf"] if at == at_ns for t in one.transforms
                  if t.child_frame_id == image.frame_id)  # fmt: skip
     q = mount.rotation  # the camera looks along its z, which is nearly the link's x
-    assert 2 * (q.x * q.z + q.w * q.y) > 0.9 and mount.parent_frame_id == "link_13"
+    assert 2 * (q.x * q.z + q.w * q.y) > 0.9
+    assert mount.parent_frame_id == "link_13"
 
 
 def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
@@ -177,7 +184,8 @@ def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
     whole = msgspec.msgpack.decode(sent[key], type=DepthImage)
     torn = msgspec.msgpack.encode(msgspec.structs.replace(whole, depth=whole.depth[:-1]))
     channels.convert(keys.DESCRIPTION, sent[keys.DESCRIPTION], 0)
-    assert not channels.convert(key, torn, 0) and channels.convert(key, sent[key], 10**9)
+    assert not channels.convert(key, torn, 0)
+    assert channels.convert(key, sent[key], 10**9)
 
 
 def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
@@ -185,11 +193,14 @@ def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
     with (run / RECORDING).open("rb") as file:
         read = list(make_reader(file).iter_messages(topics=[f"{ROBOT}/state"]))
     schema, channel, _ = read[0]
-    assert schema is not None and (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+    assert schema is not None
+    assert schema.encoding == "jsonschema"
+    assert channel.message_encoding == "json"
     states = [json.loads(message.data) for *_, message in read]
     wanted = json.loads(schema.data)
     assert all(set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states)
-    assert [one["lifecycle"] for one in states[-2:]] == ["armed", "disarmed"] and states[-2]["path_s_m"] > 0
+    assert [one["lifecycle"] for one in states[-2:]] == ["armed", "disarmed"]
+    assert states[-2]["path_s_m"] > 0
     assert {one["locomotion"] for one in states} <= {reported.state for reported in record.control} | {""}
     assert any(one.name == "hal" and one.message.startswith("armed: armed by") for one in logged)
     assert any(one.name == "control" and one.message.startswith("Locomoting: ") for one in logged)
@@ -202,7 +213,8 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
             if channel.topic.startswith("/"):
                 newest[channel.topic.replace(ROBOT, "/planar13")] = one  # as docs/how-to/foxglove.md shows
     panels, text = layout["configById"], json.dumps(layout["layout"])
-    assert all(f'"{name}"' in text for name in panels) and text.count("!") == len(panels)
+    assert all(f'"{name}"' in text for name in panels)
+    assert text.count("!") == len(panels)
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
     topics = [topic for panel in panels.values() for topic in panel.get("topics", {})]
     image = panels["Image!depth"]["imageMode"]
@@ -231,13 +243,16 @@ def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Pat
         reader = NonSeekingReader(file, validate_crcs=True, decoder_factories=FACTORIES)
         for _, channel, _, one in reader.iter_decoded_messages(log_time_order=False):
             found[channel.topic] = one
-    assert len(found[f"{ROBOT}/joint_states"].joints) == 13 and found[f"{ROBOT}/tf"].transforms
+    assert len(found[f"{ROBOT}/joint_states"].joints) == 13
+    assert found[f"{ROBOT}/tf"].transforms
     assert len(found[f"{ROBOT}/head/depth/image_raw"].data) > 1000
     count, lacks = recover_recording(torn, tmp_path / "whole.mcap")  # for readers that want an index
     whole = shown(tmp_path / "whole.mcap")
-    assert count > 500 and len(whole[f"{ROBOT}/tf"]) > 10
+    assert count > 500
+    assert len(whole[f"{ROBOT}/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
-    assert len(alone.time_s) > 20 and alone.missing == [f"recording: before it was copied: {lacks[0]}"]
+    assert len(alone.time_s) > 20
+    assert alone.missing == [f"recording: before it was copied: {lacks[0]}"]
 
 
 def test_foxglove_reason_with_changing_number_is_logged_once() -> None:

@@ -74,7 +74,7 @@ def made_up(
         mode=np.full((count, JOINTS), Mode.POSITION, dtype=np.int8),
         target=0.3 * np.sin(phase) + 0.01,
         torque_limit_nm=np.full((count, JOINTS), 7.0),
-        position_w=np.full((count, 3), np.nan),
+        position_w_m=np.full((count, 3), np.nan),
         orientation_wxyz=np.full((count, 4), np.nan),
         contact_peak_n=np.zeros(count),
         contact_count=np.zeros(count),
@@ -98,11 +98,15 @@ def shown(difference: Difference) -> tuple[str, str]:
 
 def test_the_same_run_twice_differs_in_nothing() -> None:
     difference = differ(made_up(), made_up())
-    assert difference.identical and difference.divergence is None and difference.settings == []
+    assert difference.identical
+    assert difference.divergence is None
+    assert difference.settings == []
     assert [gap.rms for gap in difference.gaps] == [0.0] * 4  # angle, speed, torque, angle target
     assert difference.torque.correlation == pytest.approx(1)
-    assert difference.advance is not None and difference.advance.percent == 0
-    assert difference.hand_overs.same_order and difference.hand_overs.later_s == [0, 0, 0]
+    assert difference.advance is not None
+    assert difference.advance.percent == 0
+    assert difference.hand_overs.same_order
+    assert difference.hand_overs.later_s == [0, 0, 0]
     text, html = shown(difference)
     assert "The runs are the same, joint by joint, for all of their 200 common ticks." in text
     assert "No difference: every angle is the same at every time." in html
@@ -117,7 +121,8 @@ def test_compare_nan_in_both_runs_is_not_equal(name: str, where: Any, wrong: flo
     hurt = dataclasses.replace(record, **{name: hurt})
     for difference in (differ(hurt, hurt), differ(record, hurt), differ(hurt, record)):
         text, html = shown(difference)
-        assert not difference.identical and "The runs are the same" not in text + html
+        assert not difference.identical
+        assert "The runs are the same" not in text + html
         assert "Not a number in one run or in both, so it cannot be compared: " in text
 
 
@@ -127,7 +132,7 @@ ODD: dict[str, dict[str, Any]] = {
     "texts": {"target": np.full((200, JOINTS), "x")},
     "complex": {"velocity_rad_s": np.zeros((200, JOINTS), dtype=complex)},
     "a number": {"mode": np.zeros(())},
-    "positions in a plane": {"position_w": np.zeros((200, 2))},
+    "positions in a plane": {"position_w_m": np.zeros((200, 2))},
     "time that stands": {"time_s": np.zeros(200)},
     "time that is not a number": {"time_s": np.full(200, np.nan)},
 }
@@ -137,7 +142,8 @@ ODD: dict[str, dict[str, Any]] = {
 def test_a_black_box_with_odd_arrays_is_one_error(odd: str) -> None:
     with raises_error(ConfigError, code="recording/not-readable") as caught:
         differ(made_up(), dataclasses.replace(made_up(), **ODD[odd]))
-    assert f"`{next(iter(ODD[odd]))}`" in str(caught.value) and "\n" not in str(caught.value)
+    assert f"`{next(iter(ODD[odd]))}`" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_one_joint_that_is_off_is_named_with_its_time() -> None:
@@ -147,15 +153,21 @@ def test_one_joint_that_is_off_is_named_with_its_time() -> None:
     angle[150, 4] += 0.1
     difference = differ(a, dataclasses.replace(a, angle_rad=angle))
     worst, divergence = difference.angle.worst, difference.divergence
-    assert worst is not None and (worst.joint, worst.time_s) == (4, pytest.approx(1.5))
+    assert worst is not None
+    assert worst.joint == 4
+    assert worst.time_s == pytest.approx(1.5)
     assert worst.difference == pytest.approx(0.3)
     assert difference.angle.joint_rms[4] == pytest.approx(math.sqrt((79 * 0.2**2 + 0.3**2) / 200))
     assert difference.angle.joint_rms[[0, 3, 5, 12]].tolist() == [0, 0, 0, 0]
-    assert divergence is not None and divergence.joint == 4 and divergence.time_s == pytest.approx(1.2)
-    assert difference.torque.rms == 0 and not difference.identical
+    assert divergence is not None
+    assert divergence.joint == 4
+    assert divergence.time_s == pytest.approx(1.2)
+    assert difference.torque.rms == 0
+    assert not difference.identical
     text, html = shown(difference)
     assert "The runs diverge at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
-    assert "joint_5 at 1.50 s" in text and 'data-joint="joint_5"' in html
+    assert "joint_5 at 1.50 s" in text
+    assert 'data-joint="joint_5"' in html
 
 
 def test_runs_are_aligned_at_their_first_arming_whenever_that_was() -> None:
@@ -165,14 +177,15 @@ def test_runs_are_aligned_at_their_first_arming_whenever_that_was() -> None:
     assert difference.hand_overs.later_s == pytest.approx([0, 0, 0])
 
 
-def test_the_common_time_alone_counts() -> None:
+def test_compare_uses_only_the_common_time() -> None:
     difference = differ(made_up(seconds=2), made_up(seconds=1))
-    assert difference.aligned.time_s[-1] == pytest.approx(0.99) and difference.identical
+    assert difference.aligned.time_s[-1] == pytest.approx(0.99)
+    assert difference.identical
     assert [one.joint for one in difference.hand_overs.a] == [9, 8]  # the third comes later than B lasts
     assert [one.key for one in difference.settings] == ["duration_s"]
 
 
-def test_a_run_that_is_late_is_seen_so() -> None:
+def test_compare_delayed_run_has_its_delay() -> None:
     a, late = made_up(), 0.05
     since_s = a.time_s[:, None] - a.time_s[0] - late
     b = dataclasses.replace(a, angle_rad=0.3 * np.sin(2 * math.pi * since_s + 0.3 * np.arange(JOINTS)))
@@ -187,9 +200,8 @@ def test_scaled_torques_correlate_fully() -> None:
     difference = differ(a, dataclasses.replace(a, torque_nm=1.5 * a.torque_nm))
     assert difference.torque.correlation == pytest.approx(1)
     assert difference.torque.rms == pytest.approx(1.0 / math.sqrt(2), rel=0.01)
-    assert difference.torque.worst is not None and abs(difference.torque.worst.difference) == pytest.approx(
-        1.0, rel=0.01
-    )
+    assert difference.torque.worst is not None
+    assert abs(difference.torque.worst.difference) == pytest.approx(1.0, rel=0.01)
     shown(difference)
 
 
@@ -197,7 +209,8 @@ def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
     difference = differ(made_up(rate_hz=100), made_up(rate_hz=30, seconds=1.5))
     assert len(difference.aligned.time_s) == 45
     assert difference.aligned.how == "A at 100 Hz, B at 30 Hz: A is interpolated at the ticks of B"
-    assert difference.angle.rms is not None and difference.angle.rms < 2e-4  # a sine between 10 ms ticks
+    assert difference.angle.rms is not None
+    assert difference.angle.rms < 2e-4  # a sine between 10 ms ticks
     assert {"rate_hz", "duration_s"} <= {one.key for one in difference.settings}
     assert difference.aligned.how in shown(difference)[0]
 
@@ -227,7 +240,7 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
     assert for_scripts(difference)["drives"]["joint_1"]["b"] == {"serial": "AE00", "firmware": "1.0"}
 
 
-def test_other_drives_are_named() -> None:
+def test_compare_names_different_drives() -> None:
     a, b = made_up(), made_up()
     of_a = with_serials(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
     of_b = with_serials(a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS)
@@ -252,14 +265,18 @@ def test_targets_are_compared_only_within_one_mode() -> None:
     difference = differ(a, dataclasses.replace(a, mode=mode, target=target))
     assert difference.other_mode == pytest.approx(100 / (200 * JOINTS))
     assert [gap.what for gap in difference.targets] == ["angle target"]
-    assert difference.targets[0].rms == 0 and not difference.identical
+    assert difference.targets[0].rms == 0
+    assert not difference.identical
     assert difference.tracking_rad == pytest.approx((0.01, 0.01))
     both = differ(
         dataclasses.replace(a, mode=mode, target=target), dataclasses.replace(a, mode=mode, target=target + 1)
     )
     torque = both.targets[1]
-    assert torque.what == "torque target" and torque.worst is not None
-    assert (torque.worst.joint, torque.worst.time_s, torque.worst.difference) == (6, pytest.approx(1.0), 1.0)
+    assert torque.what == "torque target"
+    assert torque.worst is not None
+    assert torque.worst.joint == 6
+    assert torque.worst.time_s == pytest.approx(1.0)
+    assert torque.worst.difference == 1.0
     assert [joint for joint, worst in enumerate(torque.joint_worst) if worst is not None] == [6]
     shown(both)
 
@@ -267,46 +284,59 @@ def test_targets_are_compared_only_within_one_mode() -> None:
 @pytest.mark.parametrize(("speed_m_s", "percent"), [(0.09, -10.0), (0.125, 25.0), (-0.1, -200.0)])
 def test_distance_is_relative_to_the_first_run(speed_m_s: float, percent: float) -> None:
     difference = differ(made_up(), made_up(speed_m_s=speed_m_s))
-    assert difference.advance is not None and difference.advance.percent == pytest.approx(percent)
+    assert difference.advance is not None
+    assert difference.advance.percent == pytest.approx(percent)
     asked = within(difference, abs(percent) - 0.1)
-    assert asked is not None and not asked.holds
+    assert asked is not None
+    assert not asked.holds
     asked = within(difference, abs(percent) + 0.1)
-    assert asked is not None and asked.holds
+    assert asked is not None
+    assert asked.holds
 
 
-def test_nobody_makes_a_percentage_of_standing_still() -> None:
+def test_compare_standing_run_has_no_relative_distance() -> None:
     stood = made_up(speed_m_s=0)
     both, one = differ(stood, made_up(speed_m_s=1e-5)), differ(stood, made_up())
-    assert both.advance is not None and both.advance.percent == 0
-    assert one.advance is not None and one.advance.percent is None
+    assert both.advance is not None
+    assert both.advance.percent == 0
+    assert one.advance is not None
+    assert one.advance.percent is None
     asked = within(one, 1000)
-    assert asked is not None and not asked.holds and "A did not move" in asked.words
+    assert asked is not None
+    assert not asked.holds
+    assert "A did not move" in asked.words
     shown(both)
     shown(one)
 
 
-def test_a_distance_that_nobody_knows_is_not_made_up() -> None:
+def test_compare_unknown_distance_stays_unknown() -> None:
     difference = differ(made_up(), made_up(controller_knows=False))
-    assert difference.advance is None and within(difference, 10) is None
+    assert difference.advance is None
+    assert within(difference, 10) is None
     text, html = shown(difference)
-    assert "no measure that both have" in text and "No distance" in html
+    assert "no measure that both have" in text
+    assert "No distance" in html
 
 
-def test_hand_overs_agree_up_to_where_they_do_not() -> None:
+def test_compare_hand_overs_agree_until_first_difference() -> None:
     b = made_up(propelled=((0.0, 9), (0.7, 8), (1.1, 6), (1.5, 7)))
     difference = differ(made_up(), b)
     both = difference.hand_overs
-    assert both.agreed == 2 and both.later_s == pytest.approx([0, 0.1]) and not both.same_order
+    assert both.agreed == 2
+    assert both.later_s == pytest.approx([0, 0.1])
+    assert not both.same_order
     said = "agrees for the first 2; then A continues with joint_8 at 1.20 s, B continues with joint_7 at 1.10 s"
     text, html = shown(difference)
-    assert said in text and said in html
+    assert said in text
+    assert said in html
 
 
 def test_settings_that_differ_are_named_with_both_values() -> None:
     a = made_up()
     b = dataclasses.replace(a, config=configured(**{"robot.motor.stiffness_nm_per_rad": 50, "seed": 2}))
     found = {one.key: (one.a, one.b) for one in differ(a, b).settings}
-    assert found["robot.motor.stiffness_nm_per_rad"] == ("60.0", "50.0") and found["seed"] == ("1", "2")
+    assert found["robot.motor.stiffness_nm_per_rad"] == ("60.0", "50.0")
+    assert found["seed"] == ("1", "2")
     assert not [key for key in found if key.startswith("description.")]
 
 

@@ -33,14 +33,18 @@ def state(
 def test_force_tracking_accepts_forces_slightly_after_solution():
     solved = np.random.default_rng(1).uniform(2.0, 20.0, (60, 3)).tolist()
     found = force_tracking([state(k, solved[k], solved[k - 2] if k > 1 else [0.0] * 3) for k in range(60)])
-    assert found is not None and found.correlation == pytest.approx(1.0)
-    assert found.median_error == pytest.approx(0.0) and found.empty == 0.0
+    assert found is not None
+    assert found.correlation == pytest.approx(1.0)
+    assert found.median_error == pytest.approx(0.0)
+    assert found.empty == 0.0
 
 
 def test_force_tracking_counts_empty_push_points_but_not_unjudged_ones():
     moving = [state(k, [4.0, 10.0, 0.2], [3.0, 0.0, 9.0]) for k in range(20)]
     found = force_tracking(moving)
-    assert found is not None and found.empty == 0.5 and found.median_error == pytest.approx((0.25 + 1.0) / 2)
+    assert found is not None
+    assert found.empty == 0.5
+    assert found.median_error == pytest.approx((0.25 + 1.0) / 2)
     assert (
         force_tracking([state(k, [4.0], [0.0], moves=False) for k in range(20)]) is None
     )  # friction may take all of it
@@ -52,8 +56,11 @@ def test_force_tracking_counts_empty_push_points_but_not_unjudged_ones():
 def test_force_tracking_summary_states_how_well_forces_matched(record: RunRecord):
     assert any(one.measured_force_n and max(n or 0.0 for n in one.measured_force_n) > 1.0 for one in record.control)
     summary = summarise(record, "complete")
-    assert summary.desired_force_correlation is not None and -1.0 <= summary.desired_force_correlation <= 1.0
-    assert summary.desired_force_error is not None and summary.empty_push_points is not None
-    assert summary.desired_force_error > 0.0 and 0.0 < summary.empty_push_points < 0.5
+    assert summary.desired_force_correlation is not None
+    assert -1.0 <= summary.desired_force_correlation <= 1.0
+    assert summary.desired_force_error is not None
+    assert summary.empty_push_points is not None
+    assert summary.desired_force_error > 0.0
+    assert 0.0 < summary.empty_push_points < 0.5
     blind = [msgspec.structs.replace(one, measured_force_n=[]) for one in record.control]
     assert summarise(dataclasses.replace(record, control=blind), "complete").desired_force_error is None

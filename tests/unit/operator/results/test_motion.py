@@ -16,10 +16,10 @@ from snakesim_testing.operator.recorded_triplet import SECONDS, changed
 
 def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
     """The same body, which goes along x like this and does not bend."""
-    position = np.repeat(record.position_w[:1], len(x_m), axis=0)
+    position = np.repeat(record.position_w_m[:1], len(x_m), axis=0)
     position[:, 0] += x_m
     still = {name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0) for name in ("orientation_wxyz", "angle_rad")}
-    return changed(record, position_w=position, **still)
+    return changed(record, position_w_m=position, **still)
 
 
 def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> None:
@@ -38,11 +38,12 @@ def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> N
 def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, amplitude_m: float, moves: bool) -> None:
     time_s = record.time_s - record.time_s[0]
     motion = measure_motion(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
-    assert motion is not None and motion.moving_fraction == (1.0 if moves else 0.0)
+    assert motion is not None
+    assert motion.moving_fraction == (1.0 if moves else 0.0)
 
 
-def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
-    blind = changed(record, position_w=record.position_w * np.nan, worlds=[])
+def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
+    blind = changed(record, position_w_m=record.position_w_m * np.nan, worlds=[])
     assert measure_motion(blind) is None
     reported = summarise(blind, "complete")
     assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
@@ -51,7 +52,7 @@ def test_without_a_pose_it_is_unknown_and_not_none(record: RunRecord) -> None:
 
 def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> None:
     """The black box has no pose then; guidance's world model has."""
-    blind = changed(record, position_w=record.position_w * np.nan)
+    blind = changed(record, position_w_m=record.position_w_m * np.nan)
     for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):
         worlds = [msgspec.structs.replace(world, pose_from=source) for world in record.worlds]
         known = changed(blind, worlds=worlds)
@@ -70,7 +71,8 @@ def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.C
     print_summary(summary)
     printed = re.search(r"\((\d+) hand-overs in all\)", capsys.readouterr().out)
     said = re.search(r"handed over (\d+) times among 3 joints", verdict(many, summary).words)
-    assert printed is not None and said is not None
+    assert printed is not None
+    assert said is not None
     assert int(printed[1]) == int(said[1]) == summary.hand_overs == len(summary.propulsion_joints or []) - 1 > 30
 
 

@@ -40,7 +40,7 @@ SIGNALS = {
     "torque_nm": 13,
     "target": 13,
     "torque_limit_nm": 13,
-    "position_w": 3,
+    "position_w_m": 3,
     "orientation_wxyz": 4,
     "time_s": 0,
     "contact_peak_n": 0,
@@ -99,7 +99,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     )
     write_record(folder, record)
     loaded = RunRecord.load(folder)
-    assert loaded.missing == [] and "is incomplete" not in summary_and_page(loaded)[1].text
+    assert loaded.missing == []
+    assert "is incomplete" not in summary_and_page(loaded)[1].text
     return loaded
 
 
@@ -109,7 +110,8 @@ def summary_and_page(record: RunRecord) -> tuple[RunSummary, Reader]:
         summary = summarise(record, "complete")
         reader = Reader(page(record, summary))
     numbers = [value for value in msgspec.structs.astuple(summary) if isinstance(value, float)]
-    assert len(numbers) > 5 and all(map(math.isfinite, numbers))
+    assert len(numbers) > 5
+    assert all(map(math.isfinite, numbers))
     msgspec.json.decode(msgspec.json.encode(summary), type=RunSummary)
     assert not [a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])]
     assert not re.search(r"\b(None|nan|inf)\b", reader.text)
@@ -125,7 +127,8 @@ def compared(a: RunRecord, b: RunRecord) -> str:
     assert not re.search(r"\b(nan|inf)\b", text + reader.text)
     for record in (a, b):
         for lack in record.missing:
-            assert lack in text and lack in reader.text
+            assert lack in text
+            assert lack in reader.text
     return text
 
 
@@ -143,7 +146,7 @@ def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
 
 @given(cells=spoilt_cells())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, cells: Any) -> None:
+def test_black_box_with_nan_is_summarized(base: RunRecord, tmp_path: Path, cells: Any) -> None:
     corrupted = {name: np.array(getattr(base, name)) for name in SIGNALS}
     for signal, rows, column, value in cells:
         place = corrupted[signal]
@@ -154,13 +157,14 @@ def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
     said = {line.partition(":")[0]: line for line in record.missing}
     for name, values in corrupted.items():
         bad = ~(np.abs(values) < 1e9)
-        if name in ("position_w", "orientation_wxyz") or not bad.any():
+        if name in ("position_w_m", "orientation_wxyz") or not bad.any():
             continue
         assert f"of {LAST - FIRST} samples are not numbers" in said[name]
         counts = zip(JOINTS, bad.sum(axis=0), strict=True) if values.ndim > 1 else [("", bad.sum())]
         assert all(f"{joint} {n}" in said[name] for joint, n in counts if n)
     summary, reader = summary_and_page(record)
-    assert summary.missing == record.missing and all(lack in reader.text for lack in record.missing)
+    assert summary.missing == record.missing
+    assert all(lack in reader.text for lack in record.missing)
     compared(base, record)
     compared(record, record)
 
@@ -176,7 +180,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 @pytest.mark.slow  # the black box is read with the same checks
 @given(data=st.data())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
+def test_recording_with_nan_is_summarized(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     write_record(tmp_path, base)
     messages = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
     payloads = [(key, msgspec.msgpack.encode(message)) for key, message in messages]
@@ -198,7 +202,8 @@ def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
     assert len(record.control) + len(record.worlds) == len(payloads) - refused
     lacking = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)
             for lack in record.missing]  # fmt: skip
-    assert sum(int(found[1]) for found in lacking if found) == refused and all(lacking)
+    assert sum(int(found[1]) for found in lacking if found) == refused
+    assert all(lacking)
     _, reader = summary_and_page(record)
     assert all(lack in reader.text for lack in record.missing)
     compared(record, base)
@@ -206,17 +211,17 @@ def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
 
 def test_unknown_pose_is_a_gap_only_with_a_pose_sensor(base: RunRecord, tmp_path: Path) -> None:
     def lacks(sensors: Any, unknown: slice) -> list[str]:
-        position = base.position_w.copy()
+        position = base.position_w_m.copy()
         position[unknown] = np.nan
         robot = msgspec.structs.replace(base.config.robot, sensors=sensors)
         config = msgspec.structs.replace(base.config, robot=robot)
-        write_record(tmp_path, dataclasses.replace(base, config=config, position_w=position))
+        write_record(tmp_path, dataclasses.replace(base, config=config, position_w_m=position))
         record = RunRecord.load(tmp_path)
         summary_and_page(record)
         return record.missing
 
     sensors = base.config.robot.sensors
     assert lacks(sensors, slice(0, 5)) == []
-    assert lacks(sensors, slice(3, 5)) == ["position_w: 2 of 90 samples are not numbers"]
-    assert lacks(sensors, slice(0, None)) == ["position_w: 90 of 90 samples are not numbers"]
+    assert lacks(sensors, slice(3, 5)) == ["position_w_m: 2 of 90 samples are not numbers"]
+    assert lacks(sensors, slice(0, None)) == ["position_w_m: 90 of 90 samples are not numbers"]
     assert lacks(msgspec.structs.replace(sensors, pose=None), slice(0, None)) == []

@@ -39,7 +39,7 @@ def page(record: RunRecord) -> Reader:
 # --- a whole run -----------------------------------------------------------------------------------------------
 
 
-def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
+def test_report_verdict_states_distance_and_hand_overs(page: Reader) -> None:
     said = (
         "Moved 0.62 m along the path in 10.0 s; propulsion handed over joint_10 → joint_9 → joint_8 → joint_7 → "
         "joint_6 → joint_5 → joint_4; no fault, 2 commands refused (stale)."
@@ -48,7 +48,7 @@ def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
     assert f"Locomotion ended at 6.3 s of 10.0 s: {LOST}; no three push-points on alternating sides." in page.text
 
 
-def test_what_is_red_says_why(record: RunRecord) -> None:
+def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     late = dataclasses.replace(record, host=msgspec.structs.replace(record.host, answered_ticks=100))
     html = report_page(late, summarise(late, "complete"))
     red = re.findall(r'class="tile alarming">.*?<span>(.*?)</span>(?:<span class="why">(.*?)</span>)?</div>', html)
@@ -62,19 +62,27 @@ def test_what_is_red_says_why(record: RunRecord) -> None:
         r"most often peg_\d_\d, \d+ of \d+",
         why["of the push-points carried nothing"],
     )
-    assert apart is not None and sum(map(int, apart.groups())) == 100
-    assert "the record does not show why" in why_empty(dataclasses.replace(late, position_w=late.position_w * np.nan))
+    assert apart is not None
+    assert sum(map(int, apart.groups())) == 100
+    assert "the record does not show why" in why_empty(
+        dataclasses.replace(late, position_w_m=late.position_w_m * np.nan)
+    )
 
 
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:
     frames = page.film["frames"]
-    assert frames[0][0] == 0 and frames[-1][0] == pytest.approx(SECONDS, abs=0.02) and 200 < len(frames) < 400
+    assert frames[0][0] == 0
+    assert frames[-1][0] == pytest.approx(SECONDS, abs=0.02)
+    assert 200 < len(frames) < 400
     assert all(len(nodes) == 2 * 15 for _, nodes, *_ in frames)
     propels = {joint for _, _, joint, *_ in frames}
     assert propels == {-1, *INTERVALS_S}
     solved, felt = ([len(frame[k]) for frame in frames] for k in (4, 5))
-    assert set(solved) == {0, 16} and set(felt) <= set(range(0, 24, 4)) and max(felt) >= 12
-    assert not page.film["maps"] and not page.film["paths"]  # its map is known, its route is the scene's
+    assert set(solved) == {0, 16}
+    assert set(felt) <= set(range(0, 24, 4))
+    assert max(felt) >= 12
+    assert not page.film["maps"]
+    assert not page.film["paths"]  # its map is known, its route is the scene's
     assert page.film["captions"][frames[-1][3]].startswith(f"not moving: {LOST}")
 
 
@@ -94,15 +102,18 @@ def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
     assert (shade["x0"], shade["x1"]) == pytest.approx(INTERVALS_S[6], abs=0.051)
     assert shade["fillcolor"] == "--joint-6"
     commanded = dict(zip(torque["data"][1]["x"], torque["data"][1]["y"], strict=True))
-    assert commanded[0.0] is None and commanded[3.0] is not None  # unknown is a gap
+    assert commanded[0.0] is None
+    assert commanded[3.0] is not None  # unknown is a gap
     (torques,) = page.charts["Torque of every joint over time"]["data"]
-    assert len(torques["z"]) == 13 and len(torques["z"][0]) == 480
+    assert len(torques["z"]) == 13
+    assert len(torques["z"][0]) == 480
 
 
 def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page: Reader) -> None:
     found = find_events(record, summarise(record, "complete"))
     assert [one.joint for one in found if one.joint is not None] == list(INTERVALS_S)
-    assert found[0].words == "Start" and found[-1].words == "Stop"
+    assert found[0].words == "Start"
+    assert found[-1].words == "Stop"
     assert sum(one.words.startswith("Largest contact force") for one in found) == 1
     drawn = drawn_snapshots(record, found)
     bodies = [nodes_xy_w(record, instant.row) for _, instant in drawn]
@@ -117,8 +128,10 @@ def test_forces_balance_and_add_up_to_the_commanded_one(record: RunRecord) -> No
     found = balanced_snapshots(record)
     assert len(found) > 50
     for one in found:
-        assert one.balance is not None and one.balance.gap_n < 1e-9
-        assert one.state is not None and one.state.propulsion_n is not None
+        assert one.balance is not None
+        assert one.balance.gap_n < 1e-9
+        assert one.state is not None
+        assert one.state.propulsion_n is not None
         ahead = one.state.propulsion_n * np.array(one.balance.contacts[0].tangent_w[:2])
         assert np.allclose(one.balance.resultant_n, ahead, atol=1e-9)
 
@@ -158,7 +171,8 @@ def test_report_drawing_texts_do_not_overlap_or_cut_obstacles(page: Reader) -> N
             assert wide <= 1 or high <= 2, f"{a!r} and {b!r} in {drawing.get('aria-label')}"
         width, height = map(float, drawing.attrib["viewBox"].split()[2:])
         for x, y, r in [[float(c.attrib[k]) for k in ("cx", "cy", "r")] for c in drawing.iter("circle")]:
-            assert r <= x <= width - r and r <= y <= height - r
+            assert r <= x <= width - r
+            assert r <= y <= height - r
 
 
 def box_of(item: ET.Element) -> tuple[float, float, float, float]:
@@ -180,7 +194,8 @@ def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
         msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n]) for one in record.control
     ]
     wrong = changed(record, control=more)
-    assert balanced_snapshots(wrong) == [] and "whose forces balance" in read(wrong).text
+    assert balanced_snapshots(wrong) == []
+    assert "whose forces balance" in read(wrong).text
 
 
 def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page: Reader) -> None:
@@ -188,11 +203,12 @@ def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page
         if field.name not in ELSEWHERE:
             assert field.name in page.words, field.name
     assert {"N·m", "m/s", "µs", "J", "Hz"} <= set(page.words)
-    assert "torque_rate" in page.words and "41" in page.words  # limited by the limiter
+    assert "torque_rate" in page.words
+    assert "41" in page.words  # limited by the limiter
     assert "stale" in page.words
 
 
-def test_the_page_says_how_to_repeat_the_run(page: Reader, record: RunRecord) -> None:
+def test_report_contains_the_command_of_the_run(page: Reader, record: RunRecord) -> None:
     assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page.html
     assert "&#34;amplitude_m&#34;: 0.045" in page.html
 
@@ -224,14 +240,20 @@ def test_thinning_keeps_extremes_and_gaps() -> None:
     values = np.sin(np.linspace(0.0, 100.0, 100_000))
     values[54_321], values[12_345], values[70_000:71_000] = 9.0, -9.0, np.nan
     kept = values[thinned(values)]
-    assert len(kept) <= 1510 and np.nanmax(kept) == 9.0 and np.nanmin(kept) == -9.0 and np.isnan(kept).any()
+    assert len(kept) <= 1510
+    assert np.nanmax(kept) == 9.0
+    assert np.nanmin(kept) == -9.0
+    assert np.isnan(kept).any()
     columns = strongest(np.stack([values, np.full_like(values, np.nan)], axis=1), 480)
-    assert columns.shape == (480, 2) and np.nanmax(columns) == 9.0 and np.nanmin(columns) == -9.0
+    assert columns.shape == (480, 2)
+    assert np.nanmax(columns) == 9.0
+    assert np.nanmin(columns) == -9.0
 
 
 def test_the_plotting_library_is_the_one_that_its_note_names() -> None:
     digest = hashlib.sha256(LIBRARY.read_bytes()).hexdigest()
-    assert f"`{LIBRARY.name}`" in (note := (LIBRARY.parent / "README.md").read_text()) and digest in note
+    assert f"`{LIBRARY.name}`" in (note := (LIBRARY.parent / "README.md").read_text())
+    assert digest in note
     assert (LIBRARY.parent / "LICENSE-plotly.txt").is_file()
 
 
@@ -241,7 +263,8 @@ def test_report_yielding_obstacle_is_dashed_and_described(page: Reader, record: 
     scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])
     loose = dataclasses.replace(record, config=msgspec.structs.replace(record.config, scene=scene))
     html = report_page(loose, summarise(loose, "complete"))
-    assert 'class="peg yields"' in html and 'class="peg yields"' not in page.html
+    assert 'class="peg yields"' in html
+    assert 'class="peg yields"' not in page.html
     said = (
         "leans by 0.2 rad, springs back with 800 N/m, slides from 9.81 N on, and is drawn where it stood at the start"
     )

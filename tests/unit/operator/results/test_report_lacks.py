@@ -21,23 +21,38 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarise
 from snakesim_operator.run.conclusion import note_reasons
 from snakesim_operator.run.ending import Ending
-from snakesim_testing.operator.recorded_triplet import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
+from snakesim_testing.operator.recorded_triplet import (
+    ARMED_S,
+    LOST,
+    RATE_HZ,
+    SECONDS,
+    Reader,
+    changed,
+    first_seconds,
+    read,
+)
 
-MOVING = ("position_w", "orientation_wxyz", "angle_rad")
+
+@pytest.fixture(scope="module")
+def short_record(record: RunRecord) -> RunRecord:
+    return first_seconds(record, 2.0)
+
+
+MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
 
 
 # --- runs with something missing -------------------------------------------------------------------------------
 
 
-def test_without_a_recording(record: RunRecord) -> None:
-    page = read(changed(record, control=[], worlds=[]))
+def test_report_without_recording_has_all_sections(short_record: RunRecord) -> None:
+    page = read(changed(short_record, control=[], worlds=[]))
     assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
     assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
 
 
 @pytest.mark.slow  # the limit of its size holds above, too
-def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
+def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
     """Ten runs a minute, for ten minutes."""
     times = 60
     reported = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
@@ -52,79 +67,88 @@ def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
         for reported in (record.control, record.worlds)
     ]
     page = read(changed(record, control=later[0], worlds=later[1], **long))  # holds the size against the limit
-    assert len(page.film["frames"]) <= 300 and "handed over 419 times among 7 joints" in page.text
+    assert len(page.film["frames"]) <= 300
+    assert "handed over 419 times among 7 joints" in page.text
 
 
-def test_without_a_pose(record: RunRecord) -> None:
-    count = len(record.time_s)
-    blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
+def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
+    count = len(short_record.time_s)
+    blind = changed(
+        short_record, position_w_m=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan)
+    )
     page = read(blind)
-    assert "No playback: no valid pose was recorded." in page.text and "pose sensor" not in page.text
+    assert "No playback: no valid pose was recorded." in page.text
+    assert "pose sensor" not in page.text
     assert "pose sensor" not in verdict(blind, summarise(blind, "complete")).words  # the robot has one
     assert not [title for title in page.titles if title.startswith("Top view")]
     assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
 
 
-def test_without_a_route(record: RunRecord) -> None:
-    scene = msgspec.structs.replace(record.config.scene, route=None, pegs_along_route=[])
+def test_report_without_route_has_all_sections(short_record: RunRecord) -> None:
+    scene = msgspec.structs.replace(short_record.config.scene, route=None, pegs_along_route=[])
     start = Start(on_route=False, position_m=(-5.0, 0.0))
-    page = read(changed(record, config=msgspec.structs.replace(record.config, scene=scene, start=start)))
+    page = read(changed(short_record, config=msgspec.structs.replace(short_record.config, scene=scene, start=start)))
     assert "distance of the tail end" in page.text
     assert "net displacement" in page.text
 
 
-def test_without_ticks(record: RunRecord) -> None:
-    fields = [field.name for field in dataclasses.fields(record)]
-    empty = {name: getattr(record, name)[:0] for name in fields if isinstance(getattr(record, name), np.ndarray)}
-    host = msgspec.structs.replace(record.host, ticks=0, armed_ticks=0, answered_ticks=0)
-    page = read(changed(record, control=[], worlds=[], host=host, **empty), "the host never became ready")
+def test_report_without_ticks_names_the_end(short_record: RunRecord) -> None:
+    fields = [field.name for field in dataclasses.fields(short_record)]
+    empty = {
+        name: getattr(short_record, name)[:0] for name in fields if isinstance(getattr(short_record, name), np.ndarray)
+    }
+    host = msgspec.structs.replace(short_record.host, ticks=0, armed_ticks=0, answered_ticks=0)
+    page = read(changed(short_record, control=[], worlds=[], host=host, **empty), "the host never became ready")
     assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
 
 
-def test_without_a_contact_sensor(record: RunRecord) -> None:
+def test_report_without_contact_sensor_has_all_sections(short_record: RunRecord) -> None:
     """Whatever the robot file lists: its drives have none."""
-    sensors = [sensor for sensor in record.description.sensors if sensor.key != keys.CONTACTS]
-    page = read(changed(record, description=msgspec.structs.replace(record.description, sensors=sensors)))
+    sensors = [sensor for sensor in short_record.description.sensors if sensor.key != keys.CONTACTS]
+    page = read(changed(short_record, description=msgspec.structs.replace(short_record.description, sensors=sensors)))
     assert "No contact forces: the robot has no contact sensor." in page.text
 
 
-def test_a_controller_without_push_points(record: RunRecord) -> None:
+def test_report_of_controller_without_push_points_has_all_sections(short_record: RunRecord) -> None:
     nothing = {"push_points": [], "desired_force_n": [], "propulsion_joint": None, "propulsion_n": None}
-    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in record.control]
-    config_ = msgspec.structs.replace(record.config, controller="hold")
-    page = read(changed(record, control=plain, config=config_))
+    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in short_record.control]
+    config_ = msgspec.structs.replace(short_record.config, controller="hold")
+    page = read(changed(short_record, control=plain, config=config_))
     assert "controller hold solved for no push-points" in page.text
     assert "controller hold named no propulsion joint" in page.text
     assert re.search("measured contacts?, in sum", page.text)
 
 
 @pytest.mark.slow
-def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
+def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
     lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
-    assert "went on without joint_3, 2 commands refused" in page.text and "Stopped by a fault" not in page.text
+    assert "went on without joint_3, 2 commands refused" in page.text
+    assert "Stopped by a fault" not in page.text
     stop = Fault(tick=600, what="leak", cause="joint_4 reports water inside", joint="joint_4")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause)
-    assert "Stopped by a fault" in page.text and "at joint_4: joint_4 reports water inside." in page.text
+    assert "Stopped by a fault" in page.text
+    assert "at joint_4: joint_4 reports water inside." in page.text
 
 
 @pytest.mark.parametrize("joint", [None, "joint_3"])
-def test_report_of_harmless_fault_says_run_continued(record: RunRecord, joint: str | None) -> None:
+def test_report_of_harmless_fault_says_run_continued(short_record: RunRecord, joint: str | None) -> None:
     """The host noted it before the first arming; the run was complete."""
-    noting = Authority(record.description)
+    noting = Authority(short_record.description)
     noting.record_fault(
         Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint)
     )
-    host = msgspec.structs.replace(record.host, faults=noting.faults, ended="complete")
-    page = read(changed(record, host=host))
-    assert "Stopped by a fault" not in page.text and "went on without" not in page.text
+    host = msgspec.structs.replace(short_record.host, faults=noting.faults, ended="complete")
+    page = read(changed(short_record, host=host))
+    assert "Stopped by a fault" not in page.text
+    assert "went on without" not in page.text
     assert "a fault (supply and heat are unknown, and ignored), 2 commands refused" in page.text
     ending = Ending()
-    note_reasons(ending, host, record.config)
+    note_reasons(ending, host, short_record.config)
     assert ending.reason is None, "or `snakesim run` ends with exit code 1"
 
 
-def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
+def test_report_of_run_ended_by_fault_explains_it(record: RunRecord) -> None:
     fault = Fault(tick=537, what="diverged", cause="joint_3 at 1e9 rad/s", joint="joint_3")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause)
     assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
@@ -134,14 +158,14 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_that_jammed(record: RunRecord) -> None:
+def test_report_of_jammed_run_says_so(record: RunRecord) -> None:
     page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
     assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
     assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
 
 
 @pytest.mark.slow
-def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
+def test_report_of_run_jammed_later_says_jammed(record: RunRecord) -> None:
     stuck = [
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
         if state.timestamp_ns > (ARMED_S + 6.09) * 1e9
@@ -173,7 +197,8 @@ def test_report_of_mostly_standing_run_is_not_good(record: RunRecord) -> None:
     assert lost.kind == "poor"
     assert lost.words.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST}. Moved 0.")
     late = judged(stopped_at(record, 5.5, state="NotLocomoting", reason=LOST))
-    assert late.kind == "good" and f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.words
+    assert late.kind == "good"
+    assert f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.words
 
 
 def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
@@ -181,7 +206,8 @@ def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
     stuck = stopped_at(record, 6.0, state="NotLocomoting", reason="jammed: wedged", jammed=True)
     trying = [*stuck.control[:-1], msgspec.structs.replace(stuck.control[-1], state="Locomoting", reason="pushing")]
     found = judged(changed(stuck, control=trying))
-    assert found.kind == "poor" and found.words.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
+    assert found.kind == "poor"
+    assert found.words.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
     claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
     assert claims.kind == "poor"
     assert claims.words.startswith("Stopped at 4.0 s of 10.0 s: standing still: less than 20 mm in 1 s. Moved 0.")
@@ -190,10 +216,11 @@ def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
 
 def test_report_of_rest_at_path_end_is_no_failure(record: RunRecord) -> None:
     rests = judged(stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished"))
-    assert rests.kind == "good" and "Locomotion ended at 4.0 s" in rests.words
+    assert rests.kind == "good"
+    assert "Locomotion ended at 4.0 s" in rests.words
 
 
-def test_whether_it_moved_is_measured_whatever_control_reported(record: RunRecord) -> None:
+def test_report_motion_is_measured_despite_control_reports(record: RunRecord) -> None:
     """State and share of time are the same for a controller that reports nothing, falls silent, or claims to stand."""
     whole = summarise(record, "complete")
     assert whole.locomoting_fraction == pytest.approx(0.63, abs=0.01)
@@ -204,19 +231,22 @@ def test_whether_it_moved_is_measured_whatever_control_reported(record: RunRecor
         assert reported.locomoting_fraction == whole.locomoting_fraction
         assert reported.last_state == "NotLocomoting"
     moving = summarise(changed(record, control=[]), "complete")
-    assert (moving.last_reason, moving.reported_state) == ("standing still: less than 20 mm in 1 s", None)
+    assert moving.last_reason == "standing still: less than 20 mm in 1 s"
+    assert moving.reported_state is None
 
 
-def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
+def test_report_of_standing_run_contradicts_its_controller(record: RunRecord) -> None:
     stands = stopped_at(record, 0.0, state="Locomoting", reason="moving")
     found = judged(stands)
     assert "Did not locomote: standing still: less than 20 mm in 1 s." in found.words
     reported = summarise(stands, "complete")
-    assert (reported.last_state, reported.reported_state) == ("NotLocomoting", "Locomoting")
-    assert reported.locomoting_fraction == 0 and reported.stalled_s == pytest.approx(9.0, abs=0.2)
+    assert reported.last_state == "NotLocomoting"
+    assert reported.reported_state == "Locomoting"
+    assert reported.locomoting_fraction == 0
+    assert reported.stalled_s == pytest.approx(9.0, abs=0.2)
 
 
-def test_a_controller_that_says_it_stands_and_moves(record: RunRecord) -> None:
+def test_report_of_moving_run_contradicts_its_controller(record: RunRecord) -> None:
     """The verdict is that of the motion; what control reported is beside it, as a report."""
     since_ns = (ARMED_S + 2.2) * 1e9
     lost = [
@@ -226,57 +256,67 @@ def test_a_controller_that_says_it_stands_and_moves(record: RunRecord) -> None:
         for one in record.control
     ]
     found = judged(changed(record, control=lost))
-    assert found.kind == "good" and found.words.startswith("Moved 0.62 m along the path in 10.0 s;")
+    assert found.kind == "good"
+    assert found.words.startswith("Moved 0.62 m along the path in 10.0 s;")
     assert "Locomotion ended at 6.3 s of 10.0 s: contacts lost." in found.words
     said = re.search(r'For (\d\.\d) s of its motion control reported "contacts lost"\.', found.words)
-    assert said is not None and float(said[1]) == pytest.approx(6.3 - 2.2, abs=0.15)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(6.3 - 2.2, abs=0.15)
 
 
-def test_a_run_that_moves_to_its_end_says_so(record: RunRecord) -> None:
+def test_report_of_run_moving_to_its_end_says_so(record: RunRecord) -> None:
     rows = slice(0, 500)
     fields = [field.name for field in dataclasses.fields(record)]
     short = {name: getattr(record, name)[rows] for name in fields if isinstance(getattr(record, name), np.ndarray)}
     cut = changed(record, **short, control=[one for one in record.control if one.timestamp_ns < (ARMED_S + 5.0) * 1e9])
     found = judged(cut)
-    assert found.kind == "good" and "along the path in 10.0 s, and was still moving at the end;" in found.words
+    assert found.kind == "good"
+    assert "along the path in 10.0 s, and was still moving at the end;" in found.words
     assert summarise(cut, "complete").locomoting_fraction == 1.0
 
 
-def test_text_from_outside_is_escaped(record: RunRecord) -> None:
+def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
     nasty = '<script>alert("x")</script>&'
-    config_ = msgspec.structs.replace(record.config, title=nasty)
-    reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
-    host = msgspec.structs.replace(record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
-    hurt = changed(record, config=config_, control=reported, host=host)
+    config_ = msgspec.structs.replace(short_record.config, title=nasty)
+    reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in short_record.control]
+    host = msgspec.structs.replace(short_record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
+    hurt = changed(short_record, config=config_, control=reported, host=host)
     page = report_page(hurt, summarise(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
     assert nasty in Reader(page).text
 
 
-def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecord) -> None:
+def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> None:
     nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
-    encoded = msgspec.json.encode(record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
+    encoded = msgspec.json.encode(short_record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
     reported = [
         msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
         if one.propulsion_joint
         else one
-        for one in record.control
+        for one in short_record.control
     ]
-    pegs_ = [msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(record.config.scene.cylinder)]
-    scene = msgspec.structs.replace(record.config.scene, cylinder=pegs_)
-    config_ = msgspec.structs.replace(record.config, scene=scene)
-    hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_)
+    pegs_ = [
+        msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(short_record.config.scene.cylinder)
+    ]
+    scene = msgspec.structs.replace(short_record.config.scene, cylinder=pegs_)
+    config_ = msgspec.structs.replace(short_record.config, scene=scene)
+    hurt = changed(
+        short_record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_
+    )
     page = report_page(hurt, summarise(hurt, "complete"))
-    assert find_propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
-    assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page
+    assert find_propulsion_intervals(hurt)
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert" in page
+    assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page)
+    assert "\\u202e\\u009b31m" in page
 
 
-def test_a_snake_that_lies_upwards_is_turned(record: RunRecord) -> None:
-    count = len(record.time_s)
+def test_report_map_of_upward_snake_is_rotated(short_record: RunRecord) -> None:
+    count = len(short_record.time_s)
     up = changed(
-        record,
-        position_w=record.position_w[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
+        short_record,
+        position_w_m=short_record.position_w_m[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
         orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
         worlds=[],
         control=[],

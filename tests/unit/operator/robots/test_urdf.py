@@ -66,7 +66,7 @@ def simulated(robot: Path) -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize("name", list_shipped("robots"))
-def test_every_shipped_robot_comes_back_as_it_was(name: str, tmp_path: Path) -> None:
+def test_urdf_round_trip_keeps_every_shipped_robot(name: str, tmp_path: Path) -> None:
     file, back = tmp_path / "robot.urdf", tmp_path / "robot.toml"
     export_robot(name, file)
     import_robot(file, ImportOptions(), back)
@@ -87,7 +87,8 @@ def test_urdf_round_trip_keeps_limits_and_friction_of_each_joint(tmp_path: Path)
     theirs = by_mujoco(export_urdf(robot))
     assert theirs.joint("joint_2").range == pytest.approx([-0.4, 1.5708])
     assert theirs.joint("joint_5").range == pytest.approx([-0.8, 0.8])
-    assert theirs.joint("joint_5").frictionloss[0] == 0.1 and theirs.joint("joint_4").frictionloss[0] == 0.0
+    assert theirs.joint("joint_5").frictionloss[0] == 0.1
+    assert theirs.joint("joint_4").frictionloss[0] == 0.0
     text = (tmp_path / "own.urdf").read_text()
     assert text.count('lower="-0.4"') == 1
     edited.write_text(text.replace('lower="-0.4"', 'lower="-0.7"'))
@@ -98,7 +99,8 @@ def test_urdf_round_trip_keeps_limits_and_friction_of_each_joint(tmp_path: Path)
 
 def test_urdf_import_has_exceptions_only_for_differing_joints() -> None:
     slider, hexa = import_urdf(SLIDER, ImportOptions()).robot, import_urdf(HEXA, HEXA_ORDER).robot
-    assert slider.limits.torque_nm == 4.1 and len(slider.joints) == 1
+    assert slider.limits.torque_nm == 4.1
+    assert len(slider.joints) == 1
     assert [joint.limits.torque_nm for joint in slider.joint_table].count(3.8) == 1
     sides = [(joint.limits.lower_rad, joint.limits.upper_rad) for joint in hexa.joint_table]
     assert sides == [(-1.5, 1.5), (-1.4, 1.6), *[(-1.5, 1.5)] * 4], "its angle is negated"
@@ -153,7 +155,7 @@ def test_urdf_import_alternating_millimeter_snake_has_inertia_of_mujoco(tmp_path
         (HEXA, HEXA_ORDER, "mamba_hills", "lateral_undulation"),
     ],
 )
-def test_snakes_from_elsewhere_run(
+def test_urdf_import_of_foreign_snakes_can_run(
     file: Path, order: ImportOptions, scenario: str, controller: str, tmp_path: Path
 ) -> None:
     robot = tmp_path / "robot.toml"
@@ -167,7 +169,7 @@ def test_snakes_from_elsewhere_run(
     assert robot_at(again) == robot_at(robot)
 
 
-def test_what_cannot_be_carried_over_is_named_with_its_lines() -> None:
+def test_urdf_import_names_values_it_cannot_express() -> None:
     slider, hexa = import_urdf(SLIDER, ImportOptions()), import_urdf(HEXA, HEXA_ORDER)
     left_out, changed = "\n".join(slider.left_out + hexa.left_out), "\n".join(slider.changed + hexa.changed)
     for words in (
@@ -186,9 +188,8 @@ def test_what_cannot_be_carried_over_is_named_with_its_lines() -> None:
         "angle_max_rad differs from that of the others: joint_2 (b_c) 1.6 rad",  # -1.6 to 1.4, and negated
     ):
         assert words in changed
-    assert (
-        hexa.robot.sensors.depth[0].position_m == pytest.approx((0.07, 0.0, 0.0)) and hexa.robot.sensors.imu is not None
-    )
+    assert hexa.robot.sensors.depth[0].position_m == pytest.approx((0.07, 0.0, 0.0))
+    assert hexa.robot.sensors.imu is not None
 
 
 TURNS = '<axis xyz="0 0 1"/><limit lower="-1" upper="1"/>'
@@ -223,13 +224,13 @@ def test_urdf_import_of_other_robot_is_refused_with_place(case: str, tmp_path: P
         import_urdf(file, ImportOptions())
 
 
-def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_urdf_import_report_is_available_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
-    assert reported["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08 (line 122), yaw" in reported["names"]
-    assert any("hinge01" in line for line in reported["changed"]) and any(
-        "<gazebo>" in line for line in reported["left_out"]
-    )
+    assert reported["file"] == str(tmp_path / "a.toml")
+    assert "joint_1: hinge08 (line 122), yaw" in reported["names"]
+    assert any("hinge01" in line for line in reported["changed"])
+    assert any("<gazebo>" in line for line in reported["left_out"])
 
 
 def test_an_existing_robot_file_is_not_overwritten(tmp_path: Path) -> None:
@@ -258,4 +259,5 @@ def test_a_document_that_shows_a_robot_shows_one_that_runs(tmp_path: Path) -> No
     robot = tmp_path / "eel.toml"
     robot.write_text(document.partition("```toml eel.toml\n")[2].partition("```")[0])
     result = simulate(config("peg_row", robot, "duration_s=3"))
-    assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0.0) > 0.05
+    assert result.summary.ended == "complete"
+    assert (result.summary.path_distance_m or 0.0) > 0.05

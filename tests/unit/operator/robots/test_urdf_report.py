@@ -404,7 +404,9 @@ def test_urdf_report_edit_of_our_export_counts_or_is_listed(tmp_path: Path) -> N
     text = export_urdf(decode(read_part("planar13_camera", "robots"), RobotFile))
     file.write_text(text)
     back = import_urdf(file, ImportOptions())
-    assert not back.changed and not back.assumed and not back.doubtful
+    assert not back.changed
+    assert not back.assumed
+    assert not back.doubtful
     assert all("a name of its own" in line for line in back.left_out), "the way there and back loses nothing"
     camera = text.replace("<width>160</width>", "<width>320</width>", 1)
     file.write_text(camera)

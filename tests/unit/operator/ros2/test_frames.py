@@ -28,7 +28,7 @@ def walked(tree: list[Transform], to: str) -> Pair:
 
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
-def test_the_tree_is_our_kinematics(name: str) -> None:
+def test_ros_frame_tree_equals_kinematics(name: str) -> None:
     robot = of_robot(name)
     frames = Frames(robot, "lab/")
     random = np.random.default_rng(3)
@@ -45,17 +45,20 @@ def test_the_tree_is_our_kinematics(name: str) -> None:
     )
     for i in range(len(robot.links)):
         position, rotation = walked(tree, f"lab/{robot.links[i].name}")
-        assert np.allclose(position, origins[i]) and np.allclose(rotation, rotations[i])
+        assert np.allclose(position, origins[i])
+        assert np.allclose(rotation, rotations[i])
 
 
 def test_optical_frames_look_along_z() -> None:
     optical = rotation_from_quaternion(OPTICAL_IN_CAMERA)
     right, down, forward = optical.T
-    assert np.allclose(forward, [1, 0, 0]) and np.allclose(right, [0, -1, 0]) and np.allclose(down, [0, 0, -1])
+    assert np.allclose(forward, [1, 0, 0])
+    assert np.allclose(right, [0, -1, 0])
+    assert np.allclose(down, [0, 0, -1])
     assert yaw_from_rotation(np.eye(3)) == 0.0
 
 
-def test_names_that_ros_allows() -> None:
+def test_ros_frame_names_are_valid() -> None:
     assert [make_ros_name(text) for text in ("head", "2d-front", "ö")] == ["head", "_2d_front", "_"]
 
 

@@ -24,7 +24,8 @@ def test_keys_and_tokens_of_the_design_document() -> None:
 def test_namespaces_and_quality_of_service() -> None:
     topic = Topic("/lab/planar13/tf", messages.TRANSFORMS, depth=1, best_effort=True, latched=True)
     token = make_token(0, "abc", 3, graph.SUBSCRIPTION, NodeName("snakesim", "/lab/planar13"), topic)
-    assert "/MS/%/%lab%planar13/snakesim/%lab%planar13%tf/" in token and token.endswith("/2:1:,1:,:,:,,")
+    assert "/MS/%/%lab%planar13/snakesim/%lab%planar13%tf/" in token
+    assert token.endswith("/2:1:,1:,:,:,,")
     assert make_topic_key(0, topic).startswith("0/lab/planar13/tf/")
     zenoh.KeyExpr(token)
 
@@ -33,4 +34,5 @@ def test_attachment_is_that_of_zenohs_serializer() -> None:
     gid = graph.compute_gid(TALKER)
     theirs = ext.z_serialize((ext.Int64(7), ext.Int64(1_700_000_000_123_456_789), gid))
     assert graph.make_attachment(7, 1_700_000_000_123_456_789, gid) == bytes(theirs)
-    assert len(gid) == 16 and len(bytes(theirs)) == 33
+    assert len(gid) == 16
+    assert len(bytes(theirs)) == 33

@@ -42,7 +42,7 @@ def test_type_hashes_are_those_of_later_distributions(store: Stores) -> None:
 
 @FEW
 @given(messages_of(m.JointState))
-def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
+def test_ros_joint_states_omit_invalid_joints(joints: m.JointState) -> None:
     count = min(map(len, (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid)))
     joints = m.JointState(
         tick=0,
@@ -56,13 +56,14 @@ def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
     names = [f"jöint_{'x' * i}{i}" for i in range(count)]
     seen = read(ros.JOINT_STATE, robot_in_ros.encode_joint_state(STAMP_NS, names, joints))
     kept = np.array(joints.valid, dtype=bool)
-    assert at(seen.header.stamp) == STAMP_NS and seen.header.frame_id == ""
+    assert at(seen.header.stamp) == STAMP_NS
+    assert seen.header.frame_id == ""
     assert seen.name == [name for name, valid in zip(names, joints.valid, strict=True) if valid]
     for ours, theirs in (("angle_rad", "position"), ("velocity_rad_s", "velocity"), ("torque_nm", "effort")):
         assert np.array_equal(getattr(seen, theirs), np.array(getattr(joints, ours), dtype=float)[kept])
 
 
-def test_transforms() -> None:
+def test_ros_transforms_match_kinematics() -> None:
     sent = [
         Transform("odom", "base_link", (1, 2, 3), (0.5, 0.1, 0.2, 0.3)),
         Transform("a", "bc", (4, 5, 6), (1, 0, 0, 0)),
@@ -70,7 +71,8 @@ def test_transforms() -> None:
     seen = read(ros.TRANSFORMS, ros.encode_transforms(STAMP_NS, sent)).transforms
     for one, other in zip(sent, seen, strict=True):
         place, turn = other.transform.translation, other.transform.rotation
-        assert (other.header.frame_id, other.child_frame_id) == (one.parent, one.child)
+        assert other.header.frame_id == one.parent
+        assert other.child_frame_id == one.child
         assert at(other.header.stamp) == STAMP_NS
         assert (place.x, place.y, place.z) == one.position_m
         assert (turn.w, turn.x, turn.y, turn.z) == one.orientation_wxyz
@@ -83,8 +85,12 @@ def test_contacts_are_arrows_along_their_forces(contacts: list[m.WorldContact]) 
     first, *arrows = read(ros.MARKERS, payload).markers
     assert first.action == ros.DELETE_ALL
     for number, (contact, arrow) in enumerate(zip(contacts, arrows, strict=True)):
-        assert (arrow.id, arrow.type, arrow.action) == (number, ros.ARROW, ros.ADD)
-        assert (arrow.ns, arrow.header.frame_id, at(arrow.header.stamp)) == ("contacts", "odom", STAMP_NS)
+        assert arrow.id == number
+        assert arrow.type == ros.ARROW
+        assert arrow.action == ros.ADD
+        assert arrow.ns == "contacts"
+        assert arrow.header.frame_id == "odom"
+        assert at(arrow.header.stamp) == STAMP_NS
         tail, tip = (np.array([point.x, point.y, point.z]) for point in arrow.points)
         assert np.array_equal(tail, contact.position_w)
         assert np.allclose(tip - tail, 0.01 * np.array(contact.force_w), rtol=1e-6, atol=1e-6)
@@ -112,8 +118,10 @@ def test_obstacles_have_their_shapes() -> None:
     sizes = [(shape.scale.x, shape.scale.y, shape.scale.z) for shape in shapes]
     assert sizes == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
     assert [(shape.pose.position.x, shape.pose.position.y) for shape in shapes] == [(1, 2), (3, 4), (5, 6)]
-    assert shapes[1].pose.orientation.z == pytest.approx(np.sqrt(0.5)) and shapes[1].pose.orientation.x == 0
-    assert shapes[0].color.a == pytest.approx(0.6) and shapes[2].color.r > shapes[1].color.r
+    assert shapes[1].pose.orientation.z == pytest.approx(np.sqrt(0.5))
+    assert shapes[1].pose.orientation.x == 0
+    assert shapes[0].color.a == pytest.approx(0.6)
+    assert shapes[2].color.r > shapes[1].color.r
 
 
 def image(kind: type[Any], **more: Any) -> Any:
@@ -126,24 +134,36 @@ def image(kind: type[Any], **more: Any) -> Any:
 
 def test_depth_in_millimetres_or_metres() -> None:
     seen = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "head_depth_optical_frame", image(m.DepthImage)))
-    assert (seen.width, seen.height, seen.step, seen.encoding, seen.is_bigendian) == (4, 3, 8, "16UC1", 0)
-    assert seen.header.frame_id == "head_depth_optical_frame" and at(seen.header.stamp) == STAMP_NS
+    assert seen.width == 4
+    assert seen.height == 3
+    assert seen.step == 8
+    assert seen.encoding == "16UC1"
+    assert seen.is_bigendian == 0
+    assert seen.header.frame_id == "head_depth_optical_frame"
+    assert at(seen.header.stamp) == STAMP_NS
     assert np.array_equal(seen.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
     coarse = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "f", image(m.DepthImage, scale_m=0.01)))
-    assert (coarse.encoding, coarse.step) == ("32FC1", 16)
+    assert coarse.encoding == "32FC1"
+    assert coarse.step == 16
     metres = np.frombuffer(coarse.data.tobytes(), "<f4")
-    assert np.isnan(metres[0]) and np.allclose(metres[1:], 0.01 * np.arange(1, 12))
+    assert np.isnan(metres[0])
+    assert np.allclose(metres[1:], 0.01 * np.arange(1, 12))
 
 
-def test_colour_and_intrinsics() -> None:
+def test_ros_color_image_has_intrinsics() -> None:
     sent = image(m.ColorImage)
     seen = read(ros.IMAGE, robot_in_ros.encode_color_image(STAMP_NS, "f", sent))
-    assert (seen.encoding, seen.step, seen.data.tobytes()) == ("rgb8", 12, sent.rgb)
+    assert seen.encoding == "rgb8"
+    assert seen.step == 12
+    assert seen.data.tobytes() == sent.rgb
     info = read(ros.CAMERA_INFO, robot_in_ros.encode_camera_info(STAMP_NS, "f", sent))
-    assert (info.width, info.height, info.distortion_model) == (4, 3, "plumb_bob")
+    assert info.width == 4
+    assert info.height == 3
+    assert info.distortion_model == "plumb_bob"
     assert info.k.tolist() == [80, 0, 1.5, 0, 81, 1, 0, 0, 1]
     assert info.p.tolist() == [80, 0, 1.5, 0, 0, 81, 1, 0, 0, 0, 1, 0]
-    assert info.r.tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1] and info.d.tolist() == [0] * 5
+    assert info.r.tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert info.d.tolist() == [0] * 5
 
 
 def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
@@ -154,7 +174,8 @@ def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
     for scale_m in (0.001, 0.01):
         sent = robot_in_ros.encode_compressed_depth(STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m))
         seen = read(ros.COMPRESSED_IMAGE, sent)
-        assert (seen.format, seen.header.frame_id) == ("16UC1; compressedDepth png", "f")
+        assert seen.format == "16UC1; compressedDepth png"
+        assert seen.header.frame_id == "f"
         millimetres = np.asarray(Image.open(BytesIO(seen.data.tobytes()[12:])))
         assert np.array_equal(millimetres, np.arange(12).reshape(3, 4) * round(scale_m / 0.001))
 
@@ -168,21 +189,31 @@ def test_an_imu_has_no_orientation() -> None:
         acceleration_m_s2=[(0, 0, 0), (4, 5, 6)],
     )
     seen = read(ros.IMU, robot_in_ros.encode_imu(STAMP_NS, "link_5_imu_frame", sent, 1))
-    assert (at(seen.header.stamp), seen.header.frame_id) == (STAMP_NS, "link_5_imu_frame")
+    assert at(seen.header.stamp) == STAMP_NS
+    assert seen.header.frame_id == "link_5_imu_frame"
     turn, push = seen.angular_velocity, seen.linear_acceleration
-    assert (turn.x, turn.y, turn.z, push.x, push.y, push.z) == (1, 2, 3, 4, 5, 6)
-    assert seen.orientation_covariance[0] == -1 and seen.linear_acceleration_covariance.tolist() == [0] * 9
+    assert turn.x == 1
+    assert turn.y == 2
+    assert turn.z == 3
+    assert push.x == 4
+    assert push.y == 5
+    assert push.z == 6
+    assert seen.orientation_covariance[0] == -1
+    assert seen.linear_acceleration_covariance.tolist() == [0] * 9
 
 
 @FEW
 @given(messages_of(m.Ranges))
-def test_scans(sent: m.Ranges) -> None:
+def test_ros_scan_contains_the_ranges(sent: m.Ranges) -> None:
     seen = read(ros.LASER_SCAN, robot_in_ros.encode_laser_scan(STAMP_NS, "f", sent))
     expected = [np.inf if range_m is None else np.float32(range_m) for range_m in sent.range_m]
-    assert seen.ranges.tolist() == expected and seen.intensities.size == 0
-    assert seen.angle_min == np.float32(sent.angle_min_rad) and seen.angle_increment == np.float32(sent.angle_step_rad)
+    assert seen.ranges.tolist() == expected
+    assert seen.intensities.size == 0
+    assert seen.angle_min == np.float32(sent.angle_min_rad)
+    assert seen.angle_increment == np.float32(sent.angle_step_rad)
     assert seen.angle_max == np.float32(sent.angle_min_rad + sent.angle_step_rad * (len(expected) - 1))
-    assert (seen.range_min, seen.range_max) == (np.float32(sent.range_min_m), np.float32(sent.range_max_m))
+    assert seen.range_min == np.float32(sent.range_min_m)
+    assert seen.range_max == np.float32(sent.range_max_m)
 
 
 def test_custom_sensor_numbers_have_field_and_unit() -> None:
@@ -191,15 +222,17 @@ def test_custom_sensor_numbers_have_field_and_unit() -> None:
     seen = read(ros.NUMBERS, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
     assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)
     (dimension,) = seen.layout.dim
-    assert (dimension.label, dimension.size) == ("pressed_n [N]", 2)
+    assert dimension.label == "pressed_n [N]"
+    assert dimension.size == 2
 
 
 @FEW
 @given(messages_of(m.Status))
-def test_diagnostics(status: m.Status) -> None:
+def test_ros_diagnostics_contain_the_status(status: m.Status) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
-    assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.reason}")
+    assert seen.name == status.robot
+    assert seen.message == f"{status.lifecycle}: {status.reason}"
     assert {"lifecycle", "backend", "lease holder"} <= {value.key for value in seen.values}
 
 
@@ -225,48 +258,61 @@ class TestSteering:
         sent = kind["Twist"](kind["Vector3"](x, 0.0, 0.0), kind["Vector3"](0.0, 0.0, turn))
         return bytes(JAZZY.serialize_cdr(sent, ros.TWIST.name))
 
-    def test_speed_and_direction(self) -> None:
+    def test_ros_twist_gives_speed_and_direction(self) -> None:
         steering = CmdVelSteering()
         first = steering.make_intent(self.twist(0.2, 1.0), 10**9, 0.5)
         assert first is not None
         assert (first.speed_m_s, first.heading_w_rad, first.go, first.valid_for_ns) == (0.2, 0.5, True, 500_000_000)
         later = steering.make_intent(self.twist(0.2, 1.0), 1_100_000_000, 0.5)
-        assert later is not None and later.heading_w_rad == pytest.approx(0.6)
+        assert later is not None
+        assert later.heading_w_rad == pytest.approx(0.6)
         held = steering.make_intent(self.twist(0.2), 1_200_000_000, 0.55)
-        assert held is not None and held.heading_w_rad == pytest.approx(0.6)
+        assert held is not None
+        assert held.heading_w_rad == pytest.approx(0.6)
 
     def test_a_zero_twist_stops(self) -> None:
         stop = CmdVelSteering().make_intent(self.twist(), 1, None)
-        assert stop is not None and not stop.go and stop.heading_w_rad is None
+        assert stop is not None
+        assert not stop.go
+        assert stop.heading_w_rad is None
 
     def test_twist_counts_from_forwarding_and_stop_always_counts(self) -> None:
         steering = CmdVelSteering()
         fresh = steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=400_000_000)
-        assert fresh is not None and (fresh.timestamp_ns, fresh.valid_for_ns) == (1_600_000_000, 500_000_000)
+        assert fresh is not None
+        assert fresh.timestamp_ns == 1_600_000_000
+        assert fresh.valid_for_ns == 500_000_000
         assert steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
-        assert (steering.rejected, steering.reason) == (1, "is older than 0.5 s by the times of its sender's messages")
+        assert steering.rejected == 1
+        assert steering.reason == "is older than 0.5 s by the times of its sender's messages"
         stop = steering.make_intent(self.twist(), 2 * 10**9, None, age_ns=60 * 10**9)
-        assert stop is not None and not stop.go and stop.timestamp_ns == 2 * 10**9
+        assert stop is not None
+        assert not stop.go
+        assert stop.timestamp_ns == 2 * 10**9
 
     def test_direction_does_not_run_away_from_the_body(self) -> None:
         steering = CmdVelSteering()
         for i in range(200):
             intent = steering.make_intent(self.twist(0.1, 2.0), i * 100_000_000, 3.0)
-            assert intent is not None and intent.heading_w_rad is not None
+            assert intent is not None
+            assert intent.heading_w_rad is not None
             assert abs(intent.heading_w_rad - 3.0) <= np.pi / 2 + 1e-9
 
     def test_after_a_silence_it_starts_from_the_body(self) -> None:
         steering = CmdVelSteering()
         steering.make_intent(self.twist(0.1), 0, 1.0)
         anew = steering.make_intent(self.twist(0.1, 1.0), 10**10, 2.0)
-        assert anew is not None and anew.heading_w_rad == 2.0
+        assert anew is not None
+        assert anew.heading_w_rad == 2.0
 
     @pytest.mark.parametrize("bad", [b"", b"\0\1\0\0", b"\0\7\0\0" + bytes(48)])
-    def test_noise_is_counted(self, bad: bytes) -> None:
+    def test_ros_invalid_payload_is_counted(self, bad: bytes) -> None:
         steering = CmdVelSteering()
-        assert steering.make_intent(bad, 0, 0.0) is None and steering.rejected == 1
+        assert steering.make_intent(bad, 0, 0.0) is None
+        assert steering.rejected == 1
 
     @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
-    def test_what_no_snake_does_is_rejected(self, x: float, turn: float) -> None:
+    def test_ros_twist_impossible_for_a_snake_is_rejected(self, x: float, turn: float) -> None:
         steering = CmdVelSteering()
-        assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None and steering.rejected == 1
+        assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None
+        assert steering.rejected == 1

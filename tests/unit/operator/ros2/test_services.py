@@ -41,10 +41,8 @@ def test_hashes_are_those_that_others_have() -> None:
 def test_an_answer_says_who_asked_what() -> None:
     gid = bytes(range(16))
     assert graph.make_reply_attachment(graph.make_attachment(9, 1, gid))[:8] == (9).to_bytes(8, "little")  # pyright: ignore[reportOptionalSubscript]
-    assert (
-        graph.make_reply_attachment(b"") is None
-        and graph.make_reply_attachment(graph.make_attachment(-1, 1, gid)) is None
-    )
+    assert graph.make_reply_attachment(b"") is None
+    assert graph.make_reply_attachment(graph.make_attachment(-1, 1, gid)) is None
 
 
 @pytest.mark.parametrize("value", [True, 3, 0.5, "a", [1.0, 2.5], ["a", "b"], None])
@@ -60,9 +58,11 @@ def test_values_of_parameters_keep_their_type(value: Any) -> None:
 def test_a_parameter_is_described_with_unit_and_range() -> None:
     lead = Parameter("speed_kp_s", 0.2, unit="s", description="how far ahead", minimum=0.0, maximum=1.0)
     seen = _make_descriptor("control.speed_kp_s", lead)
-    assert (seen.description, seen.additional_constraints) == ("how far ahead [s]", ">= 0, <= 1")
+    assert seen.description == "how far ahead [s]"
+    assert seen.additional_constraints == ">= 0, <= 1"
     (span,) = seen.floating_point_range
-    assert (span.from_value, span.to_value) == (0.0, 1.0)
+    assert span.from_value == 0.0
+    assert span.to_value == 1.0
 
 
 class TestJointTargets:
@@ -87,20 +87,23 @@ class TestJointTargets:
     def test_named_joints_follow_and_the_others_stay(self) -> None:
         targets = RosJointTargets(self.robot)
         targets.make_setpoints(self.clock(0), self.joints(0.1))
-        assert targets.accept(self.said(["joint_3"], position=[0.5]), 10) and targets.accept(
-            self.said(["joint_4"], effort=[-1.0]), 10
-        )
+        assert targets.accept(self.said(["joint_3"], position=[0.5]), 10)
+        assert targets.accept(self.said(["joint_4"], effort=[-1.0]), 10)
         points = targets.make_setpoints(self.clock(20), self.joints(0.2))
-        assert (points.target[2], points.mode[3], points.target[3]) == (0.5, Mode.TORQUE, -1.0)
-        assert set(points.target[4:]) == {0.1} and set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
+        assert points.target[2] == 0.5
+        assert points.mode[3] == Mode.TORQUE
+        assert points.target[3] == -1.0
+        assert set(points.target[4:]) == {0.1}
+        assert set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
 
-    def test_silence_stops_where_the_joint_is(self) -> None:
+    def test_ros_joint_commands_that_stop_hold_the_joint(self) -> None:
         targets = RosJointTargets(self.robot)
         targets.accept(self.said(["joint_3"], velocity=[1.0]), 0)
         targets.make_setpoints(self.clock(VALID_NS), self.joints(0.3))
         for angle_rad in (0.4, 0.45):
             points = targets.make_setpoints(self.clock(VALID_NS + 1), self.joints(angle_rad))
-        assert (points.mode[2], points.target[2]) == (Mode.POSITION, 0.4)
+        assert points.mode[2] == Mode.POSITION
+        assert points.target[2] == 0.4
 
     @pytest.mark.parametrize(
         ("stamp_s", "ros_now_s", "age_s", "why"),
@@ -123,7 +126,8 @@ class TestJointTargets:
         message, now_ns = self.said(["joint_3"], stamp_s=stamp_s, position=[0.5]), 10 * 10**9
         ros_now_ns = None if ros_now_s is None else round(ros_now_s * 1e9)
         taken = targets.accept(message, now_ns, ros_now_ns, round(age_s * 1e9))
-        assert taken == (not why) and why in targets.reason
+        assert taken == (not why)
+        assert why in targets.reason
         assert targets.make_setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
 
     def test_a_command_ends_half_a_second_after_it_was_sent(self) -> None:
@@ -150,6 +154,8 @@ class TestJointTargets:
     )
     def test_a_message_is_taken_whole_or_not_at_all(self, names: list[str], numbers: dict[str, Any], why: str) -> None:
         targets = RosJointTargets(self.robot)
-        assert not targets.accept(self.said(names, **numbers), 0) and targets.rejected == 1
-        assert why in targets.reason and not targets.accept(b"\0\1\0\0\1", 0)
+        assert not targets.accept(self.said(names, **numbers), 0)
+        assert targets.rejected == 1
+        assert why in targets.reason
+        assert not targets.accept(b"\0\1\0\0\1", 0)
         assert set(targets.make_setpoints(self.clock(1), self.joints(0.1)).target) == {0.1}

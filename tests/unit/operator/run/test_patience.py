@@ -32,7 +32,7 @@ def test_patience_in_paused_time_counts_only_while_host_answers() -> None:
     assert any(patience.ends(status(), now_s=1e6 + 0.5 * half) for half in range(10))
 
 
-def test_it_starts_again_with_whatever_comes() -> None:
+def test_patience_restarts_with_every_progress() -> None:
     patience = StartupTimeout(ALL, 60.0)
     steps = [
         status(0),

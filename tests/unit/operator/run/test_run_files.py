@@ -56,11 +56,13 @@ def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     files.rename("a.log", "a-1.log")
     files.rename("never.log", "never-1.log")  # what nobody appended to has nothing to give
     files.append("a.log", b"new\n")
-    files.put("whole.json", b"{}")
+    files.write_file("whole.json", b"{}")
     files.settle()
     assert (tmp_path / "a-1.log").read_bytes() == b"".join(b"%d\n" % i for i in range(1000))
-    assert (tmp_path / "a.log").read_bytes() == b"new\n" and (tmp_path / "whole.json").read_bytes() == b"{}"
-    assert files.close() == "" and warned == []
+    assert (tmp_path / "a.log").read_bytes() == b"new\n"
+    assert (tmp_path / "whole.json").read_bytes() == b"{}"
+    assert files.close() == ""
+    assert warned == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a-1.log", "a.log", "b.log", "whole.json"]
 
 
@@ -69,7 +71,7 @@ def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: D
     files = RunFiles(tmp_path, warned.append)
     disk.space = 10
     files.append("a.log", b"0123456789abcdef")
-    files.put("whole.json", b"{}")
+    files.write_file("whole.json", b"{}")
     wait_until(lambda: warned, "a warning")
     assert (tmp_path / "a.log").read_bytes() == b"0123456789"
     began = time.monotonic()
@@ -78,7 +80,8 @@ def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: D
     disk.space = 2**30
     wait_until(lambda: (tmp_path / "whole.json").exists(), "the second file")
     assert (tmp_path / "a.log").read_bytes() == b"0123456789abcdef"
-    assert files.close() == "" and warned == [f"{tmp_path}: No space left on device"]
+    assert files.close() == ""
+    assert warned == [f"{tmp_path}: No space left on device"]
 
 
 def test_run_files_on_full_disk_are_absent_and_reported(tmp_path: Path, disk: Disk) -> None:
@@ -87,9 +90,10 @@ def test_run_files_on_full_disk_are_absent_and_reported(tmp_path: Path, disk: Di
     disk.space = 0
     for i in range(100):
         files.append("a.log", b"%d\n" % i)
-    files.put("whole.json", b"{}")
+    files.write_file("whole.json", b"{}")
     wait_until(lambda: warned, "a warning")
-    assert files.close() == f"{tmp_path}: No space left on device" and len(warned) == 1
+    assert files.close() == f"{tmp_path}: No space left on device"
+    assert len(warned) == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -125,10 +129,10 @@ def test_what_comes_too_fast_for_a_slow_disk_is_told(
     assert [int(line) for line in kept] == list(range(100))
 
 
-def test_without_a_folder_nothing_is_kept() -> None:
+def test_run_files_without_folder_are_not_kept() -> None:
     files = RunFiles(None, pytest.fail)
     files.append("a.log", b"x")
-    files.put("whole.json", b"{}")
+    files.write_file("whole.json", b"{}")
     files.settle()
     assert files.close() == ""
 
@@ -141,4 +145,5 @@ def test_run_log_that_floods_is_cut_and_marked(tmp_path: Path, monkeypatch: pyte
         files.settle()
     files.append("b.log", b"x")
     assert files.close() == "a.log is longer than 2 MiB: the rest of it is lost"
-    assert (tmp_path / "a.log").stat().st_size == 2_090_000 and (tmp_path / "b.log").read_bytes() == b"x"
+    assert (tmp_path / "a.log").stat().st_size == 2_090_000
+    assert (tmp_path / "b.log").read_bytes() == b"x"

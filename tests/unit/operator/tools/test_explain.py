@@ -32,7 +32,7 @@ def test_every_field_of_every_file_has_a_description() -> None:
     assert fields_without_description() == []
 
 
-def test_the_page_is_what_the_code_says() -> None:
+def test_explain_page_is_current() -> None:
     assert PAGE.read_text(encoding="utf-8") == make_page(), "run `make schemas` and commit what it changes"
 
 
@@ -76,7 +76,7 @@ def test_a_value_has_its_documentation_and_where_it_comes_from(capsys: pytest.Ca
     }
 
 
-def test_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_explain_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
     described = explain_as_json(load("triplet"), "rate_hz", capsys)
     assert described["unit"] == "Hz"
     assert described["value"] == 100.0

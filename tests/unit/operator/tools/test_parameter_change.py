@@ -66,7 +66,9 @@ def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("reported", [state("standing still"), None], ids=["goes on", "time stands"])
 def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | None) -> None:
     before, now = parameters.change_parameters(Control(reported).operator, CHANGES, "ada")
-    assert (before.changes, now.changes, now.requester) == (0, 1, "ada")
+    assert before.changes == 0
+    assert now.changes == 1
+    assert now.requester == "ada"
 
 
 @pytest.mark.parametrize("gone", [False, True])

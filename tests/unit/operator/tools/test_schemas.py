@@ -85,7 +85,7 @@ def fits(value: Any, name: str) -> bool:
     return validator(name).is_valid(json.loads(msgspec.json.encode(value)))
 
 
-def of(message: type[Message]) -> str:
+def schema_name(message: type[Message]) -> str:
     return f"messages/{message.__name__}.json"
 
 
@@ -93,14 +93,14 @@ def of(message: type[Message]) -> str:
 @given(data=st.data())
 @settings(max_examples=8)
 def test_every_message_fits_its_schema(message: type[Message], data: st.DataObject) -> None:
-    assert fits(data.draw(messages_of(message)), of(message))
+    assert fits(data.draw(messages_of(message)), schema_name(message))
 
 
 @each_message
 def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> None:
-    assert json.loads(published_contract()[of(message)])["encoding"] == format_encoding(message)
+    assert json.loads(published_contract()[schema_name(message)])["encoding"] == format_encoding(message)
     example = plain_example(message)
-    assert fits(example, of(message))
+    assert fits(example, schema_name(message))
     for field in example:
         rest = {name: value for name, value in example.items() if name != field}
         try:
@@ -108,7 +108,7 @@ def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> 
             taken = True
         except WireError:
             taken = False
-        assert fits(rest, of(message)) == taken, field
+        assert fits(rest, schema_name(message)) == taken, field
 
 
 @each_message
@@ -118,7 +118,7 @@ def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message
         for poison in poisons(info):
             if isinstance(poison, bytes) or (isinstance(poison, float) and not math.isfinite(poison)):
                 continue  # JSON has no such value
-            assert not fits(replaced(example, at, poison), of(message)), f"{at} took {poison!r}"
+            assert not fits(replaced(example, at, poison), schema_name(message)), f"{at} took {poison!r}"
 
 
 # --- the files that are shipped --------------------------------------------------------------------------------

@@ -79,7 +79,9 @@ def test_questions_and_goals_of_several_are_those_of_the_sdk(ids: list[int], fas
 def test_packet_answers_are_read_by_sdk_and_by_us(id_: int, data: bytes, noise: bytes, cut: int) -> None:
     status = encoded(id_, Instruction.STATUS, bytes([ALERT]) + data)
     said, result = SDK.rxPacket(Line(status), False)
-    assert result == COMM_SUCCESS and bytes(said[9 : 9 + len(data)]) == data and said[8] == ALERT
+    assert result == COMM_SUCCESS
+    assert bytes(said[9 : 9 + len(data)]) == data
+    assert said[8] == ALERT
     decoder, stream = Decoder(), noise + status
     found = [packet for at in range(0, len(stream), cut) for packet in decoder.feed(stream[at : at + cut])]
     assert [(one.id, one.data, one.alert) for one in found] == [(id_, data, True)]

@@ -93,11 +93,12 @@ def bench() -> Iterator[Bench]:
     one.close()
 
 
-def test_ping_and_broadcast_ping(bench: Bench) -> None:
+def test_sdk_ping_and_broadcast_ping_are_answered(bench: Bench) -> None:
     assert SDK.ping(bench.port, 2) == (MODEL, COMM_SUCCESS, 0)
     assert SDK.ping(bench.port, 9)[1] == COMM_RX_TIMEOUT
     found, result = SDK.broadcastPing(bench.port)
-    assert result == COMM_SUCCESS and found == {servo: [MODEL, FIRMWARE] for servo in (1, 2, 3)}
+    assert result == COMM_SUCCESS
+    assert found == {servo: [MODEL, FIRMWARE] for servo in (1, 2, 3)}
 
 
 def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench) -> None:
@@ -118,16 +119,17 @@ def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench)
         assert moved == pytest.approx([100, 200, 300], abs=15)
 
 
-def test_whoever_is_silent_silences_all_behind_it(bench: Bench) -> None:
+def test_sdk_fast_read_ends_at_a_silent_servo(bench: Bench) -> None:
     bench.emulator.inject(parse_injection("mute:joint_2@0-9"), begins=True)
     read = GroupSyncRead(bench.port, SDK, at.PRESENT, 10)
     for servo in (1, 2, 3):
         read.addParam(servo)
     assert read.txRxPacket() != COMM_SUCCESS
-    assert read.data_dict[1] and not read.data_dict[3]
+    assert read.data_dict[1]
+    assert not read.data_dict[3]
 
 
-def test_refusals(bench: Bench) -> None:
+def test_sdk_and_servo_refuse_the_same_writes(bench: Bench) -> None:
     port = bench.port
     assert SDK.write2ByteTxRx(port, 1, at.MODEL, 7) == (COMM_SUCCESS, Refusal.ACCESS)
     assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (COMM_SUCCESS, Refusal.RANGE)
@@ -160,7 +162,9 @@ def test_sdk_alert_stays_in_answers_until_a_restart(bench: Bench) -> None:
     bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=True)
     bench.pass_time(0.1)
     errors, result, said = SDK.read1ByteTxRx(port, 1, at.HARDWARE_ERROR)
-    assert (errors, result, said & ALERT) == (at.HardwareError.OVERHEATING, COMM_SUCCESS, ALERT)
+    assert errors == at.HardwareError.OVERHEATING
+    assert result == COMM_SUCCESS
+    assert said & ALERT == ALERT
     assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
     assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
     bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=False)

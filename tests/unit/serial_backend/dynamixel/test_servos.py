@@ -53,10 +53,12 @@ def test_servos_stop_by_watchdog_when_driver_is_gone(robot: Robot) -> None:
     robot.emulator()
     assert {servo.table[at.WATCHDOG] for servo in robot.emulator.servos} == {at.TRIPPED}
     found = robot.run(NOTICED, "armed")
-    assert {fault.what for fault in found} == {"drive_fault"} and "watchdog" in found[0].cause
+    assert {fault.what for fault in found} == {"drive_fault"}
+    assert "watchdog" in found[0].cause
     robot.run(5, "fault")
     robot.mode, robot.target = Mode.POSITION, 0.1
-    assert robot.run(10, "disarmed") == [] and robot.run(60, "armed") == []
+    assert robot.run(10, "disarmed") == []
+    assert robot.run(60, "armed") == []
 
 
 def test_servo_in_torque_mode_stops_just_beyond_its_travel(
@@ -81,7 +83,8 @@ def test_servo_angle_after_start_in_any_turn_is_joint_angle(robot: Robot) -> Non
         elsewhere.run(40, "armed")
         said = elsewhere.joints
         elsewhere.backend.close()
-        assert said is not None and said.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+        assert said is not None
+        assert said.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
     assert here == pytest.approx([0.0] * JOINTS, abs=0.002)
 
 

@@ -72,13 +72,15 @@ def test_joystick_lost_events_or_device_release_the_stick(device: Device) -> Non
     device.sends(EV_ABS, ABS_Y, 0)
     device.unplug()
     device.stick.read_events(1.0)
-    assert device.stick.lost and device.stick.forward == 0.0
+    assert device.stick.lost
+    assert device.stick.forward == 0.0
 
 
 def test_joystick_is_released_when_newest_event_is_old(device: Device) -> None:
     assert device.stick.is_silent(0.0), "nothing has come yet"
     device.sends(EV_ABS, ABS_Y, 0, at_s=10.5)
-    assert device.stick.forward == pytest.approx(1.0) and not device.stick.is_silent(10.5 + STICK_AGE_S)
+    assert device.stick.forward == pytest.approx(1.0)
+    assert not device.stick.is_silent(10.5 + STICK_AGE_S)
     assert device.stick.is_silent(10.6 + STICK_AGE_S), "a receiver without its pad, or a program that was stopped"
     device.sends(EV_ABS, ABS_Y, 1, at_s=20.0)
     assert not device.stick.is_silent(20.1)

@@ -37,7 +37,9 @@ def test_keys_arrive_whole_or_in_bunches() -> None:
     assert _split_keys(b"\x1b[Z\x1b\xff") == ["\x1b", "\xff"], "unknown keys do nothing"
 
 
-def test_without_a_terminal_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steering_without_terminal_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with open("/dev/null") as nothing:  # noqa: PTH123
         monkeypatch.setattr("sys.stdin", nothing)
         assert main(["teleop"]) == 2

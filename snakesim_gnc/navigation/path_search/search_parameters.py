@@ -1,6 +1,23 @@
 """The robot and the costs of the path search. `beam` has the equation of the cost. Pure."""
 
+import math
 from dataclasses import dataclass
+
+STEP_M = 0.05  # length of an arc
+MAX_CONTACTS = 8  # of one body that a node stores, the newest
+MAX_HEADING_ERROR_RAD = 1.75  # a path heads no farther away from the goal
+
+# Of the nodes in one narrow cell only the cheapest is kept: they are the same for the robot.
+CELL_M = 0.02
+CELL_RAD = math.pi / 18
+# A wide cell keeps a limited number of nodes, so that other ways round an obstacle stay in the search.
+WIDE_CELL_M = 0.1
+WIDE_CELL_RAD = 0.6
+CANDIDATES_PER_KEPT_NODE = 3  # nodes whose contacts are computed, for each one that is kept
+
+MIN_PUSH = -0.1  # n.g of a contact that counts for the margin: `path_fit` moves the body off those that brake more
+MAX_FRONTAL = 0.35  # |n.t| of a contact with the side of the body; beyond, the head bumps
+FAILED_PATH_M = 0.025  # a path farther than this from a failed one is another path
 
 
 @dataclass(frozen=True)
@@ -34,3 +51,8 @@ class SearchParameters:
     near_m: float = 0.3
     failed_path_cost: float = 1.0
     sideways_cost: float = 0.5
+
+
+def count_body_arcs(parameters: SearchParameters) -> int:
+    """Return the length of the body as a number of arcs."""
+    return round(parameters.body_length_m / STEP_M)

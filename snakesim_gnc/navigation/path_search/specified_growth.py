@@ -1,82 +1,37 @@
 """How a beam search makes its paths longer by one layer of arcs: the specification. Pure.
 
-`native_growth` computes the same numbers in C, about ten times as fast. This module is what a reader should trust: it
+`native_growth` computes the same numbers in C, about seven times as fast. This module is what a reader should trust: it
 explains the search, the tests compare the two bit for bit, and it plans where the C library is not installed. A change
 here needs the same change in `snakesim_native/planner/`.
 
 In shapes, n is the number of nodes and c the number of curvatures. Points and headings are in the world frame.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import wrenches
-from snakesim_gnc.navigation.margin import compute_margins_n
-from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
-from snakesim_gnc.navigation.search_arcs import STEP_M, ArcTable, SearchArcs
-from snakesim_gnc.navigation.search_nodes import NodeLayer, count_earlier_in_cell, number_cells
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
+from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_touched
+from snakesim_gnc.navigation.path_search.search_arcs import ArcTable, SearchArcs
+from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, count_earlier_in_cell, number_cells
+from snakesim_gnc.navigation.path_search.search_parameters import (
+    CANDIDATES_PER_KEPT_NODE,
+    CELL_M,
+    CELL_RAD,
+    FAILED_PATH_M,
+    MAX_HEADING_ERROR_RAD,
+    STEP_M,
+    WIDE_CELL_M,
+    WIDE_CELL_RAD,
+    SearchParameters,
+    count_body_arcs,
+)
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 from snakesim_hal.base.arrays import Floats
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
-
-MAX_HEADING_ERROR_RAD = 1.75  # a path heads no farther away from the goal
-
-# Of the nodes in one narrow cell only the cheapest is kept: they are the same for the robot.
-CELL_M = 0.02
-CELL_RAD = np.pi / 18
-# A wide cell keeps a limited number of nodes, so that other ways round an obstacle stay in the search.
-WIDE_CELL_M = 0.1
-WIDE_CELL_RAD = 0.6
-CANDIDATES_PER_KEPT_NODE = 3  # nodes whose contacts are computed, for each one that is kept
-
-MIN_PUSH = -0.1  # n.g of a contact that counts for the margin: `path_fit` moves the body off those that brake more
-MAX_FRONTAL = 0.35  # |n.t| of a contact with the side of the body; beyond, the head bumps
-FAILED_PATH_M = 0.025  # a path farther than this from a failed one is another path
-
-
-@dataclass(frozen=True)
-class SearchedPath:
-    """A path that the search found."""
-
-    points_w: Floats  # (n + 1, 2) one for every STEP_M
-    margins_n: Floats  # (n + 1,) propulsion margin of the body with its head there
-    cost_m: float
-
-
-@dataclass(frozen=True)
-class SearchTask:
-    """The goal of one search, and the body from which it starts."""
-
-    origin_w: Floats  # (2,) the head of the measured body; moments are about it
-    goal_rad: float
-    goal_w: Floats  # (2,) unit vector
-    lying_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
-    # For a search of the whole body.
-    lying_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
-    max_sideways_m: float = np.inf  # how far the path may be from where the body lies
-    failed_w: Floats | None = None  # (k, 2) points of paths on which the body got stuck here
-
-
-class PathGrowth(Protocol):
-    """The paths of one search, which grow by one arc at a time."""
-
-    @property
-    def node_count(self) -> int:
-        """Return the number of nodes in the newest layer."""
-        ...
-
-    def grow(self) -> bool:
-        """Expand the newest layer into the next one. Return False, and change nothing, if no arc is free."""
-        ...
-
-    def trace_cheapest(self) -> SearchedPath | None:
-        """Return the path to the cheapest node of the newest layer; None if nothing has grown."""
-        ...
 
 
 class SpecifiedGrowth:
@@ -262,62 +217,3 @@ class SpecifiedGrowth:
         cells = number_cells(nodes.x_m[order], nodes.y_m[order], nodes.heading_rad[order], WIDE_CELL_M, WIDE_CELL_RAD)
         is_kept = count_earlier_in_cell(cells) < self._parameters.kept_per_wide_cell
         return nodes.select_rows(order[is_kept][: self._parameters.kept_nodes])
-
-
-def count_body_arcs(parameters: SearchParameters) -> int:
-    """Return the length of the body as a number of arcs."""
-    return round(parameters.body_length_m / STEP_M)
-
-
-@dataclass(frozen=True)
-class TouchedObstacles:
-    """What bodies touch at one arc length each. All arrays have one row for each of n points on their axes."""
-
-    push: Floats  # (n,) towards the goal, n.g; 0 without a contact
-    counts: Bools  # (n,) whether there is a contact that counts for the margin; the other arrays are valid only there
-    obstacle: Ints  # (n,) index
-    gap_m: Floats  # (n,) between skin and obstacle
-    wrench: Floats  # (n, 3) of a unit push
-
-
-def find_touched(
-    obstacles: ObstacleGrid, points_w: Floats, tangents: Floats, parameters: SearchParameters, task: SearchTask
-) -> TouchedObstacles:
-    """Find what bodies touch at points on their axes.
-
-    Args:
-        obstacles: the map.
-        points_w: (n, 2) the points.
-        tangents: (n, 2) unit vectors along the axes.
-        parameters: the robot.
-        task: the search.
-    """
-    nearest = obstacles.find_nearest(points_w[:, 0], points_w[:, 1])
-    normals = nearest.normal_w
-    gap_m = nearest.distance_m - parameters.radius_m
-    frontal = np.abs(_dot(normals, tangents))
-    is_contact = (nearest.obstacle != NO_OBSTACLE) & (gap_m < parameters.contact_distance_m) & (frontal < MAX_FRONTAL)
-    push = _dot(normals, task.goal_w)
-    skin_from_origin = points_w - normals * parameters.radius_m - task.origin_w
-    unit_push = normals - parameters.assumed_obstacle_friction * tangents
-    return TouchedObstacles(
-        push=np.where(is_contact, push, 0.0),
-        counts=is_contact & (push > MIN_PUSH),
-        obstacle=nearest.obstacle,
-        gap_m=gap_m,
-        wrench=wrenches(skin_from_origin, unit_push),
-    )
-
-
-def compute_node_margins_n(nodes: NodeLayer, parameters: SearchParameters) -> Floats:
-    """Return the propulsion margin of each node's body, (n,), with the contacts that are not near its ends."""
-    first_s_m = nodes.s_m - parameters.body_length_m + parameters.unused_tail_m
-    last_s_m = nodes.s_m - parameters.unused_head_m
-    counts = (nodes.contact_s_m >= first_s_m) & (nodes.contact_s_m <= last_s_m)
-    contacts = np.where(counts[..., None], nodes.contact_wrench, 0.0)
-    return compute_margins_n(contacts, nodes.drag_m / parameters.body_length_m)
-
-
-def _dot(a: Floats, b: Floats) -> Floats:
-    """Return a . b of vectors (n, 2), or (2,) that counts for all. BLAS would round differently on other processors."""
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]

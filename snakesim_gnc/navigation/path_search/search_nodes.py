@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE
+from snakesim_gnc.navigation.path_search.search_parameters import MAX_CONTACTS
 from snakesim_hal.base.arrays import Floats
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
-
-MAX_CONTACTS = 8  # of one body that a node stores, the newest
 
 
 @dataclass

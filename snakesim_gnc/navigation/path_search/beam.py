@@ -2,7 +2,7 @@
 
 The search grows paths in layers of short arcs. It expands all nodes of a layer at once, with every allowed curvature,
 and keeps the best few. Each node has the propulsion margin of the whole body with its head there (`search_nodes`).
-`path_growth` specifies how a layer is expanded; `native_growth` does the same in C where its library is installed.
+`specified_growth` specifies how a layer is expanded; `native_growth` does the same in C where its library is installed.
 
 The cost is in meters of path. For each meter of path it is
 
@@ -29,20 +29,14 @@ from collections.abc import Generator
 import numpy as np
 
 from snakesim_gnc.geometry.planar import sample_back_from_end, wrenches
-from snakesim_gnc.navigation.native_growth import NativeGrowth, is_native_available
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_growth import (
-    PathGrowth,
-    SearchedPath,
-    SearchTask,
-    SpecifiedGrowth,
-    compute_node_margins_n,
-    count_body_arcs,
-    find_touched,
-)
-from snakesim_gnc.navigation.search_arcs import STEP_M
-from snakesim_gnc.navigation.search_nodes import NodeLayer, make_start_nodes
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_touched
+from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
+from snakesim_gnc.navigation.path_search.native_library import is_native_available
+from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_body_arcs
+from snakesim_gnc.navigation.path_search.search_task import PathGrowth, SearchedPath, SearchTask
+from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
 from snakesim_hal.base.arrays import Floats
 
 # Where the search of a whole body begins: around the tail, and around its heading.

@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.obstacle_grid import CELL_ERROR_M, ObstacleGrid
-from snakesim_gnc.navigation.search_nodes import NodeLayer
-from snakesim_gnc.navigation.search_parameters import SearchParameters
+from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters
 from snakesim_hal.base.arrays import Floats
 
 Bools = NDArray[np.bool_]
-
-STEP_M = 0.05  # length of an arc
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,51 @@
+"""What a path search is asked for, what it returns, and what grows its paths. Pure.
+
+Points are in the world frame.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+
+
+@dataclass(frozen=True)
+class SearchedPath:
+    """A path that the search found."""
+
+    points_w: Floats  # (n + 1, 2) one for every STEP_M
+    margins_n: Floats  # (n + 1,) propulsion margin of the body with its head there
+    cost_m: float
+
+
+@dataclass(frozen=True)
+class SearchTask:
+    """The goal of one search, and the body from which it starts."""
+
+    origin_w: Floats  # (2,) the head of the measured body; moments are about it
+    goal_rad: float
+    goal_w: Floats  # (2,) unit vector
+    lying_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
+    # For a search of the whole body.
+    lying_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
+    max_sideways_m: float = np.inf  # how far the path may be from where the body lies
+    failed_w: Floats | None = None  # (k, 2) points of paths on which the body got stuck here
+
+
+class PathGrowth(Protocol):
+    """The paths of one search, which grow by one arc at a time."""
+
+    @property
+    def node_count(self) -> int:
+        """Return the number of nodes in the newest layer."""
+        ...
+
+    def grow(self) -> bool:
+        """Expand the newest layer into the next one. Return False, and change nothing, if no arc is free."""
+        ...
+
+    def trace_cheapest(self) -> SearchedPath | None:
+        """Return the path to the cheapest node of the newest layer; None if nothing has grown."""
+        ...
