@@ -2,14 +2,14 @@
 
 import argparse
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.base.terminal import align_columns, print_json, print_line
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
-from snakesim_serial_backend.wire import SerialWire
+from snakesim_serial_backend.wire import SerialWire, is_emulated
 
 OK = 0  # exit codes
 FAILED = 1
@@ -25,7 +25,7 @@ def scan_ports(arguments: argparse.Namespace) -> int:
     rows: list[dict[str, str]] = []
     failures: list[str] = []
     for name in arguments.channel:
-        for baud in arguments.baud or list(at.RATE):
+        for baud in _choose_bauds(name, arguments.baud or list(at.RATE)):
             try:
                 wire = SerialWire(name, baud)
             except BackendError as error:  # an adapter that does not support this rate, or a port in use
@@ -46,6 +46,13 @@ def scan_ports(arguments: argparse.Namespace) -> int:
         print_line(failure)
     print_line("no servo answers")
     return FAILED
+
+
+def _choose_bauds(port: str, bauds: Sequence[int]) -> Sequence[int]:
+    """Return the baud rates to try on a port. A pseudo terminal has none: all its servos answer at any."""
+    if is_emulated(port):
+        return bauds[:1]
+    return bauds
 
 
 def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
@@ -82,7 +89,10 @@ def _describe_registers(data: bytes) -> dict[str, str]:
     (current_limit,) = struct.unpack_from("<H", data, at.CURRENT_LIMIT)
     (voltage,) = struct.unpack_from("<H", data, at.VOLTAGE)
     errors = data[at.HARDWARE_ERROR]
+    baud_of_value = {value: baud for baud, value in at.RATE.items()}
+    baud = baud_of_value.get(data[at.BAUD_RATE])
     return {
+        "baud": str(baud) if baud is not None else "-",
         "mode": str(data[at.OPERATING_MODE]),
         "offset": str(homing_offset),
         "angle": f"{position * at.RAD:.3f} rad",

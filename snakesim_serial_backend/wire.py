@@ -182,6 +182,11 @@ class SerialWire:
         """Return how long this number of bytes takes on the bus."""
         return size * BITS_A_BYTE / self.baud
 
+    @property
+    def answers_at_once(self) -> bool:
+        """Whether no answer is late, because the drives are emulated in this process."""
+        return self._run_drives is not None
+
     def run_emulated_drives(self) -> None:
         """Let drives that are emulated in this process run up to now."""
         if self._run_drives is not None:

@@ -1,14 +1,19 @@
-"""The table of faults on request in docs/how-to/inject-faults.md, from the registry.
+"""The tables of faults on request in docs/how-to/inject-faults.md, from the registry and from the driver types.
 
 `python -m docs.site.kinds_table` writes it.
 """
 
 from pathlib import Path
 
+from snakesim_drivers.emulation.emulated_body import FAULTS
+from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.model.fault_kinds import DOERS, KINDS, Amount
+from snakesim_hal.programs.preflight import find_backend
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "inject-faults.md"
 BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"
+BEGIN_DRIVES = "<!-- drive types, from here: made by `make schemas` -->\n"
+DRIVE_TYPES = ("odrive", "moteus", "dynamixel")
 TARGETS = {
     "process": "`host`, `guidance`, `navigation`, `control`, and `router` with `--with-router`, which cannot hang",
     "key": "`sensor/joints`, `actuator/joints`, ...",
@@ -21,8 +26,14 @@ TARGETS = {
 
 def with_table() -> str:
     """The page as it should be."""
-    head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    return head + BEGIN + table() + END + rest.partition(END)[2]
+    page = _replace(PAGE.read_text(encoding="utf-8"), BEGIN, table())
+    return _replace(page, BEGIN_DRIVES, drive_table())
+
+
+def _replace(page: str, begin: str, new_table: str) -> str:
+    """Return a page with another table behind the mark that begins it."""
+    head, _, rest = page.partition(begin)
+    return head + begin + new_table + END + rest.partition(END)[2]
 
 
 def table() -> str:
@@ -35,6 +46,19 @@ def table() -> str:
             doers = ", else ".join(DOERS[doer] for doer in kind.by)
             rows.append(f"| {target} | `{name}` | {kind.description} | {amount} | {doers} |")
             target = ""
+    return "\n".join(rows) + "\n"
+
+
+def drive_table() -> str:
+    """Return the table of faults that emulated drives and their buses have, with a row for each drive type."""
+    rows = ["| `--backend` | in an emulated drive | on its bus | in samples |", "|---|---|---|---|"]
+    in_samples = [name for name, kind in KINDS["joint"].items() if "samples" in kind.by and name not in FAULTS]
+    for name in DRIVE_TYPES:
+        backend = find_backend(name)
+        assert issubclass(backend, DriverTypeBackend)
+        on_bus = {*backend.list_bus_faults(backend.Settings()), "slow"}
+        cells = [" ".join(f"`{kind}`" for kind in kinds) for kinds in (FAULTS, sorted(on_bus), in_samples)]
+        rows.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(rows) + "\n"
 
 

@@ -5,15 +5,24 @@ from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_hal.base.process import on_stop_signal, tune_garbage_collector
+from snakesim_hal.base.process import (
+    SERVICE_PRIORITY,
+    drop_priority_after,
+    on_stop_signal,
+    set_realtime_priority,
+    tune_garbage_collector,
+)
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.fault_kinds import Injection
 
 POLL_S = 0.001  # longest wait for frames or bytes, of drives in a process of their own
+MAX_BUSY_S = 0.2  # computing without a pause, after which emulated drives give up their real-time priority
 
 
 def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callable[[float], object]) -> None:
     """Run emulated drives until this process gets a stop signal.
+
+    They get real-time priority if the system allows it: real drives answer however busy the computer is.
 
     Args:
         ready: The line to print once they run.
@@ -23,6 +32,8 @@ def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callab
     running = [True]
     on_stop_signal(running.clear)
     tune_garbage_collector()
+    if set_realtime_priority(SERVICE_PRIORITY) is None:
+        drop_priority_after(MAX_BUSY_S)
     print_line(ready)
     while running:
         emulator()

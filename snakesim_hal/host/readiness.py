@@ -21,6 +21,10 @@ class Readiness:
         """Return the services that are not connected, or in lockstep have not answered tick 0 yet."""
         return self._participants.missing(must_have_answered=self._must_have_answered)
 
+    def unpublished_processes(self) -> list[str]:
+        """Return the processes of awaited services whose description has not arrived yet."""
+        return self._processes.unpublished(self._participants)
+
     def differing_processes(self) -> list[str]:
         """Return how the processes of awaited services differ from this host, or lack a description."""
         return self._processes.find_problems(self._own_entry, self._participants)

@@ -143,6 +143,10 @@ class RequestHandler:
         if missing:
             reason = f"waiting for {', '.join(missing)}"
             return self._state.answer(ok=False, reason=reason, refusal="not_ready")
+        unpublished = self._readiness.unpublished_processes()
+        if unpublished:
+            reason = f"waiting for the settings of {', '.join(unpublished)}"
+            return self._state.answer(ok=False, reason=reason, refusal="not_ready")
         differing = self._readiness.differing_processes()
         if differing:
             return self._state.answer(ok=False, reason="; ".join(differing), refusal="settings_differ")

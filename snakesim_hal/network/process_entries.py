@@ -22,6 +22,8 @@ from snakesim_hal.wire.messages import VERSIONS, Process
 
 HOST = "host"
 MAX_ENTRIES = 256
+MAX_NAMED = 3  # differences in the text of a refusal
+NOT_SET = "not set"
 
 
 def own_entry(name: str, config: RunConfig | None = None) -> Process:
@@ -56,18 +58,62 @@ def show_process(session: Session, entry: Process) -> Publisher[Process]:
 def find_differences(one: Process, other: Process) -> list[str]:
     """Return the differences between two processes of one robot as texts, with values in the order of the arguments."""
     found = [
-        f"`{field}` is {one.settings[field]} on {describe_place(one)}, {other.settings[field]} on "
-        f"{describe_place(other)}"
-        for field in one.settings
-        if field in other.settings and one.settings[field] != other.settings[field]
+        f"`{key}` is {value} on {describe_place(one)}, {other_value} on {describe_place(other)}"
+        for key, value, other_value in _differing_settings(one, other)
     ]
     found += [
         f"message {name} has version {one.messages[name]} on {describe_place(one)}, {other.messages[name]} on "
         f"{describe_place(other)}"
-        for name in one.messages
-        if name in other.messages and one.messages[name] != other.messages[name]
+        for name in _differing_messages(one, other)
     ]
     return found
+
+
+def _differing_settings(one: Process, other: Process) -> list[tuple[str, str, str]]:
+    """Return the keys whose values differ, each with both values. A process may use only some sections."""
+    sections = {_section(key) for key in one.settings} & {_section(key) for key in other.settings}
+    differing: list[tuple[str, str, str]] = []
+    for key in dict.fromkeys((*one.settings, *other.settings)):
+        value = one.settings.get(key, NOT_SET)
+        other_value = other.settings.get(key, NOT_SET)
+        if _section(key) in sections and value != other_value:
+            differing.append((key, value, other_value))
+    return differing
+
+
+def _section(key: str) -> str:
+    return key.partition(".")[0]
+
+
+def _differing_messages(one: Process, other: Process) -> list[str]:
+    """Return the messages that both processes know in different versions."""
+    return [name for name in one.messages if name in other.messages and one.messages[name] != other.messages[name]]
+
+
+def _describe_conflict(entry: Process, own: Process) -> str:
+    """Return the keys in which a process differs from this one and what to do; empty if there are none."""
+    settings = _differing_settings(entry, own)
+    named = [f"`{key}` = {value} (here {own_value})" for key, value, own_value in settings]
+    named += [
+        f"message {name} version {entry.messages[name]} (here {own.messages[name]})"
+        for name in _differing_messages(entry, own)
+    ]
+    if not named:
+        return ""
+    listed = ", ".join(named[:MAX_NAMED])
+    if len(named) > MAX_NAMED:
+        listed += f" and {len(named) - MAX_NAMED} more, which `snakesim status` lists"
+    return f"{describe_place(entry)} differs from this host in {listed}; {_describe_remedy(entry, own)}"
+
+
+def _describe_remedy(entry: Process, own: Process) -> str:
+    """Return what to do about different settings, or different versions, of two processes."""
+    if _differing_messages(entry, own):
+        return "install one version of SnakeSIM on both machines"
+    keys_in_conflict = [key for key, _, _ in _differing_settings(entry, own)]
+    if keys_in_conflict == ["clock_mode"]:
+        return f"start {entry.name} again with --clock-mode {own.settings['clock_mode']}"
+    return f"start host and {entry.name} with equal files, --set and --clock-mode"
 
 
 def describe_place(entry: Process) -> str:
@@ -89,17 +135,27 @@ class ProcessEntries:
 
     def find_problems(self, own: Process, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
-        problems: list[str] = []
+        problems = [f"{process} has not published its settings yet" for process in self.unpublished(names)]
+        for entry in self._published(names).values():
+            conflict = _describe_conflict(entry, own) if entry is not None else ""
+            if conflict:
+                problems.append(conflict)
+        return problems
+
+    def unpublished(self, names: Collection[str]) -> list[str]:
+        """Return the present processes of these names that have not published their entry yet."""
+        return [keys.parse_service(key) for key, entry in self._published(names).items() if entry is None]
+
+    def _published(self, names: Collection[str]) -> dict[str, Process | None]:
+        """Return the entry of each present process of these names by its key; None: it is not published yet."""
+        published: dict[str, Process | None] = {}
         for key in sorted(self._alive.copy()):
             name = keys.parse_service(key).rpartition("-")[0]
-            if name not in names:
-                continue
-            entry = self._entries.get(key)
-            if entry is None or entry.name != name:
-                problems.append(f"{keys.parse_service(key)} has not published its settings yet")
-            else:
-                problems += find_differences(entry, own)
-        return problems
+            if name in names:
+                entry = self._entries.get(key)
+                is_own = entry is not None and entry.name == name
+                published[key] = entry if is_own else None
+        return published
 
     def waits(self) -> dict[str, list[str]]:
         """Return the keys that each present process waits for, by its name."""

@@ -9,7 +9,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from snakesim_hal.backend import Backend
@@ -55,21 +55,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_tool("snakesim start host", lambda: host(process_options(arguments, hosts=True)))
 
 
-def host(options: ProcessOptions) -> int:
+def host(options: ProcessOptions, on_network: Callable[[], None] = lambda: None) -> int:
     """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError.
 
     A simulator that is reset becomes another host, in the same process.
+
+    Args:
+        options: of the process.
+        on_network: is called once the host can be reached.
     """
     if options.arguments.parent_socket is None:
         check_without_run(options.config, options.loaded.table)
-    host = _run(options, check_backend(options.config, options.loaded.table))
+    host = _run(options, check_backend(options.config, options.loaded.table), on_network)
     if host.ended == "reset":
         restart_process()
     stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.stored)
     return 1 if stopped or host.ended != "complete" else 0
 
 
-def _run(options: ProcessOptions, config: RunConfig) -> Host:
+def _run(options: ProcessOptions, config: RunConfig, on_network: Callable[[], None]) -> Host:
     """Open stop port, backend and network, run the host to its end, and close everything."""
     arguments = options.arguments
     with contextlib.ExitStack() as opened:
@@ -80,6 +84,7 @@ def _run(options: ProcessOptions, config: RunConfig) -> Host:
         network = open_session(options.link) if options.link.listen else open_session_when_ready(options.link, "host")
         session = opened.enter_context(network)
         refuse_second_host(session, options.link)
+        on_network()
         host = _create_host(arguments, config, backend, session, realtime_warnings)
         serve_stops(stop_port, options.link.namespace or host.description.robot, host.request_estop)
         on_stop_signal(host.stop)

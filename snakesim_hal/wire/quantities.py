@@ -19,6 +19,7 @@ MAX_PARAMETERS_JSON = 8192  # characters
 MAX_SCHEMA = 65536  # characters
 MAX_CUSTOM_SENSORS = 16  # sensors with a custom message
 MAX_CUSTOM_SCHEMA = 8192  # characters of the schema of each
+MAX_SHARED_SETTINGS = 256  # of a process
 MAX_PREVIEW_BYTES = 128 * 1024
 MAX_TARGET = 1e5  # of a setpoint or a torque limit, in the unit of its mode
 

@@ -21,12 +21,23 @@ from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
 ANSWER_S = 5.0
 DESCRIPTION_S = 3.0
+RETRY_S = 0.5  # between two attempts to arm
 SHOWN_S = 1.5  # until the host's status must show what it answered
 DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
 
 
+class NotReadyError(RefusedError):
+    """The robot cannot be armed now, for a reason that can pass without an operator: a service is still starting."""
+
+
 def arm(
-    robot: str, backend: str, where: RobotSelection, print_text: PrintLine = print_line, *, unchecked: bool = False
+    robot: str,
+    backend: str,
+    where: RobotSelection,
+    print_text: PrintLine = print_line,
+    *,
+    unchecked: bool = False,
+    wait_s: float = 0.0,
 ) -> int:
     """Arm a robot, if its name and its backend are those that the operator names.
 
@@ -36,10 +47,30 @@ def arm(
         where: selects the robot's network.
         print_text: prints a line for the operator.
         unchecked: whether to arm also without a check of the joints.
+        wait_s: time in which to try again while no robot answers, or while it is not ready. Other refusals end the
+            wait, because only an operator can remove their cause.
 
     Raises:
+        NotReadyError: the robot is not ready, at the end of the wait.
         RefusedError: another robot or backend is there, or the host refuses.
+        NotConnectedError: no robot answers, at the end of the wait.
     """
+    deadline_s = time.monotonic() + wait_s
+    reported = ""
+    while True:
+        try:
+            return _arm_once(robot, backend, where, print_text, unchecked=unchecked)
+        except (NotReadyError, NotConnectedError) as error:
+            if time.monotonic() >= deadline_s:
+                raise
+            if str(error) != reported:
+                reported = str(error)
+                print_text(f"waiting: {reported}")
+        time.sleep(RETRY_S)
+
+
+def _arm_once(robot: str, backend: str, where: RobotSelection, print_text: PrintLine, *, unchecked: bool) -> int:
+    """Try to arm a robot, as `arm` declares."""
     link = only_robot(where, f"robot arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _read_description(session, link)
@@ -133,7 +164,8 @@ def request_from_host(
             f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}", code="robot/not-confirmed"
         )
     if not answers[0].ok:
-        raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
+        refused = NotReadyError if answers[0].refusal == "not_ready" else RefusedError
+        raise refused(f"{name}: not {done}: {answers[0].reason}")
     print_text(f"{name}: {done}: {answers[0].reason}")
     return 0
 

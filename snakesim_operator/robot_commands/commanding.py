@@ -17,6 +17,13 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
     parser.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
     add_unchecked(parser)
+    parser.add_argument(
+        "--wait",
+        type=float,
+        default=0.0,
+        metavar="SECONDS",
+        help="how long to try again while no robot answers, or while it is not ready (default: 0)",
+    )
     add_network(parser)
 
 
@@ -67,7 +74,13 @@ def _add_fault_inject(parser: argparse.ArgumentParser) -> None:
 def _arm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.command import arm
 
-    return arm(arguments.robot, arguments.backend, select_robots(arguments), unchecked=arguments.unchecked)
+    return arm(
+        arguments.robot,
+        arguments.backend,
+        select_robots(arguments),
+        unchecked=arguments.unchecked,
+        wait_s=arguments.wait,
+    )
 
 
 def _disarm(arguments: argparse.Namespace) -> int:
@@ -159,7 +172,11 @@ COMMANDS: Commands = (
         help="Allow a robot to move; names robot and backend, to avoid mix-ups.",
         add=_add_arm,
         run=_arm,
-        examples=("robot arm planar13 sim", "robot arm planar13 can --namespace lab/planar13"),
+        details=(
+            "`--wait` is for scripts. A refusal that does not pass by itself, such as a fault or other settings, ends "
+            "the wait at once. Exit code: 0 armed, 1 refused or not ready in time, 2 wrong input."
+        ),
+        examples=("robot arm planar13 sim", "robot arm planar13 can --namespace lab/planar13 --wait 30"),
     ),
     Command(
         name="robot disarm",

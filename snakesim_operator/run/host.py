@@ -2,9 +2,11 @@
 
 import argparse
 import contextlib
+from functools import partial
 
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import write_config
+from snakesim_hal.network.session import Link
 from snakesim_hal.programs.host_program import host
 from snakesim_hal.programs.preflight import check_backend
 from snakesim_hal.programs.service_program import process_options
@@ -32,5 +34,9 @@ def run_host(arguments: argparse.Namespace) -> int:
             arguments.out = opened.enter_context(locked_folder(arguments.out, print_line))
             write_config(config, arguments.out / CONFIG)
         print_line(f"{link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
-        print_line(f"network: {link.endpoint}, namespace {link.namespace}; Ctrl-C ends it")
-        return host(options)
+        return host(options, partial(_report_network, link))
+
+
+def _report_network(link: Link) -> None:
+    """Print where the host can be reached, once it can."""
+    print_line(f"network: {link.endpoint}, namespace {link.namespace}; Ctrl-C ends it")

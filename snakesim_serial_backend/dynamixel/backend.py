@@ -13,7 +13,8 @@ from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_serial_backend.dynamixel.emulator import CURRENT_A, MAX_CURRENT, EmulatedDynamixel
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.emulator import MAX_CURRENT, MODEL, EmulatedDynamixel, EmulatedModel
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import Port
@@ -25,6 +26,9 @@ from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
 # A silence of this length ends an answer, whichever is longer.
 MIN_GAP_S = 0.002
 GAP_PER_PERIOD = 0.2
+EMULATED_GAP_PER_PERIOD = 0.5  # of servos in another process, which a busy computer delays
+
+UNKNOWN_CURRENT_UNIT_A = 0.00269  # of an emulated servo whose model the driver refuses
 
 
 class DynamixelBackend(DriverTypeBackend):
@@ -68,9 +72,12 @@ class DynamixelBackend(DriverTypeBackend):
                 pty = Pty()
                 emulator = emulator_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
-            port = Port(wire, gap_s)
+            port_gap_s = gap_s
+            if is_emulated(wire.port):
+                port_gap_s = max(gap_s, EMULATED_GAP_PER_PERIOD * config.period_ns * 1e-9)
+            port = Port(wire, port_gap_s)
             servos_context = ServosContext(
-                servos=[servo_of(joints[number], port) for number in numbers],
+                servos=[servo_of(joints[number], port, settings) for number in numbers],
                 port=port,
                 readings=readings,
                 settings=settings,
@@ -86,7 +93,7 @@ class DynamixelBackend(DriverTypeBackend):
         return group_by_port(joints, settings, ports, open_servos)
 
 
-def servo_of(joint: Joint, port: Port) -> Servo:
+def servo_of(joint: Joint, port: Port, settings: DynamixelSettings) -> Servo:
     """Return a servo with the parameters of its joint, converted to its horn."""
     drive = joint.drive
     limits = joint.limits
@@ -97,7 +104,7 @@ def servo_of(joint: Joint, port: Port) -> Servo:
         id=joint.id,
         name=joint.name,
         port=port,
-        constant=constant_of(joint),
+        constant=constant_of(joint, emulated_model(settings)),
         stiffness=joint.motor.stiffness_nm_per_rad / drive.gear**2,
         damping=joint.motor.damping_nm_s_per_rad / drive.gear**2,
         lower_rad=min(end_a_rad, end_b_rad),
@@ -107,12 +114,12 @@ def servo_of(joint: Joint, port: Port) -> Servo:
     )
 
 
-def constant_of(joint: Joint) -> float:
+def constant_of(joint: Joint, model: EmulatedModel) -> float:
     """Return a joint's torque constant in N·m/A.
 
     Without one, which only emulated servos may lack, it is such that half of the possible current gives full torque.
     """
-    max_a = MAX_CURRENT * CURRENT_A / 2
+    max_a = MAX_CURRENT * model.current_a / 2
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / max_a
 
 
@@ -179,8 +186,22 @@ def emulator_of(
     joints: Sequence[Joint], settings: DynamixelSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: DriverClock
 ) -> EmulatedDynamixel:
     """Make emulated servos for joints. ptys: the pseudo terminal of every joint's servo."""
-    constants = [constant_of(joint) for joint in joints]
-    return EmulatedDynamixel(body, ptys, constants, settings.baud, clock.now_ns)
+    model = emulated_model(settings)
+    constants = [constant_of(joint, model) for joint in joints]
+    return EmulatedDynamixel(body, ptys, constants, settings.baud, clock.now_ns, model)
+
+
+def emulated_model(settings: DynamixelSettings) -> EmulatedModel:
+    """Return the model that servos are emulated as: that of the settings, if they name one that is known."""
+    number = at.model_number(settings.model)
+    if number is None:
+        number = MODEL
+    current_a = settings.current_unit_a.get(str(number))
+    if current_a is None and number in at.MODELS:
+        current_a = at.MODELS[number].current_a
+    if current_a is None:
+        current_a = UNKNOWN_CURRENT_UNIT_A
+    return EmulatedModel(number, current_a)
 
 
 def _open_log(path: str) -> TextIO | None:

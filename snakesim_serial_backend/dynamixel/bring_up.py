@@ -22,6 +22,8 @@ EEPROM_VALUES = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}
 TORQUE_AT_START = 0x01  # bit of the startup configuration
 MEASURED_SIZE = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos differ: position, voltage, temperature
 READS = 3  # to distinguish a second servo from a single disturbance
+ATTEMPTS = 3  # to read or write registers
+MIN_DOUBLED = 2  # reads with an answer too many that show a second servo
 # Two servos with one id: their answers follow each other if their return delays differ, and collide if they do not.
 ANSWERS_TWICE = "is duplicated: it answers one question twice; give each servo its own id"
 GARBLED = (
@@ -43,6 +45,12 @@ def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -
     Raises:
         BackendError: a servo is missing or cannot be used; the message lists all of these.
     """
+    with port.wait_patiently():
+        return _bring_up(servos, port, settings)
+
+
+def _bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
+    """Do what `bring_up` declares."""
     pings, objections = _find_servos(servos, settings.bring_up_limit_s)
     flaws: list[str] = []
     for servo in servos:
@@ -67,7 +75,7 @@ def _check_servo(servo: Servo, ping: Packet | None, settings: DynamixelSettings)
     shared_id = _check_shared_id(servo)
     if shared_id:
         return shared_id
-    eeprom = servo.port.read(servo.id, 0, at.EEPROM_SIZE)
+    eeprom = _try_to_read(servo, 0, at.EEPROM_SIZE)
     if eeprom is None:
         return NO_ANSWER
     number, firmware = struct.unpack("<HB", ping.data[:3])
@@ -83,7 +91,7 @@ def _find_servos(servos: Sequence[Servo], limit_s: float) -> tuple[dict[str, Pac
     """Ping all servos until all have answered, or the time is over.
 
     Returns:
-        The answer of each servo that answered, and the objection to each that seems to share its id; by its name.
+        The answer of each servo that answered, and the objection to each that sends garbled bytes; by its name.
     """
     end_s = time.monotonic() + limit_s
     found: dict[str, Packet] = {}
@@ -93,14 +101,11 @@ def _find_servos(servos: Sequence[Servo], limit_s: float) -> tuple[dict[str, Pac
             if servo.name in found:
                 continue
             answers = servo.port.ping(servo.id)
+            objections.pop(servo.name, None)
             if answers.statuses:
                 found[servo.name] = answers.statuses[0]
-            if len(answers.statuses) > 1:
-                objections[servo.name] = ANSWERS_TWICE
-            elif answers.garbled and not answers.statuses:
+            elif answers.garbled:
                 objections[servo.name] = f"sends garbled bytes in answer to a ping: {GARBLED}"
-            else:
-                objections.pop(servo.name, None)
         if len(found) == len(servos) or time.monotonic() > end_s:
             return found, objections
 
@@ -108,16 +113,21 @@ def _find_servos(servos: Sequence[Servo], limit_s: float) -> tuple[dict[str, Pac
 def _check_shared_id(servo: Servo) -> str:
     """Return why another servo seems to have the same id; empty if only one answers.
 
-    A ping does not show it: two servos of one model answer it with the same bytes at the same time.
+    A ping does not show it: two servos of one model answer it with the same bytes at the same time. Late answers to
+    earlier requests do not show it, either: the port assigns them to those requests.
     """
+    doubled = 0
     garbled = 0
     for _ in range(READS):
         answers = servo.port.read_alone(servo.id, at.PRESENT, MEASURED_SIZE)
-        if len(answers.statuses) > 1:
-            return ANSWERS_TWICE
-        if answers.statuses:
+        if answers.surplus:
+            doubled += 1
+        elif answers.statuses:
             return ""
         garbled += answers.garbled
+        servo.port.wait_until_idle()
+    if doubled >= MIN_DOUBLED:
+        return ANSWERS_TWICE
     if garbled:
         return f"sends garbled bytes, in {garbled} of {READS} answers: {GARBLED}"
     return ""
@@ -206,7 +216,7 @@ def _write_registers(servo: Servo) -> None:
     eeprom = _read_registers(servo, 0, at.EEPROM_SIZE).data
     differing = {address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value}
     for address, value in {**STARTUP_REGISTERS, **differing}.items():
-        status = servo.port.write(servo.id, address, bytes([value]))
+        status = _try_to_write(servo, address, value)
         if status is None:
             reason = "does not answer"
         elif status.error:
@@ -236,7 +246,25 @@ def _read_present(servo: Servo) -> Packet:
 
 def _read_registers(servo: Servo, address: int, size: int) -> Packet:
     """Read registers of a servo. Raises BackendError without an answer."""
-    status = servo.port.read(servo.id, address, size)
+    status = _try_to_read(servo, address, size)
     if status is None:
         raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent")
     return status
+
+
+def _try_to_read(servo: Servo, address: int, size: int) -> Packet | None:
+    """Read registers of a servo, several times if need be; None without an answer."""
+    for _ in range(ATTEMPTS):
+        status = servo.port.read(servo.id, address, size)
+        if status is not None:
+            return status
+    return None
+
+
+def _try_to_write(servo: Servo, address: int, value: int) -> Packet | None:
+    """Write a register of a servo, several times if need be, and return its answer; None without one."""
+    for _ in range(ATTEMPTS):
+        status = servo.port.write(servo.id, address, bytes([value]))
+        if status is not None:
+            return status
+    return None

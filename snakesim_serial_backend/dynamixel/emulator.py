@@ -8,6 +8,7 @@ position law's gains is assumed, as the driver's is.
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
@@ -25,9 +26,8 @@ from snakesim_serial_backend.dynamixel.packets import (
 )
 from snakesim_serial_backend.wire import Pty
 
-MODEL = 1120  # XM540-W270
+MODEL = 1120  # XM540-W270, if the settings name no model
 FIRMWARE = 46
-CURRENT_A = 0.00269  # one unit of current
 MAX_CURRENT = 2047  # units of current
 MAX_PWM = 885
 FACTORY_DELAY = 250  # of an answer, in 2 us
@@ -40,12 +40,18 @@ WRITABLE = [(7, 14), (20, 64), (64, 70), (76, 120)]  # addresses from, to
 # Registers that only the emulator uses.
 FIRMWARE_VERSION = 6
 ID = 7
-BAUD_RATE = 8
 PROTOCOL = 13
 MAX_TEMPERATURE = 31
 PWM_LIMIT = 36
 SHUTDOWN = 63
 FIRST_GOAL = 100  # the goals of PWM, current, velocity and position follow each other
+
+
+class EmulatedModel(NamedTuple):
+    """The model that servos are emulated as."""
+
+    number: int
+    current_a: float  # in a unit of current
 
 
 @dataclass
@@ -88,6 +94,7 @@ class EmulatedDynamixel(DriveEmulator[Pty]):
         constants: Sequence[float],
         baud: int,
         clock_ns: Callable[[], int],
+        model: EmulatedModel,
     ) -> None:
         """Make a servo for every joint of a body.
 
@@ -97,10 +104,12 @@ class EmulatedDynamixel(DriveEmulator[Pty]):
             constants: torque constant of every joint's servo, N·m/A.
             baud: baud rate that the servos are set to.
             clock_ns: a clock with any origin.
+            model: the model of all servos.
         """
         self.servos: list[EmulatedServo] = []
         for joint, port, constant in zip(body.joints, ports, constants, strict=True):
-            servo = EmulatedServo(bytearray(at.SIZE), port, CURRENT_A * constant)
+            servo = EmulatedServo(bytearray(at.SIZE), port, model.current_a * constant)
+            servo.write_register("H", at.MODEL, model.number)
             self._write_factory_settings(servo, joint.id, baud)
             servo.write_register("H", at.MIN_VOLTAGE, round(joint.limits.min_voltage_v / at.VOLTS))
             self.servos.append(servo)
@@ -113,10 +122,9 @@ class EmulatedDynamixel(DriveEmulator[Pty]):
     @staticmethod
     def _write_factory_settings(servo: EmulatedServo, id_: int, baud: int) -> None:
         """Set the registers that a servo keeps without power."""
-        servo.write_register("H", at.MODEL, MODEL)
         servo.table[FIRMWARE_VERSION] = FIRMWARE
         servo.table[ID] = id_
-        servo.table[BAUD_RATE] = at.RATE[baud]
+        servo.table[at.BAUD_RATE] = at.RATE[baud]
         servo.table[at.DELAY] = FACTORY_DELAY
         servo.table[at.OPERATING_MODE] = 3  # position
         servo.table[at.SECONDARY_ID] = ID_WITHOUT_SERVO

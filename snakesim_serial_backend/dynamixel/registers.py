@@ -30,6 +30,7 @@ FIRST_FIRMWARE = 38  # the first one with a bus watchdog
 # Addresses.
 MODEL = 0  # 2 bytes; the model's information follows at 2, and the firmware at 6
 EEPROM_SIZE = 64  # size of the registers that last without power, from 0 on
+BAUD_RATE = 8
 DELAY = 9  # of an answer
 DRIVE_MODE = 10
 OPERATING_MODE = 11
@@ -112,6 +113,18 @@ def model_name(number: int) -> str:
     if model is not None:
         return model.name
     return WITHOUT_CURRENT.get(number, f"model {number}")
+
+
+def model_number(name: str) -> int | None:
+    """Return the number of a model with this name, as `model_name` returns it; None for an unknown name."""
+    names = {number: model.name for number, model in MODELS.items()} | WITHOUT_CURRENT
+    for number, known_name in names.items():
+        if known_name == name:
+            return number
+    word, _, number_text = name.partition(" ")
+    if word == "model" and number_text.isdecimal():
+        return int(number_text)
+    return None
 
 
 def error_names(errors: int) -> str:

@@ -114,7 +114,7 @@ class Servos(Drives):
         """Read the motion of a silent servo alone, and count answers that are doubled or garbled."""
         servo = self.servos[i]
         answers = servo.port.read_alone(servo.id, at.PRESENT, at.present_form.size)
-        if len(answers.statuses) > 1:
+        if answers.surplus:
             servo.answered_twice += 1
         else:
             servo.answered_twice = 0
@@ -122,9 +122,9 @@ class Servos(Drives):
             servo.garbled += 1
         else:
             servo.garbled = 0
-        if len(answers.statuses) == 1:
+        if answers.statuses and not answers.surplus:
             self._silent.clear()  # perhaps others answer again, too
-            self.handle_answer(i, answers.statuses[0])
+            self.handle_answer(i, answers.statuses[-1])  # an earlier one is a late answer to an earlier request
 
     def handle_answer(self, i: int, status: Packet) -> None:
         """Put what a servo measures into the readings."""
@@ -309,7 +309,7 @@ def _answer_finding(i: int, servo: Servo) -> Finding | None:
 def _state_finding(i: int, servo: Servo) -> Finding | None:
     """Return what has switched a servo's torque off, if anything."""
     if servo.errors:
-        cause = f"{servo.label} reports {at.error_names(servo.errors)}; a clear restarts it"
+        cause = f"{servo.label} reports {at.error_names(servo.errors)}; `snakesim robot reset` restarts it"
         return Finding("drive_fault", cause, i, alone=True)
     if servo.watchdog == at.TRIPPED:
         cause = f"{servo.label} was stopped by its bus watchdog, as it got no packet in time"

@@ -149,8 +149,8 @@ class Process(Message, frozen=True, kw_only=True):
     started_unix_s: Annotated[q.Count, about("when it started, by the wall clock of its machine")]
     settings: Annotated[
         dict[q.Name, q.Name],
-        Meta(max_length=32),
-        about("settings that host and services must share: values, and hashes of sections; empty: it uses none"),
+        Meta(max_length=q.MAX_SHARED_SETTINGS),
+        about("settings that host and services must share: values, and hashes of long ones; empty: it uses none"),
     ] = {}
     messages: Annotated[
         dict[q.Name, Annotated[q.Count, about("version of that message")]],

@@ -25,7 +25,7 @@ from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.frames import Frames
 from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
 from snakesim_operator.features.ros2.messages import Transform
-from snakesim_operator.features.ros2.relay import Relay, RosTime
+from snakesim_operator.features.ros2.relay import NewestRelay, Relay, RosTime
 from snakesim_operator.features.ros2.sensor_topics import SensorTopics, StaticFrames
 from snakesim_operator.features.ros2.steering import CmdVelInput
 from snakesim_operator.features.ros2.urdf import make_urdf
@@ -155,13 +155,13 @@ class Bridge:
         status_cycles = self._cycles_between(STATUS_HZ)
         image_cycles = self._cycles_between(self._options.images_hz)
         relays: list[Relay[Any]] = [
-            Relay(session, keys.JOINTS, m.JointState, every_cycle, self._forward_joints),
-            Relay(session, keys.WORLD, m.World, every_cycle, self._forward_world),
-            Relay(session, keys.STATUS, m.Status, status_cycles, self._forward_status),
+            NewestRelay(session, keys.JOINTS, m.JointState, every_cycle, self._forward_joints),
+            NewestRelay(session, keys.WORLD, m.World, every_cycle, self._forward_world),
+            NewestRelay(session, keys.STATUS, m.Status, status_cycles, self._forward_status),
         ]
         has_pose_sensor = any(sensor.key == keys.POSE for sensor in robot.sensors)
         if has_pose_sensor:
-            relays.append(Relay(session, keys.POSE, m.Pose, every_cycle, self._forward_pose))
+            relays.append(NewestRelay(session, keys.POSE, m.Pose, every_cycle, self._forward_pose))
         relays += self._sensor_topics.make_relays(image_cycles)
         return relays
 

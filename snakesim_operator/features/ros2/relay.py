@@ -1,40 +1,48 @@
 """Bounds the rate at which samples of the robot reach ROS, and converts robot time to the time of the ROS nodes."""
 
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from typing import Generic
+from typing import Generic, NamedTuple
 
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Reader
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageT
-from snakesim_hal.wire.messages import Message
+from snakesim_hal.wire.messages import Imu, Message
 
 MAX_CLOCK_OFFSETS = 256  # a delayed clock message must not move the offset, so several seconds of clocks count
 MAX_SAMPLES = 4  # some malformed samples must not displace the newest valid one
+
+
+class ImuMeasurement(NamedTuple):
+    """What one IMU has measured."""
+
+    sample: Imu
+    entry: int  # of the IMU in the lists of the sample
 
 
 def _always() -> bool:
     return True
 
 
-class Relay(Generic[MessageT]):
+class Relay(ABC, Generic[MessageT]):
     """Forwards samples of one key in every n-th cycle of the bridge, while ROS nodes want them.
 
     The relay subscribes to the key only while a subscriber needs the samples: an image that no ROS node reads does not
     travel through the robot's network.
     """
 
+    depth: int | None = MAX_SAMPLES  # samples that are kept until the next poll; None: all
+
     def __init__(
         self,
         session: Session,
         key: str,
         message_type: type[MessageT],
-        every_cycles: int,
-        forward: Callable[[MessageT], None],
+        every_cycles: int = 1,
         has_subscriber: Callable[[], bool] = _always,
-        *,
-        forwards_all: bool = False,
     ) -> None:
         """Prepare the relay. It subscribes in its first poll.
 
@@ -43,19 +51,23 @@ class Relay(Generic[MessageT]):
             key: Key of the samples.
             message_type: Their message type.
             every_cycles: Number of bridge cycles from one forwarded sample to the next.
-            forward: Receives each forwarded sample.
-            is_wanted: Returns whether a ROS node reads the result at present.
-            forwards_all: Forward all samples since the last poll instead of the newest one, for a key whose samples
-                complete each other.
+            has_subscriber: Returns whether a ROS node reads the result at present.
         """
         self._session = session
         self._key = key
         self._message_type = message_type
         self._every_cycles = every_cycles
-        self._forward = forward
         self._has_subscriber = has_subscriber
-        self._forwards_all = forwards_all
         self._reader: Reader[MessageT] | None = None  # None while no subscriber needs the samples
+
+    @abstractmethod
+    def forward_new_samples(self, reader: Reader[MessageT], is_valid: Callable[[Message], bool]) -> None:
+        """Forward what has arrived since the last poll, at most once for each topic.
+
+        Args:
+            reader: Has the samples.
+            is_valid: Returns whether a sample fits the robot; other samples are skipped.
+        """
 
     def poll(self, cycle: int, is_valid: Callable[[Message], bool]) -> None:
         """Forward what has arrived, if the relay is due in this cycle.
@@ -70,26 +82,57 @@ class Relay(Generic[MessageT]):
             self._unsubscribe()
             return
         if self._reader is None:
-            self._reader = self._subscribe()
-        if self._forwards_all:
-            for sample in self._reader.drain():
-                if is_valid(sample):
-                    self._forward(sample)
-        else:
-            newest = self._reader.newest(is_valid)
-            if newest is not None:
-                self._forward(newest)
-
-    def _subscribe(self) -> Reader[MessageT]:
-        depth: int | None = MAX_SAMPLES
-        if self._forwards_all:
-            depth = None
-        return self._session.reader(self._key, self._message_type, depth=depth)
+            self._reader = self._session.reader(self._key, self._message_type, depth=self.depth)
+        self.forward_new_samples(self._reader, is_valid)
 
     def _unsubscribe(self) -> None:
         if self._reader is not None:
             self._session.stop_reading(self._reader)
             self._reader = None
+
+
+class NewestRelay(Relay[MessageT]):
+    """Forwards the newest sample since the last poll."""
+
+    def __init__(
+        self,
+        session: Session,
+        key: str,
+        message_type: type[MessageT],
+        every_cycles: int,
+        forward: Callable[[MessageT], None],
+        has_subscriber: Callable[[], bool] = _always,
+    ) -> None:
+        """Prepare the relay, as `Relay` does. forward: receives each forwarded sample."""
+        super().__init__(session, key, message_type, every_cycles, has_subscriber)
+        self._forward = forward
+
+    def forward_new_samples(self, reader: Reader[MessageT], is_valid: Callable[[Message], bool]) -> None:
+        newest = reader.newest(is_valid)
+        if newest is not None:
+            self._forward(newest)
+
+
+class ImuRelay(Relay[Imu]):
+    """Forwards the newest measurement of every IMU since the last poll.
+
+    A sample holds only those IMUs that have new measurements, so all samples count.
+    """
+
+    depth = None
+
+    def __init__(self, session: Session, forward: Callable[[dict[int, ImuMeasurement]], None]) -> None:
+        """Prepare the relay. forward: receives the newest measurement of each IMU by the number of its link."""
+        super().__init__(session, keys.IMU, Imu)
+        self._forward = forward
+
+    def forward_new_samples(self, reader: Reader[Imu], is_valid: Callable[[Message], bool]) -> None:
+        newest: dict[int, ImuMeasurement] = {}
+        for sample in reader.drain():
+            if is_valid(sample):
+                newest |= {link: ImuMeasurement(sample, entry) for entry, link in enumerate(sample.link)}
+        if newest:
+            self._forward(newest)
 
 
 class RosTime:

@@ -16,7 +16,7 @@ from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.frames import Frames, make_ros_name
 from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
 from snakesim_operator.features.ros2.messages import Transform
-from snakesim_operator.features.ros2.relay import Relay, RosTime
+from snakesim_operator.features.ros2.relay import ImuMeasurement, ImuRelay, NewestRelay, Relay, RosTime
 
 ImageEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and image to a message in CDR
 SampleEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and sample to a message in CDR
@@ -92,8 +92,7 @@ class SensorTopics:
         relays: list[Relay[Any]] = []
         sensor_keys = {sensor.key for sensor in self._robot.sensors}
         if keys.IMU in sensor_keys:
-            # A sample holds the IMUs that have new measurements, so all samples count.
-            relays.append(Relay(self._session, keys.IMU, m.Imu, 1, self._forward_imu, forwards_all=True))
+            relays.append(ImuRelay(self._session, self._forward_imus))
         for key in sorted(sensor_keys):
             name = _get_sensor_name(key)
             if key == keys.depth_key(name):
@@ -173,7 +172,7 @@ class SensorTopics:
                 return True
             return any(publisher.has_subscribers() for publisher, _ in outputs)
 
-        return Relay(self._session, key, message_type, every_cycles, forward, is_wanted)
+        return NewestRelay(self._session, key, message_type, every_cycles, forward, is_wanted)
 
     def _relay_mounted_sensor(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
         """Return the relay of one topic of a sensor that is mounted on a link."""
@@ -187,17 +186,17 @@ class SensorTopics:
             frame = self._frames.get_mount_frame(name)
             publisher.publish(encode(timestamp_ns, frame, sample))
 
-        return Relay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
+        return NewestRelay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
 
-    def _forward_imu(self, sample: m.Imu) -> None:
-        """Publish each IMU of a sample on the topic of its link."""
-        timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
-        for entry, link in enumerate(sample.link):
+    def _forward_imus(self, measurements: dict[int, ImuMeasurement]) -> None:
+        """Publish each IMU on the topic of its link. measurements: by the number of the link."""
+        for link, measurement in measurements.items():
             if link not in self._imu_publishers:
                 link_name = make_ros_name(self._robot.links[link].name)
                 self._imu_publishers[link] = self._declare_publisher(f"{link_name}/imu", ros.IMU)
             self._static_frames.place_sensor(f"{keys.IMU}/{link}", [self._frames.make_imu_transform(link)])
             publisher = self._imu_publishers[link]
             if publisher.has_subscribers():
+                timestamp_ns = self._ros_time.convert(measurement.sample.timestamp_ns)
                 frame = self._frames.get_imu_frame(link)
-                publisher.publish(robot_in_ros.encode_imu(timestamp_ns, frame, sample, entry))
+                publisher.publish(robot_in_ros.encode_imu(timestamp_ns, frame, measurement.sample, measurement.entry))

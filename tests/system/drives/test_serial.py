@@ -1,5 +1,6 @@
 """Servos of another program: two processes and a pseudo terminal between them, in real time."""
 
+import contextlib
 import os
 import re
 import subprocess
@@ -75,3 +76,74 @@ def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path)
     stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
     assert len(stopped) == 13, record.faults
     assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"
+
+
+ROW_ROBOT = """
+extends = "planar13"
+name = "row"
+
+[chain]
+modules = 4
+axes = ["yaw"]
+"""
+ROW = """
+title = "A row of servos, as separate programs"
+robot = "./row_robot.toml"
+scene = "flat"
+controller = "hold"
+clock_mode = "realtime"
+rate_hz = 25
+duration_s = 60
+seed = 1
+
+[start]
+on_route = false
+
+[services.control]
+latency_ticks = 2
+
+[backends.dynamixel]
+ports = ["row"]
+watchdog_s = 0.5
+"""
+
+
+def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_path: Path) -> None:
+    """Servos have no velocity mode, which the robot file lists: the host leaves it out, and the service does not."""
+    (tmp_path / "row_robot.toml").write_text(ROW_ROBOT)
+    (tmp_path / "row.toml").write_text(ROW)
+    network = ("--endpoint", free_endpoint())
+
+    def start(stack: contextlib.ExitStack, log: str, *arguments: str) -> Path:
+        """Start a program; returns the file with its output."""
+        path = tmp_path / log
+        file = stack.enter_context(path.open("wb"))
+        program = subprocess.Popen(
+            [*SNAKESIM, *arguments], cwd=tmp_path, env=environment(tmp_path), stdout=file, stderr=file
+        )
+        stack.callback(program.wait, 10)
+        stack.callback(program.terminate)
+        return path
+
+    def arm() -> Ended:
+        return snakesim("robot", "arm", "row", "dynamixel", *network, cwd=tmp_path)
+
+    with contextlib.ExitStack() as stack:
+        servos = start(stack, "servos.log", "drive", "emulate", "dynamixel", "row.toml", "--channel", "row")
+        wait_until(lambda: "servos ready: 4" in servos.read_text(), "the servos")
+        start(stack, "host.log", "start", "host", "row.toml", "--backend", "dynamixel", *network)
+        with contextlib.ExitStack() as other:
+            start(
+                other,
+                "other.log",
+                "start",
+                "service",
+                "control",
+                "row.toml",
+                "--set",
+                "mission.speed_m_s=0.3",
+                *network,
+            )
+            wait_until(lambda: "`mission.speed_m_s` = 0.3 (here " in arm().said, "a refusal", 30.0)
+        start(stack, "control.log", "start", "service", "control", "row.toml", *network)
+        wait_until(lambda: arm().code == 0, "armed", 60.0)

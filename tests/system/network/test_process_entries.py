@@ -4,8 +4,9 @@ import msgspec
 import pytest
 
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
-from snakesim_hal.network.process_entries import ProcessEntries, own_entry, show_process
+from snakesim_hal.network.process_entries import ProcessEntries, find_differences, own_entry, show_process
 from snakesim_hal.network.session import Session
+from snakesim_hal.programs.preflight import check_backend
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Process
 from snakesim_testing.harness.wait import wait_until
@@ -18,25 +19,39 @@ def config(*sets: str) -> RunConfig:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ("robot.limits.speed_rad_s=3.0", "`robot` is planar13 "),
-        ("scene.ground.friction=0.2", "`scene` is triplet "),
-        ("rate_hz=50", "`rate_hz` is 50 on "),
-        ("clock_mode=realtime", "`clock_mode` is realtime on "),
-        ("services.control.latency_ticks=3", "`services` is "),
-        ("control.propulsion_n=30.0", "`controller` is obstacle_triplet "),
-        ("mission.speed_m_s=0.2", "`mission` is "),
+        ("robot.limits.speed_rad_s=3.0", "`robot.limits.speed_rad_s` = 3.0 (here 7.5)"),
+        ("robot.joints.joint_2.id=40", '`robot.joints.joint_2` = {"id": 40} (here not set)'),
+        ("scene.ground.friction=0.2", "`scene.ground.friction` = 0.2 (here 0.1)"),
+        ("rate_hz=50", "`rate_hz` = 50.0 (here 100.0)"),
+        ("clock_mode=realtime", "`clock_mode` = realtime (here lockstep); start control again with --clock-mode lock"),
+        ("services.control.latency_ticks=3", "`services.control.latency_ticks` = 3 (here 2)"),
+        ("control.propulsion_n=30.0", "`controllers.obstacle_triplet.propulsion_n` = 30.0 (here 35.0)"),
+        ("mission.speed_m_s=0.2", "`mission.speed_m_s` = 0.2 (here 0.1)"),
     ],
 )
-def test_a_difference_is_told_with_both_places(change: str, named: str, sessions: tuple[Session, Session]) -> None:
+def test_a_difference_is_reported_with_its_key_and_both_values(
+    change: str, named: str, sessions: tuple[Session, Session]
+) -> None:
     here, there = sessions
     entries, own = ProcessEntries(here), own_entry("host", config())
     show_process(there, own_entry("control", config(change)))
     wait_until(lambda: bool(entries.find_problems(own, ["control"])), "an entry", 5.0)
     wait_until(lambda: named in entries.find_problems(own, ["control"])[0], named, 5.0)
     (reported,) = entries.find_problems(own, ["control"])
-    assert f"(control, process {own.pid})" in reported
-    assert f"(host, process {own.pid})" in reported
+    assert f"(control, process {own.pid}) differs from this host in `" in reported
+    assert "; start " in reported
     assert entries.find_problems(own, ["guidance"]) == []
+
+
+@pytest.mark.parametrize(
+    ("backend", "driver"), [("dynamixel", ""), ("moteus", ""), ("can", ""), ("mixed", "dynamixel")]
+)
+def test_modes_that_a_backend_does_not_have_are_no_difference(backend: str, driver: str) -> None:
+    """The host leaves them out of its configuration, and a service does not know the backend."""
+    both = ("clock_mode=realtime", f'robot.drive.driver="{driver}"')
+    of_service = config(*both)
+    of_host = check_backend(config(*both, f"backend={backend}"))
+    assert find_differences(own_entry("control", of_service), own_entry("host", of_host)) == []
 
 
 def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]) -> None:
@@ -66,7 +81,7 @@ def test_process_entry_with_other_version_is_reported_while_alive(
     newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
     there.latched_publisher(key, Process).put(newer)
     wait_until(
-        lambda: "message JointCommand has version 2 on " in "".join(entries.find_problems(own, ["control"])),
+        lambda: "message JointCommand version 2 (here " in "".join(entries.find_problems(own, ["control"])),
         "told",
         5.0,
     )

@@ -24,7 +24,7 @@ def test_programs_started_in_any_order_equal_one_run(lab: Lab) -> None:
     waited = lab.folder / "service-control.log"
     wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
     router = lab.start("start", "router", str(lab.router_file))
-    wait_until(lambda: "DIFFERS: `mission` is " in lab.tell("status").out, "the difference")
+    wait_until(lambda: "DIFFERS: `mission.speed_m_s` is 0.3 on " in lab.tell("status").out, "the difference")
     refused = lab.tell("robot", "arm", "planar13", "sim").err
     assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
     other_goal.kill()

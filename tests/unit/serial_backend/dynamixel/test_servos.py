@@ -191,3 +191,17 @@ def test_servo_with_duplicate_id_stops_the_robot(robot: Robot, delay: int, what:
     fault = robot.run(NOTICED, "armed")[0]
     assert (fault.what, fault.joint) == (what, "joint_2") and re.search(words, fault.cause), fault
     assert fault.reach == ("robot" if what == "duplicate_node" else "joint")
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "XL330-M288"])
+def test_emulated_servos_are_of_the_model_that_the_settings_name(model: str) -> None:
+    robot = Robot(DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5, model=model))
+    robot.run(40, "armed")
+    assert robot.joints is not None and robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+    robot.backend.close()
+
+
+def test_an_emulated_model_that_the_driver_cannot_use_is_refused_by_its_name() -> None:
+    settings = DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5, model="XL430-W250")
+    with pytest.raises(BackendError, match="XL430-W250 neither measures nor limits current"):
+        Robot(settings)
