@@ -124,7 +124,7 @@ class ArmedRobots:
         self._is_ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # limited as arrays
         self._stays_alone: Mask = np.zeros(robots, dtype=np.bool_)  # until its next reset
         self._descriptions = [description] * robots
-        self._everybody = self.simulated.everybody
+        self._all_robots = self.simulated.all_robots
 
         # Robots that take part in the present ticks.
         self._active: Mask = np.zeros(robots, dtype=np.bool_)
@@ -214,12 +214,12 @@ class ArmedRobots:
         """Find the robots that take part in the next ticks."""
         self._active_at_call = active
         self._ordinary_at_call = self._is_ordinary
-        self._active = self._everybody if active.all() else active
+        self._active = self._all_robots if active.all() else active
         self._active_robots = np.flatnonzero(active).tolist()
         ordinary = active & self._is_ordinary
         if not np.array_equal(ordinary, self._ordinary):
             self._update_active_limits()
-        self._ordinary = self._everybody if ordinary.all() else ordinary
+        self._ordinary = self._all_robots if ordinary.all() else ordinary
 
     def _find_clients(self, robots: Mask) -> list[int]:
         """Return those of these robots that have a limiter to themselves."""
@@ -256,7 +256,7 @@ class ArmedRobots:
             torque_limit_nm = self._limits.torque_nm
             target = requested.copy()
             is_limited = np.zeros_like(self.is_limited)
-        if robots is not self._everybody:
+        if robots is not self._all_robots:
             target = np.where(robots[:, None], target, self._target)
             torque_limit_nm = np.where(robots[:, None], torque_limit_nm, self._torque_limit_nm)
             is_limited = is_limited & robots[:, None]
@@ -353,7 +353,7 @@ class ArmedRobots:
             self._stays_alone[robot] |= not is_near[robot] or self._clients[robot].has_isolated_joints
             if is_ordinary[robot] and not self._stays_alone[robot] and self._obeys(robot, mode):
                 self._join_others(robot)
-        if is_ordinary is not self._everybody:
+        if is_ordinary is not self._all_robots:
             unusual = self._ordinary & moved & ~is_ordinary
             for robot in np.flatnonzero(unusual).tolist():
                 self._leave_others(robot, before[robot], mode)
@@ -370,10 +370,10 @@ class ArmedRobots:
         is_near = change <= self._max_change
         has_moved = change[:, joints : 2 * joints] != 0.0
         windings = self.simulated.sensors.windings
-        is_heat_new = windings is not None and windings.is_new is not windings.nobody
+        is_heat_new = windings is not None and windings.is_new is not windings.no_robots
         all_near = np.count_nonzero(is_near) == is_near.size
         if all_near and np.count_nonzero(has_moved) == has_moved.size and not is_heat_new:
-            return self._everybody, self._everybody
+            return self._all_robots, self._all_robots
         near: Mask = np.all(is_near, axis=1)
         has_changed: Mask = np.all(np.any(change.reshape(len(change), 3, joints) != 0.0, axis=1), axis=1)
         ordinary: Mask = near & has_changed
@@ -385,7 +385,7 @@ class ArmedRobots:
     def _update_torque_fractions(self) -> None:
         """Derate the torque limits of robots whose winding temperatures have just been measured."""
         windings = self.simulated.sensors.windings
-        if windings is None or windings.is_new is windings.nobody:
+        if windings is None or windings.is_new is windings.no_robots:
             return
         fractions = np.where(self._heat_is_measured, self.simulated.remaining_fractions(), 1.0)
         self._torque_fraction = np.where(windings.is_new[:, None], fractions, self._torque_fraction)

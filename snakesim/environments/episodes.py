@@ -130,7 +130,7 @@ class Episodes:
         start_m = self.advance_m
         ticks = np.zeros(self._count, dtype=np.int64)
         count = 0  # of ticks
-        everybody = True
+        all_active = True
         shortest = int(self._ticks_left[environments].min(initial=setup.frame_skip))
         active = environments
         is_armed: Mask | None = None  # as of the last computation of `active`
@@ -138,7 +138,7 @@ class Episodes:
             if is_armed is not self.robots.is_armed or tick >= shortest:
                 is_armed = self.robots.is_armed
                 active = environments & is_armed & (ticks < self._ticks_left)
-                everybody = everybody and bool(active.all())
+                all_active = all_active and bool(active.all())
                 if not np.count_nonzero(active):
                     break
             self.robots.step(setup.commands.mode, actions, active)
@@ -151,7 +151,7 @@ class Episodes:
         self._ticks_left = self._ticks_left - ticks
 
         observations = self.observe(environments)
-        energy_j, limited = self._sum_ticks(count, everybody)
+        energy_j, limited = self._sum_ticks(count, all_active)
         reached = np.array([progress.reached for progress in self._observers.progress])
         stopped = ~self.robots.is_armed
         values = {
@@ -208,12 +208,12 @@ class Episodes:
                     raise
         raise AssertionError("the last attempt returns or raises")
 
-    def _sum_ticks(self, count: int, everybody: bool) -> tuple[Floats, NDArray[np.int64]]:
+    def _sum_ticks(self, count: int, all_active: bool) -> tuple[Floats, NDArray[np.int64]]:
         """Return the energy in J and the number of limited targets of each environment in a step.
 
         Args:
             count: number of ticks in the step.
-            everybody: whether all environments took part in all of them.
+            all_active: whether all environments took part in all of them.
         """
         if not count:
             return np.zeros(self._count), np.zeros(self._count, dtype=np.int64)
@@ -223,7 +223,7 @@ class Episodes:
         joint_power_w = np.abs(samples[:, :, 2 * joints :] * samples[:, :, joints : 2 * joints])
         energy_j = joint_power_w.cumsum(axis=2)[:, :, -1] * self._period_ns * 1e-9
         is_limited = self._tick_is_limited[:count]
-        if not everybody:
+        if not all_active:
             active = self._tick_active[:count]
             energy_j = np.where(active, energy_j, 0.0)
             is_limited = is_limited & active[:, :, None]

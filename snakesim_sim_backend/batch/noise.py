@@ -12,14 +12,14 @@ BLOCK = 4096  # numbers that are drawn at once for each robot; a tick needs abou
 class NoiseStreams:
     """A stream of standard normal numbers for each robot. Numbers are drawn in blocks, which changes none of them."""
 
-    def __init__(self, everybody: Mask) -> None:
+    def __init__(self, all_robots: Mask) -> None:
         """Make streams; `restart` gives them seeds.
 
         Args:
-            everybody: the mask of all robots.
+            all_robots: the mask of all robots.
         """
-        robots = len(everybody)
-        self._everybody = everybody
+        robots = len(all_robots)
+        self._all_robots = all_robots
         self._random = [np.random.default_rng() for _ in range(robots)]
         self._numbers: Floats = np.zeros((robots, BLOCK))
         # Position of each robot's next number in its block, and how many numbers all robots have left out after it.
@@ -47,7 +47,7 @@ class NoiseStreams:
         """Leave out the next numbers of some robots."""
         if count > self._left:
             self._draw(count)
-        if robots is self._everybody:
+        if robots is self._all_robots:
             self._skipped += count
         else:
             self._next += count * robots

@@ -33,7 +33,7 @@ class SimulatedRobots:
 
     Attributes:
         sensors: what the robots measure.
-        everybody: the mask of all robots. A call with this object is faster than one with an equal mask.
+        all_robots: the mask of all robots. A call with this object is faster than one with an equal mask.
     """
 
     def __init__(self, robots: int, config: RunConfig, *, threads: int) -> None:
@@ -50,10 +50,10 @@ class SimulatedRobots:
         self._timing = describe_timing(config)
         self._has_heat = config.robot.sensors.power is not None
         self._simulations = _open_simulations(robots, joints, threads)
-        self.everybody: Mask = np.ones(robots, dtype=np.bool_)
-        self._noise = NoiseStreams(self.everybody)
+        self.all_robots: Mask = np.ones(robots, dtype=np.bool_)
+        self._noise = NoiseStreams(self.all_robots)
         self._heat = HeatArrays(robots, joints, config.period_ns * 1e-9)
-        self.sensors = SensorArrays(self.everybody, config, self._noise)
+        self.sensors = SensorArrays(self.all_robots, config, self._noise)
 
         # Motors.
         self._min_torque_nm = np.zeros((robots, joints))
@@ -107,7 +107,7 @@ class SimulatedRobots:
             robots: which robots get them.
         """
         inputs = self._simulations.motor_inputs[:, INPUT_OF_MODE[mode] :: INPUTS]
-        if robots is self.everybody:
+        if robots is self.all_robots:
             inputs[:] = target
         else:
             np.copyto(inputs, target, where=robots[:, None])

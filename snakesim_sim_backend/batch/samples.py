@@ -40,23 +40,23 @@ class DelayedValues:
     Attributes:
         values: (robots, n), those that were delivered last.
         is_known: (robots,), whether any have been delivered in this episode.
-        is_new: (robots,), whether they were delivered at this tick; the same object as `nobody` if none were.
-        nobody: the mask without robots.
+        is_new: (robots,), whether they were delivered at this tick; the same object as `no_robots` if none were.
+        no_robots: the mask without robots.
     """
 
-    def __init__(self, everybody: Mask, width: int, delay_s: float, period_ns: int) -> None:
+    def __init__(self, all_robots: Mask, width: int, delay_s: float, period_ns: int) -> None:
         """Start without samples.
 
         Args:
-            everybody: the mask of all robots.
+            all_robots: the mask of all robots.
             width: number of values.
             delay_s: from the measurement to the delivery.
             period_ns: of the control cycle.
         """
-        robots = len(everybody)
+        robots = len(all_robots)
         self._delay_ticks = round_to_ticks(delay_s, period_ns)
-        self._everybody = everybody
-        self.nobody: Mask = np.zeros(robots, dtype=np.bool_)
+        self._all_robots = all_robots
+        self.no_robots: Mask = np.zeros(robots, dtype=np.bool_)
         self._waiting: deque[tuple[Floats, Mask]] = deque()  # values, and which of them are samples
         self.values: Floats = np.zeros((robots, width))
         self.is_known: Mask = np.zeros(robots, dtype=np.bool_)
@@ -66,7 +66,7 @@ class DelayedValues:
         """Forget all samples of a robot."""
         self.is_known = self.is_known.copy()
         self.is_known[robot] = False
-        self.is_new = self.nobody
+        self.is_new = self.no_robots
         for age, (values, due) in enumerate(self._waiting):
             others_due = due.copy()
             others_due[robot] = False
@@ -87,11 +87,11 @@ class DelayedValues:
                 return
             self._waiting.append((values, due))
             if len(self._waiting) <= self._delay_ticks:
-                self.is_new = self.nobody
+                self.is_new = self.no_robots
                 return
             values, due = self._waiting.popleft()
         self.is_new = due
-        if due is self._everybody:
+        if due is self._all_robots:
             self.is_known = due
             self.values = values
         else:
@@ -101,6 +101,6 @@ class DelayedValues:
     def add_nothing(self) -> None:
         """Go on by a tick in which no robot samples."""
         if self._delay_ticks:
-            self.add(self.values, self.nobody)
+            self.add(self.values, self.no_robots)
         else:
-            self.is_new = self.nobody
+            self.is_new = self.no_robots

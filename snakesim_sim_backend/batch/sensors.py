@@ -57,16 +57,16 @@ class SensorArrays:
         windings: temperatures, (robots, joints), as the power sensor has delivered them.
     """
 
-    def __init__(self, everybody: Mask, config: RunConfig, noise: NoiseStreams) -> None:
+    def __init__(self, all_robots: Mask, config: RunConfig, noise: NoiseStreams) -> None:
         """Make the sensors of robots.
 
         Args:
-            everybody: the mask of all robots. A call with this object is faster than one with an equal mask.
+            all_robots: the mask of all robots. A call with this object is faster than one with an equal mask.
             config: configuration of one of the robots; those of the others agree with it in `describe_timing`.
             noise: the random numbers of the robots.
         """
-        robots = len(everybody)
-        self._everybody = everybody
+        robots = len(all_robots)
+        self._all_robots = all_robots
         sensors = config.robot.sensors
         joints = config.robot.chain.modules
         self._noise = noise
@@ -108,7 +108,7 @@ class SensorArrays:
         if sensors.pose is not None:
             self._pose_due = due_ticks(sensors.pose.rate_hz)
             self._pose_has_noise = _has_noise(sensors.pose)
-            self._raw_poses = DelayedValues(everybody, NUMBERS_OF_RAW_POSE, sensors.pose.delay_s, config.period_ns)
+            self._raw_poses = DelayedValues(all_robots, NUMBERS_OF_RAW_POSE, sensors.pose.delay_s, config.period_ns)
             self._raw_poses.values[:, 3] = 1.0  # a quaternion that can be normalized, until there is a pose
         self._pose_sigma = np.zeros((robots, 6))
         self._no_pose_noise = np.zeros((robots, 6))
@@ -118,7 +118,7 @@ class SensorArrays:
         self.windings: DelayedValues | None = None
         if sensors.power is not None:
             self._power_due = due_ticks(sensors.power.rate_hz)
-            self.windings = DelayedValues(everybody, joints, sensors.power.delay_s, config.period_ns)
+            self.windings = DelayedValues(all_robots, joints, sensors.power.delay_s, config.period_ns)
 
     def restart(self, robot: int, config: RunConfig) -> None:
         """Forget all samples of a robot, and use the noise of its new configuration."""
@@ -228,7 +228,7 @@ class SensorArrays:
         else:
             self._waiting_joints.append(values)
         delivered = self._waiting_joints[0]
-        if active is not self._everybody:
+        if active is not self._all_robots:
             delivered = np.where(active[:, None], delivered, self.joints)
         self.joints = delivered
 
