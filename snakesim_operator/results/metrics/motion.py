@@ -63,7 +63,14 @@ class Motion:
 
 
 def measure_motion(record: RunRecord) -> Motion | None:
-    """Return when the body moved, or None if its pose was never measured, so that this is unknown."""
+    """Find the intervals in which the body stood still, from the measured path of its center of mass.
+
+    Args:
+        record: The recorded run.
+
+    Returns:
+        The stops, with times from the start of the time axis; None if the pose was never measured.
+    """
     measured = _read_center(record)
     if measured is None:
         return None
@@ -77,9 +84,10 @@ def measure_motion(record: RunRecord) -> Motion | None:
         stop_end_s = run_end_s
         if last < last_sample:
             stop_end_s = _find_stop_end_s(time_s, center_w, last)
-        is_continued = bool(stops) and start_s - stops[-1].end_s < WINDOW_S
-        if is_continued:  # the motion in between is shorter than the window that would show it
-            start_s = stops.pop().start_s
+        # Motion for less than a window cannot be told from a stop: merge the stops before and after it.
+        if stops and start_s - stops[-1].end_s < WINDOW_S:
+            previous = stops.pop()
+            start_s = previous.start_s
         stops.append(Interval(start_s, max(stop_end_s, start_s), STANDING))
     return Motion(stops, run_end_s)
 

@@ -95,22 +95,32 @@ def playback_page(record: RunRecord, summary: RunSummary) -> str:
 
 
 def _describe_snapshots(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
-    """Return the drawings of each event, and the numbers beside them."""
+    """Return what the template shows for each event that is drawn: drawings as SVG, and numbers.
+
+    Args:
+        record: The recorded run.
+        events: All events of the run; only some of them are drawn.
+
+    Returns:
+        A dictionary for each event: the event, its snapshot, the top view, the force polygon (None without balanced
+        forces), and `pushed_n`, the measured contact force in the direction of travel.
+    """
     chosen = drawn_snapshots(record, events)
     snapshots = [snapshot for _, snapshot in chosen]
+    top_views = views(record, snapshots, VIEW_WIDTH)
     balances = [snapshot.balance for snapshot in snapshots if snapshot.balance is not None]
     cards: list[dict[str, Any]] = []
-    for (event, snapshot), view in zip(chosen, views(record, snapshots, VIEW_WIDTH), strict=True):
-        polygon = None
-        if snapshot.balance is None:
+    for (event, snapshot), view in zip(chosen, top_views, strict=True):
+        balance = snapshot.balance
+        if balance is None:
             nodes = nodes_xy_w(record, snapshot.row)
-            forward = nodes[-1] - nodes[0]
+            forward = nodes[-1] - nodes[0]  # from the tail to the head
+            polygon = None
         else:
-            forward = snapshot.balance.resultant_n
+            forward = balance.resultant_n
             scale = common_scale(balances, *POLYGON_SIZE, upright=view.upright)
-            polygon = Markup(
-                force_polygon(snapshot.balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
-            )
+            drawing = force_polygon(balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
+            polygon = Markup(drawing)
         cards.append(
             {
                 "event": event,
