@@ -217,7 +217,11 @@ def differ(a: RunRecord, b: RunRecord) -> Difference:
 
 
 def _check_comparable(a: RunRecord, b: RunRecord) -> None:
-    """Raise ConfigError if a run has no tick, if the joints differ, or if an array is damaged."""
+    """Check that two runs have ticks, the same joints, and arrays that fit to each other.
+
+    Raises:
+        ConfigError: A run has no tick, the joints differ, or an array is damaged.
+    """
     for record in (a, b):
         if not len(record.time_s):
             raise ConfigError(
@@ -227,7 +231,10 @@ def _check_comparable(a: RunRecord, b: RunRecord) -> None:
                 code="recording/never-armed",
             )
     if a.description.layout != b.description.layout:
-        robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]
+        robots: list[str] = []
+        for record in (a, b):
+            joint_count = len(record.description.joints)
+            robots.append(f"{record.folder} has {record.description.robot} with {joint_count} joints")
         raise ConfigError(
             f"{', '.join(robots)}: their names, order or axes are not the same, so there is no joint to compare with "
             "which. Compare runs of one robot file",

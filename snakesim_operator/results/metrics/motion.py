@@ -93,9 +93,15 @@ def measure_motion(record: RunRecord) -> Motion | None:
 
 
 def _read_center(record: RunRecord) -> tuple[Floats, Floats] | None:
-    """Return times on the axis, (m,), and the center of mass then, (m, 2), by the pose sensor or else by guidance.
+    """Return the measured path of the body's center of mass.
 
-    A pose that guidance estimated by dead reckoning is no measurement. None: there is no measured pose.
+    The pose sensor in the record is used if it has poses; otherwise the poses that guidance published. Poses that
+    guidance estimated by dead reckoning are left out, because they are no measurement.
+
+    Returns:
+        time_s: (m,) times from the start of the time axis, in s.
+        center_w: (m, 2) the center of mass in the world, in m.
+        None if fewer than two poses were measured.
     """
     advance = Advance.from_run(record)
     if advance is not None:
@@ -104,14 +110,14 @@ def _read_center(record: RunRecord) -> tuple[Floats, Floats] | None:
     samples: list[tuple[float, float, float]] = []
     for world in record.worlds:
         time_s = world.timestamp_ns * 1e-9
-        if world.center_w is None or world.pose_from != "sensor" or time_s < begin_s:
+        if time_s < begin_s or world.pose_from != "sensor" or world.center_w is None:
             continue
         x, y = world.center_w[:2]
         samples.append((time_s - begin_s, x, y))
     if len(samples) < 2:
         return None
-    rows = np.array(samples)
-    return rows[:, 0], rows[:, 1:]
+    table = np.array(samples)  # (m, 3)
+    return table[:, 0], table[:, 1:]
 
 
 def _find_window_begins(time_s: Floats) -> NDArray[np.intp]:

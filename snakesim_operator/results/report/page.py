@@ -35,46 +35,59 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:
-    """Return the whole page as HTML."""
+    """Return the report of one run as an HTML page.
+
+    Args:
+        record: The recorded run.
+        summary: The numbers of the run.
+    """
     events = find_events(record, summary)
     all_intervals = find_propulsion_intervals(record)
-    intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
-    joints: list[tuple[int, list[Propulsion]]] = []
-    for joint in most_used_joints(intervals):
-        joints.append((joint, [interval for interval in all_intervals if interval.joint == joint]))
+    shown_intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
+    intervals_by_joint: list[tuple[int, list[Propulsion]]] = []
+    for joint in most_used_joints(shown_intervals):
+        intervals_of_joint = [interval for interval in all_intervals if interval.joint == joint]
+        intervals_by_joint.append((joint, intervals_of_joint))
+    propelling_joints = {interval.joint for interval in shown_intervals}
+    config_json = msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode()
     return render(
         HERE / "report.html",
         len(record.description.joints),
         styles=[HERE / "figure.css"],
         scripts=[HERE / "playback.js"],
+        # The run and its verdict.
         title=record.config.title or summary.scenario,
         record=record,
         summary=summary,
         verdict=verdict(record, summary),
-        pretty=with_subscript,
-        in_words=in_words,
         film=playback(record),
-        names=[joint.name for joint in record.description.joints],
+        # Sections and figures.
         events=select_listed(events),
         snapshots=_describe_snapshots(record, events),
         pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
+        figures=figures,
+        names=[joint.name for joint in record.description.joints],
+        limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
+        intervals=shown_intervals,
+        joints=intervals_by_joint,
+        propelled=len(propelling_joints),
+        begin_s=zero_s(record),
+        # Explanations of numbers that are not good.
         why_empty=why_empty(record),
         why_at_limit=why_at_limit(record),
         why_late=why_late(summary),
-        tick_times=TICK_TIMES,
         why_refused=why_refused(summary),
-        limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
-        intervals=intervals,
-        joints=joints,
-        propelled=len({interval.joint for interval in intervals}),
-        figures=figures,
-        begin_s=zero_s(record),
+        # Lists and tables.
+        tick_times=TICK_TIMES,
         first_faults=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
         numbers=_numbers(summary),
         config_file=_config_file(record),
-        config=msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode(),
+        config=config_json,
+        # Functions for the template.
+        pretty=with_subscript,
+        in_words=in_words,
     )
 
 

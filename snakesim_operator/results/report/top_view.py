@@ -180,22 +180,30 @@ def _draw_measured_force(contact: WorldContact, view: View, labels: Labels) -> s
 
 
 def _draw_solved_forces(snapshot: Snapshot, view: View, labels: Labels) -> str:
-    """Draw the solved forces and their resultant."""
+    """Draw the controller's desired contact forces and their resultant as arrows, in SVG; empty without any.
+
+    Args:
+        snapshot: The time to draw, with the desired and the measured forces.
+        view: Window of the ground, scale of length and scale of force.
+        labels: Labels of the drawing, which avoid the arrows.
+    """
     balance = snapshot.balance
     if balance is None:
         return ""
     parts: list[str] = []
     contact_classes, resultant_class = balance.force_classes(snapshot.measured_contacts)
     for contact, force_n, class_ in zip(balance.contacts, balance.contact_n, contact_classes, strict=True):
-        foot = view.at(contact.position_w)
-        tip = view.along(foot, force_n, view.force_scale)
-        parts.append(arrow(foot, tip, class_, head=11))
-        labels.keep_off_line(foot, tip, 5)
-    start = view.at(balance.contacts[0].position_w)
-    tip = view.along(start, balance.resultant_n, view.force_scale)
-    labels.keep_off_line(start, tip, 7, 2.0)
-    parts.append(arrow(start, tip, "resultant under", head=14))
-    parts.append(arrow(start, tip, resultant_class, head=14))
+        tail = view.at(contact.position_w)
+        tip = view.along(tail, force_n, view.force_scale)
+        parts.append(arrow(tail, tip, class_, head=11))
+        labels.keep_off_line(tail, tip, 5)
+
+    # The resultant acts through the first push-point. A wider arrow below it separates it from the body.
+    tail = view.at(balance.contacts[0].position_w)
+    tip = view.along(tail, balance.resultant_n, view.force_scale)
+    labels.keep_off_line(tail, tip, 7, 2.0)
+    parts.append(arrow(tail, tip, "resultant under", head=14))
+    parts.append(arrow(tail, tip, resultant_class, head=14))
     return "".join(parts)
 
 
