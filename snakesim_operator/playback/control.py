@@ -100,13 +100,13 @@ def same(a: JointCommand, b: JointCommand) -> bool:
 
 
 def config_of(contents: RecordingContents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
-    """Return the configuration of a recording, with changes.
+    """Return the configuration of a recorded run, with changes.
 
     Args:
         contents: The recording.
-        overrides: The changes.
-        run_recorded_code: Allow a controller or service in a Python file. Otherwise it is refused, unless `overrides`
-            name it.
+        overrides: Changes of the configuration, from the command line.
+        run_recorded_code: Whether a controller or service in a Python file is allowed if only the recording names it.
+            A file that `overrides` names is always allowed.
 
     Raises:
         ConfigError: There is no configuration, it is invalid, or it names Python files that are not allowed.
@@ -116,12 +116,13 @@ def config_of(contents: RecordingContents, overrides: list[Override], *, run_rec
             f"{contents.path}: holds no hal/config, so it is not known which controller was at work",
             code="recording/missing-data",
         )
-    with TemporaryDirectory(prefix="snakesim-") as folder:
+    with TemporaryDirectory(prefix="snakesim-") as folder:  # `load` reads a file
         path = Path(folder) / "config.json"
         path.write_text(contents.config.content)
         config = load(str(path), overrides).config
     if not run_recorded_code:
-        _refuse_recorded_files(contents.path, config, {override.key for override in overrides})
+        overridden_keys = {override.key for override in overrides}
+        _refuse_recorded_files(contents.path, config, overridden_keys)
     return config
 
 
@@ -383,27 +384,29 @@ class Replay:
 def replay_control(
     path: Path, overrides: list[Override], out: Path | None, print_text: PrintLine, *, run_recorded_code: bool = False
 ) -> int:
-    """Replay a recording, and print how the commands differ: `snakesim replay --control`.
+    """Replay a recording through the services, and print how their commands differ from the recorded ones.
 
     Args:
         path: The recording.
         overrides: Changes of its configuration.
-        out: A folder for a run that `compare` reads; None: the replay is not recorded.
+        out: Folder in which the replay is recorded as a run, which `snakesim study compare` reads; None: it is not
+            recorded.
         print_text: Prints a line.
-        run_recorded_code: Allow Python files that only the recording names.
+        run_recorded_code: Whether to allow Python files that only the recording names.
 
     Returns:
-        The exit code. 0: the commands are the same, or a setting was changed; 1: they differ; 3: something is
-        missing in the recording.
+        The exit code. 0: the commands are the same, or a setting was changed. 1: they differ, although nothing was
+        changed and nothing is missing. 3: something is missing in the recording.
 
     Raises:
         ConfigError: The recording cannot be replayed, or `out` holds a recording already.
     """
+    recording_path = None
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
+        recording_path = out / RECORDING
     try:
-        recording = None if out is None else out / RECORDING
-        replay = Replay(path, overrides, recording, run_recorded_code=run_recorded_code)
+        replay = Replay(path, overrides, recording_path, run_recorded_code=run_recorded_code)
     except FileExistsError:
         raise ConfigError(
             f"--out {out}: holds a recording already; choose another folder", code="file/already-exists"
@@ -412,8 +415,10 @@ def replay_control(
     if out is not None:
         write_config(replay.config, out / CONFIG)
         print_text(f"replayed: {out}; `snakesim study compare {path} {out}` shows the difference")
+
     if replay.stopped:
-        print_text(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
+        last_tick = max(comparison.replayed, default=0)
+        print_text(f"replayed up to tick {last_tick} only: {replay.stopped}")
     elif not comparison.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
     are_same = _print_comparison(comparison, replay, print_text)

@@ -40,12 +40,16 @@ class Episode:
 
 
 def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[Episode]:
-    """Read the episodes of several runs.
+    """Read the episodes of several runs and folders of demonstrations.
 
     Args:
-        runs: Folders of runs, recordings, and folders of demonstrations.
-        task: The task of all episodes; None: the one of each run.
+        runs: Folders of runs, recordings, and folders of demonstrations. A folder of demonstrations holds a recording
+            for each episode, and a file of labels with the operator's judgment.
+        task: The task of all episodes in words; None: the task that each run or label names.
         images: Whether to read the pictures of the cameras.
+
+    Returns:
+        The episodes, in the order of `runs`.
 
     Raises:
         ConfigError: A run or its labels cannot be read.
@@ -53,11 +57,13 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
     episodes: list[Episode] = []
     for run in runs:
         labels_path = run / EPISODES
-        if not labels_path.is_file():
+        is_demonstrations = labels_path.is_file()
+        if not is_demonstrations:
             episodes += _read_run(run, task, None, images=images)
             continue
         for label in read_labels(labels_path):
-            episodes += _read_run(run / label.file, task or label.task, label.success, images=images)
+            recording = run / label.file
+            episodes += _read_run(recording, task or label.task, label.success, images=images)
     return episodes
 
 

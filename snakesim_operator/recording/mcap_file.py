@@ -48,7 +48,14 @@ class McapFile:
     """One file. Everything that is added waits for `flush`; only `flush` and `finish` raise OSError."""
 
     def __init__(self, file: GrowingFile) -> None:
-        """Write the beginning of the file. file: an empty one, which the caller closes."""
+        """Write the beginning of an MCAP file: the magic bytes and the header.
+
+        Args:
+            file: An empty file, which the caller closes.
+
+        Raises:
+            OSError: The disk does not take the bytes.
+        """
         self._file = file
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
 

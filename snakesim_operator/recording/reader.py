@@ -73,10 +73,12 @@ class RecordingReader:
         return self.losses.describe()
 
     def read_messages(self, keys: Collection[str] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages of the robot.
+        """Yield the messages that the robot's processes published, in the order of the file.
+
+        Messages that the recorder made for viewers are left out.
 
         Args:
-            keys: Keys to read; a pattern of the key space stands for its keys. None: all keys.
+            keys: Keys to read. A pattern of the key space stands for its keys. None: all keys.
 
         Raises:
             ConfigError: The file is no recording, or cannot be read.
@@ -85,11 +87,12 @@ class RecordingReader:
             if not isinstance(record, Message):
                 continue
             channel = self._channels[record.channel_id]
+            key = channel.topic
             encoding = channel.metadata.get("encoding")
-            if encoding is None:  # a topic made for viewers
+            if encoding is None:  # only messages of the robot have one
                 continue
-            if keys is None or channel.topic in keys or find_row_key(channel.topic) in keys:
-                yield RecordedMessage(channel.topic, record.data, encoding, record.log_time, record.publish_time)
+            if keys is None or key in keys or find_row_key(key) in keys:
+                yield RecordedMessage(key, record.data, encoding, record.log_time, record.publish_time)
 
     def read_records(self) -> Iterator[McapRecord]:
         """Yield every schema, channel, message and metadata that can be read, a channel before its messages.
