@@ -62,6 +62,7 @@ def _add_compare(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim replay` to its parser."""
     add_recording(parser)
     _add_speed(parser, (0.001, 1e6))
     parser.add_argument("--step", action="store_true", help="play one tick at each Enter")

@@ -88,13 +88,13 @@ class BodyMessages:
         self._references = _JointStatesTemplate(JointStates(joints=references))
 
     def fill_transforms(self, angles_rad: Sequence[float], base: Pose | None, time_ns: int) -> FrameTransforms:
-        """Return each link in the frame of the link behind it, and the tail link in the world if that is known.
+        """Return the frame of each link relative to the link behind it, and of the tail link in the world if known.
 
-        The message is valid until the next call, which fills it again.
+        The same message is filled again by the next call, so that the caller must encode it before that.
 
         Args:
-            angles_rad: (n_joints,), tail to head.
-            base: Position and orientation of link 0 in the world; None if unknown.
+            angles_rad: (n_joints,) joint angles, tail to head.
+            base: Position in m and orientation wxyz of the tail link in the world; None if unknown.
             time_ns: Robot time.
         """
         message = self._chain if base is None else self._chain_in_world
@@ -111,12 +111,13 @@ class BodyMessages:
             translation.x, translation.y, translation.z = position_w
             rotation.w, rotation.x, rotation.y, rotation.z = orientation_wxyz
         for frame, angle_rad, is_pitch in zip(frames, angles_rad, self._is_pitch, strict=True):
+            half_angle_rad = 0.5 * angle_rad
             rotation = frame.rotation
-            rotation.w = math.cos(0.5 * angle_rad)
+            rotation.w = math.cos(half_angle_rad)
             if is_pitch:
-                rotation.y = math.sin(0.5 * angle_rad)
+                rotation.y = math.sin(half_angle_rad)
             else:
-                rotation.z = math.sin(0.5 * angle_rad)
+                rotation.z = math.sin(half_angle_rad)
         return message
 
     def encode_joint_states(self, joints: JointState, time_ns: int) -> bytes:

@@ -143,11 +143,11 @@ def parse_chunk(data: bytearray) -> Iterator[McapRecord]:
 
 
 def parse_record(opcode: int, content: memoryview) -> McapRecord:
-    """Decode the content of one record.
+    """Decode the content of one MCAP record.
 
     Args:
-        opcode: MESSAGE, or a key of _RECORD_TYPES.
-        content: The record without its head.
+        opcode: Kind of the record: a message, channel, header, metadata, schema or statistics.
+        content: The bytes behind the record's opcode and length.
 
     Raises:
         DamagedError: The content cannot be read, or is longer than what it holds.
@@ -159,7 +159,8 @@ def parse_record(opcode: int, content: memoryview) -> McapRecord:
         record = _RECORD_TYPES[opcode].read(stream)
     except _UNREADABLE:
         raise DamagedError(f"a record of kind {opcode} that cannot be read") from None
-    if stream.count != len(content):
+    read_bytes = stream.count
+    if read_bytes != len(content):
         raise DamagedError(f"a record of kind {opcode} whose lengths contradict each other")
     return record
 

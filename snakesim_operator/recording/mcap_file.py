@@ -158,7 +158,11 @@ class McapFile:
         self._file.flush()
 
     def _encode_summary(self) -> list[tuple[Opcode, bytes]]:
-        """Return the groups of records of the summary, each with its opcode."""
+        """Return the records of the summary section, encoded and grouped by kind.
+
+        Returns:
+            The groups in the order of the file: the opcode of the records, and their bytes, which may be empty.
+        """
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(self._channels),

@@ -16,26 +16,29 @@ MAX_HAND_OVERS_SHOWN = 8
 
 
 def table(difference: Difference) -> list[str]:
-    """Return the numbers of the page as lines of text."""
-    lines = [
-        _row("", "A", "B"),
-        *_compared(difference),
-        "",
-        *_settings(difference.settings),
-        *filter(None, [difference.drives]),
-        "",
-        f"over {difference.aligned.time_s[-1]:.2f} s from the first arming, {difference.aligned.how}",
-        *_distance(difference),
-        *_hand_overs(difference),
-        "",
-        f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when",
-        *(_gap(gap, difference.joints) for gap in difference.gaps),
-        *_torques_and_tracking(difference),
-        "",
-        *_by_joint(difference),
-        "",
-        *sentences(difference),
-    ]
+    """Return the comparison of two runs as lines of text for a terminal.
+
+    Args:
+        difference: The comparison of the runs A and B.
+
+    Returns:
+        Sections with an empty line between them: the runs, the settings that differ, how far they came, the differences
+        of angles, speeds and torques, a row for each joint, and sentences that sum up.
+    """
+    common_s = difference.aligned.time_s[-1]
+    gap_heading = f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when"
+    lines = [_row("", "A", "B"), *_compared(difference)]
+    lines += ["", *_settings(difference.settings)]
+    if difference.drives:
+        lines.append(difference.drives)
+    lines += ["", f"over {common_s:.2f} s from the first arming, {difference.aligned.how}"]
+    lines += _distance(difference)
+    lines += _hand_overs(difference)
+    lines += ["", gap_heading]
+    lines += [_gap(gap, difference.joints) for gap in difference.gaps]
+    lines += _torques_and_tracking(difference)
+    lines += ["", *_by_joint(difference)]
+    lines += ["", *sentences(difference)]
     return [line.rstrip() for line in lines]
 
 

@@ -30,24 +30,31 @@ class Effort:
 
     @staticmethod
     def from_run(record: RunRecord, advance: Advance | None, *, has_power: bool) -> "Effort":
-        """Compute the effort of a run.
+        """Compute how fast a run advanced along its route, and at what effort.
 
         Args:
-            record: What was recorded of the run.
+            record: The recorded run.
             advance: How the run advanced; None: the pose is unknown.
-            has_power: Whether torques and speeds are known.
+            has_power: Whether torques and speeds are known, so that the energy can be computed.
+
+        Returns:
+            The values; None where they are unknown, which is all of them without a pose.
         """
         if advance is None or advance.until_s <= 0:
             return Effort()
+        cost_of_transport = None
+        if has_power:
+            cost_of_transport = _cost_of_transport(record, advance)
+        # Dragging the robot over flat ground costs its weight times the friction: compare with that.
+        propulsive_efficiency = None
         ground = record.config.scene.ground
-        transport = _cost_of_transport(record, advance) if has_power else None
-        efficiency = None
-        if transport is not None and transport > 0 and ground.heightfield is None:
-            efficiency = ground.friction / transport
+        is_flat = ground.heightfield is None
+        if cost_of_transport is not None and cost_of_transport > 0 and is_flat:
+            propulsive_efficiency = ground.friction / cost_of_transport
         return Effort(
             body_lengths_s=advance.reached_m / advance.until_s / _body_length_m(record),
-            cost_of_transport=transport,
-            propulsive_efficiency=efficiency,
+            cost_of_transport=cost_of_transport,
+            propulsive_efficiency=propulsive_efficiency,
             jam_ratio=min(advance.stalled_s / advance.until_s, 1.0),
             impulse_n_s_per_m=_impulse_n_s_per_m(record, advance),
             torque_headroom=_torque_headroom(record, advance),
