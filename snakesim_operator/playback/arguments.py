@@ -62,6 +62,7 @@ def _add_compare(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim replay` to its parser."""
     add_recording(parser)
     _add_speed(parser, (0.001, 1e6))
     parser.add_argument("--step", action="store_true", help="play one tick at each Enter")
@@ -176,6 +177,17 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    """Run `snakesim replay`: publish the messages of a recording, or with `--control` run the services on its sensors.
+
+    Args:
+        arguments: The parsed options of the command.
+
+    Returns:
+        The exit code; 130 if the user interrupts the command.
+
+    Raises:
+        ConfigError: The recording cannot be read, or options contradict each other.
+    """
     from snakesim_hal.model.scenario import Override, parse_set
     from snakesim_operator.playback.control import replay_control
     from snakesim_operator.playback.play import play
@@ -186,9 +198,10 @@ def _replay(arguments: argparse.Namespace) -> int:
         overrides = [parse_set(text) for text in arguments.set]
         if arguments.controller is not None:
             overrides.append(Override("controller", arguments.controller, "--controller"))
-        trusted = arguments.run_recorded_code
-        return replay_control(path, overrides, arguments.out, print_line, run_recorded_code=trusted)
-    if arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code:
+        return replay_control(path, overrides, arguments.out, print_line, run_recorded_code=arguments.run_recorded_code)
+
+    has_control_option = arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code
+    if has_control_option:
         raise ConfigError(
             "--set, --controller, --run-recorded-code and --out are for --control, which runs the services; add it, or "
             "leave them out",

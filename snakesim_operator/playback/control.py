@@ -100,13 +100,13 @@ def same(a: JointCommand, b: JointCommand) -> bool:
 
 
 def config_of(contents: RecordingContents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
-    """Return the configuration of a recording, with changes.
+    """Return the configuration of a recorded run, with changes.
 
     Args:
         contents: The recording.
-        overrides: The changes.
-        run_recorded_code: Allow a controller or service in a Python file. Otherwise it is refused, unless `overrides`
-            name it.
+        overrides: Changes of the configuration, from the command line.
+        run_recorded_code: Whether a controller or service in a Python file is allowed if only the recording names it.
+            A file that `overrides` names is always allowed.
 
     Raises:
         ConfigError: There is no configuration, it is invalid, or it names Python files that are not allowed.
@@ -116,36 +116,43 @@ def config_of(contents: RecordingContents, overrides: list[Override], *, run_rec
             f"{contents.path}: holds no hal/config, so it is not known which controller was at work",
             code="recording/missing-data",
         )
-    with TemporaryDirectory(prefix="snakesim-") as folder:
+    with TemporaryDirectory(prefix="snakesim-") as folder:  # `load` reads a file
         path = Path(folder) / "config.json"
         path.write_text(contents.config.content)
         config = load(str(path), overrides).config
     if not run_recorded_code:
-        _refuse_recorded_files(contents.path, config, {override.key for override in overrides})
+        overridden_keys = {override.key for override in overrides}
+        _refuse_recorded_files(contents.path, config, overridden_keys)
     return config
 
 
 def _refuse_recorded_files(path: Path, config: RunConfig, overridden: set[str]) -> None:
-    """Raise ConfigError for a Python file that only the recording names.
+    """Refuse to run a Python file that only the recording names, because its source may be untrusted.
 
-    Backend and other services are not replayed, so their files do not run.
+    Files of the backend and of services that are not replayed do not run, so they are not checked.
 
     Args:
-        path: The recording.
-        config: Its configuration, with the changes of the command line.
-        overridden: Keys that the command line sets.
+        path: The recording, for the message.
+        config: Configuration of the recording, with the changes of the command line.
+        overridden: Keys of the configuration that the command line sets, which are trusted.
+
+    Raises:
+        ConfigError: The controller or a replayed service is in a Python file that the command line does not name.
     """
-    named = [("controller", "--controller ", "its controller", config.controller)]
-    for name in SERVICE_OUTPUTS:
-        key = f"services.{name}.plugin"
-        code = config.services[name].plugin if name in config.own_services else ""
-        named.append((key, f"--set {key}=", f"its service {name}", code))
-    for key, flag, what, code in named:
-        if in_file(code) and key not in overridden:
+    # Each plugin that would run: its key, the option that sets it, its role in words, and its name or file.
+    plugins = [("controller", "--controller ", "its controller", config.controller)]
+    for service in SERVICE_OUTPUTS:
+        key = f"services.{service}.plugin"
+        plugin = ""
+        if service in config.own_services:
+            plugin = config.services[service].plugin
+        plugins.append((key, f"--set {key}=", f"its service {service}", plugin))
+    for key, option, role, plugin in plugins:
+        if in_file(plugin) and key not in overridden:
             raise ConfigError(
-                f"{path}: the recording names {shorten(code)!r} as {what}, and would have that Python file run on this "
-                f"computer. If you trust the file, name it yourself, with {flag}{shorten(code)}, or run what the "
-                f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME",
+                f"{path}: the recording names {shorten(plugin)!r} as {role}, and would have that Python file run on "
+                f"this computer. If you trust the file, name it yourself, with {option}{shorten(plugin)}, or run what "
+                f"the recording names with --run-recorded-code; else choose an installed one with {option}NAME",
                 code="recording/untrusted-code",
             )
 
@@ -211,11 +218,18 @@ class Replay:
         self._pending_changes: list[tuple[ControlParameters, LocalQuery]] = []  # without an answer yet
 
     def run(self) -> Comparison:
-        """Replay the whole recording. Raises SnakesimError if a service fails."""
-        with ExitStack() as opened:
-            opened.enter_context(threadpool_limits(1))  # as in the run
+        """Replay the whole recording through the services, and return how their commands compare.
+
+        If the recording is incomplete, a service may fail because a message is missing. The replay then stops there,
+        and `stopped` has the reason.
+
+        Raises:
+            SnakesimError: A service failed, although the recording is complete.
+        """
+        with ExitStack() as stack:
+            stack.enter_context(threadpool_limits(1))  # as in the run, for the same rounding
             if self._recording is not None:
-                opened.callback(self._recording.close, {"replay_of": str(self._path)})
+                stack.callback(self._recording.close, {"replay_of": str(self._path)})
                 for row in keys.SPACE:
                     self._session.on_latched_arrival(row.key, self._recording.write_arrival)
             self._session.on_query(keys.LEASE, self._grant_lease)
@@ -223,7 +237,7 @@ class Replay:
             self._publish_description()
             for name in self._services:
                 loop = ServiceLoop(find_service(self.config, name), self.config, self._network.session())
-                opened.callback(loop.close)
+                stack.callback(loop.close)
                 self._loops.append(loop)
             try:
                 self._replay_messages()
@@ -232,7 +246,8 @@ class Replay:
                 if not self.missing:
                     raise
                 self.stopped = str(error)  # a service waits for a message that is lost
-                self.comparison.ignore_after(max(self.comparison.replayed, default=-1))
+                last_replayed_tick = max(self.comparison.replayed, default=-1)
+                self.comparison.ignore_after(last_replayed_tick)
         return self.comparison
 
     def _publish_description(self) -> None:
@@ -248,48 +263,65 @@ class Replay:
                 self._recording.flush_when_due()
 
     def _replay_message(self, recorded: RecordedMessage) -> None:
-        """Publish a recorded message, unless a replayed service publishes it; at a clock, let the services act."""
-        message_type = keys.find_message(recorded.key)
+        """Publish a recorded message for the services, and let them act if it is a clock.
+
+        Not published are messages that the replayed services publish themselves, and configuration and description,
+        which were published at the start. Recorded commands are kept for the comparison. Recorded changes of the
+        controller's parameters are requested again.
+
+        Args:
+            recorded: The next message of the recording, in order of robot time.
+        """
+        key = recorded.key
+        message_type = keys.find_message(key)
         if message_type is None or recorded.encoding != format_encoding(message_type):
-            return  # from an unknown node
+            return  # it came from an unknown node
         self._now_ns = recorded.time_ns
-        if recorded.key == keys.JOINT_COMMAND:
+        is_service_output = key in self._output_keys
+        if key == keys.JOINT_COMMAND:
             command = self._command_decoder.decode(recorded.payload, recorded.encoding)
             self.comparison.recorded[command.tick] = command
             self._recorded_by_sequence[command.sequence] = command
-        if recorded.key == keys.PARAMETERS_IN_FORCE and recorded.key in self._output_keys:
-            self._change_parameters(self._parameters_decoder.decode(recorded.payload, recorded.encoding))
-        if recorded.key in self._output_keys or recorded.key in (keys.CONFIG, keys.DESCRIPTION):
+        if key == keys.PARAMETERS_IN_FORCE and is_service_output:
+            parameters = self._parameters_decoder.decode(recorded.payload, recorded.encoding)
+            self._change_parameters(parameters)
+        if is_service_output or key in (keys.CONFIG, keys.DESCRIPTION):
             return
+
         payload = recorded.payload
-        if recorded.key == keys.APPLIED and "control" in self._services:
+        if key == keys.APPLIED and "control" in self._services:
             payload = self._applied_payload(recorded)
-        publisher = self._publishers.get(recorded.key)
+        publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._session.publisher(recorded.key, message_type)
-            self._publishers[recorded.key] = publisher
+            publisher = self._session.publisher(key, message_type)
+            self._publishers[key] = publisher
         publisher.send(payload)
-        if recorded.key == keys.CLOCK:
+        if key == keys.CLOCK:
             self._act()
 
     def _act(self) -> None:
-        """Let every service act on the newest clock, and check the answers to changes of parameters."""
+        """Let every service act on the newest clock, then check the answers to requested changes of parameters.
+
+        Raises:
+            ConfigError: The controller rejected a change that the recording holds.
+        """
         if not self._joined:
             for loop in self._loops:
                 loop.join()
             self._joined = True
         for loop in self._loops:
             loop.act()
-        for change, query in [*self._pending_changes]:
+        unanswered: list[tuple[ControlParameters, LocalQuery]] = []
+        for change, query in self._pending_changes:
             answer = query.answered()
             if answer is None:
-                continue
-            self._pending_changes.remove((change, query))
-            if not answer.ok:
+                unanswered.append((change, query))
+            elif not answer.ok:
                 raise ConfigError(
                     f"{self._path}: what {change.requester} set at tick {change.tick}: {answer.reason}",
                     code="controller/unknown-parameter",
                 )
+        self._pending_changes = unanswered
 
     def _change_parameters(self, recorded: ControlParameters) -> None:
         """Change the parameters of the controller as in the recording, where they come before their tick's clock.
@@ -308,9 +340,16 @@ class Replay:
         self._pending_changes.append((recorded, self._session.send_query(keys.PARAMETERS, request)))
 
     def _applied_payload(self, recorded: RecordedMessage) -> bytes:
-        """Return the setpoints that the host would have applied.
+        """Return the applied setpoints that the host would have published after the replayed commands.
 
-        They are those of the recording where the command is the same; else the replayed command, without limits.
+        If the replayed command is the same as the recorded one, or if either is unknown, these are the recorded
+        setpoints. Otherwise they are those of the replayed command, without the limits of the command limiter.
+
+        Args:
+            recorded: The recorded message at `hal/applied`.
+
+        Returns:
+            The message as encoded bytes.
         """
         applied = self._applied_decoder.decode(recorded.payload, recorded.encoding)
         recorded_command = self._recorded_by_sequence.get(applied.sequence or -1)
@@ -319,15 +358,17 @@ class Replay:
         replayed_command = self.comparison.replayed.get(recorded_command.tick)
         if replayed_command is None or same(recorded_command, replayed_command):
             return recorded.payload
-        limits = replayed_command.torque_limit_nm or [joint.torque_limit_nm for joint in self.robot.joints]
-        changed = msgspec.structs.replace(
+        torque_limits_nm = replayed_command.torque_limit_nm
+        if not torque_limits_nm:
+            torque_limits_nm = [joint.torque_limit_nm for joint in self.robot.joints]
+        replayed_applied = msgspec.structs.replace(
             applied,
             mode=replayed_command.mode,
             target=replayed_command.target,
-            torque_limit_nm=limits,
+            torque_limit_nm=torque_limits_nm,
             limited={},
         )
-        return encode(changed)
+        return encode(replayed_applied)
 
     def _keep_command(self, arrival: Arrival) -> None:
         command = self._command_decoder.decode(arrival.payload, arrival.encoding)
@@ -343,27 +384,29 @@ class Replay:
 def replay_control(
     path: Path, overrides: list[Override], out: Path | None, print_text: PrintLine, *, run_recorded_code: bool = False
 ) -> int:
-    """Replay a recording, and print how the commands differ: `snakesim replay --control`.
+    """Replay a recording through the services, and print how their commands differ from the recorded ones.
 
     Args:
         path: The recording.
         overrides: Changes of its configuration.
-        out: A folder for a run that `compare` reads; None: the replay is not recorded.
+        out: Folder in which the replay is recorded as a run, which `snakesim study compare` reads; None: it is not
+            recorded.
         print_text: Prints a line.
-        run_recorded_code: Allow Python files that only the recording names.
+        run_recorded_code: Whether to allow Python files that only the recording names.
 
     Returns:
-        The exit code. 0: the commands are the same, or a setting was changed; 1: they differ; 3: something is
-        missing in the recording.
+        The exit code. 0: the commands are the same, or a setting was changed. 1: they differ, although nothing was
+        changed and nothing is missing. 3: something is missing in the recording.
 
     Raises:
         ConfigError: The recording cannot be replayed, or `out` holds a recording already.
     """
+    recording_path = None
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
+        recording_path = out / RECORDING
     try:
-        recording = None if out is None else out / RECORDING
-        replay = Replay(path, overrides, recording, run_recorded_code=run_recorded_code)
+        replay = Replay(path, overrides, recording_path, run_recorded_code=run_recorded_code)
     except FileExistsError:
         raise ConfigError(
             f"--out {out}: holds a recording already; choose another folder", code="file/already-exists"
@@ -372,8 +415,10 @@ def replay_control(
     if out is not None:
         write_config(replay.config, out / CONFIG)
         print_text(f"replayed: {out}; `snakesim study compare {path} {out}` shows the difference")
+
     if replay.stopped:
-        print_text(f"replayed up to tick {max(comparison.replayed, default=0)} only: {replay.stopped}")
+        last_tick = max(comparison.replayed, default=0)
+        print_text(f"replayed up to tick {last_tick} only: {replay.stopped}")
     elif not comparison.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
     are_same = _print_comparison(comparison, replay, print_text)

@@ -76,16 +76,18 @@ class _Keyboard:
 
 
 def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
-    """Record episodes until q, or the end of the input.
+    """Record episodes that an operator demonstrates, until the operator types q or the input ends.
+
+    A full disk ends the command as well. A stop signal counts as the end of the input.
 
     Args:
-        where: Which robot to address.
-        folder: Where the recordings go.
+        where: Which robot to record.
+        folder: Folder for the recordings; it is created if it does not exist.
         task: The task that the operator demonstrates, in words.
         lines: Lines that the operator types.
 
     Returns:
-        The exit code: 1 if the disk was full.
+        The exit code: 1 if the disk was full, otherwise 0.
 
     Raises:
         SnakesimError: The robot cannot be recorded.
@@ -98,7 +100,7 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     print_line(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {HELP}")
     try:
         while not demonstrations.failure:
-            keyboard.next_line()
+            keyboard.next_line()  # Enter begins an episode
             demonstrations.record_episode()
     except _InputEnded:
         pass
@@ -124,23 +126,31 @@ class _Demonstrations:
         self.failure = ""
 
     def record_episode(self) -> None:
-        """Record from now to Enter, and keep the episode unless the operator drops it. Raises _InputEnded."""
+        """Record one episode until Enter, and keep it unless the operator drops it.
+
+        The file is deleted if the operator drops the episode, if the input ends, or if recording fails.
+
+        Raises:
+            _InputEnded: The operator ended the command before judging the episode.
+        """
         path = self._free_path()
         began = datetime.now(UTC).isoformat(timespec="seconds")
         print_line(f"{path.name}: recording; Enter ends it")
-        success = None
+        success = None  # as judged by the operator; None: drop the episode
         try:
             recorder = record_to_file(self._link, path, lambda: not self._keyboard.take_line())
             self.failure = recorder.recording.failure
             if not self.failure:
-                print_line(f"{path.name}: {recorder.recording.counts.total()} messages. s, f or d?")
+                message_count = recorder.recording.counts.total()
+                print_line(f"{path.name}: {message_count} messages. s, f or d?")
                 success = self._read_judgment()
         finally:
             if success is None:
                 path.unlink(missing_ok=True)
                 print_line(f"{path.name}: dropped")
         if success is not None:
-            self._keep(EpisodeLabel(file=path.name, task=self._task, success=success, who=get_user_name(), began=began))
+            label = EpisodeLabel(file=path.name, task=self._task, success=success, who=get_user_name(), began=began)
+            self._keep(label)
 
     def _free_path(self) -> Path:
         """Return the first numbered path at which no recording is yet."""

@@ -40,12 +40,16 @@ class Episode:
 
 
 def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[Episode]:
-    """Read the episodes of several runs.
+    """Read the episodes of several runs and folders of demonstrations.
 
     Args:
-        runs: Folders of runs, recordings, and folders of demonstrations.
-        task: The task of all episodes; None: the one of each run.
+        runs: Folders of runs, recordings, and folders of demonstrations. A folder of demonstrations holds a recording
+            for each episode, and a file of labels with the operator's judgment.
+        task: The task of all episodes in words; None: the task that each run or label names.
         images: Whether to read the pictures of the cameras.
+
+    Returns:
+        The episodes, in the order of `runs`.
 
     Raises:
         ConfigError: A run or its labels cannot be read.
@@ -53,11 +57,13 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
     episodes: list[Episode] = []
     for run in runs:
         labels_path = run / EPISODES
-        if not labels_path.is_file():
+        is_demonstrations = labels_path.is_file()
+        if not is_demonstrations:
             episodes += _read_run(run, task, None, images=images)
             continue
         for label in read_labels(labels_path):
-            episodes += _read_run(run / label.file, task or label.task, label.success, images=images)
+            recording = run / label.file
+            episodes += _read_run(recording, task or label.task, label.success, images=images)
     return episodes
 
 
@@ -88,13 +94,17 @@ def read_labels(path: Path) -> list[EpisodeLabel]:
 
 
 def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:
-    """Return the episodes of one run: one, and one more for each gap.
+    """Read the episodes of one run. A gap in the record ends an episode and begins the next one.
 
     Args:
-        run: Folder or recording.
-        task: The task; None: the scenario.
-        success: The operator's label; None: success is that the run reached its goal.
+        run: Folder of a run, or a recording.
+        task: The task in words; None: the name of the scenario.
+        success: The operator's label; None: the run succeeded if it reached its goal.
         images: Whether to read the pictures of the cameras.
+
+    Returns:
+        The episodes in order of time. If the run succeeded, only the last one counts as a success. A run that was
+        never armed has one episode without rows.
     """
     record = RunRecord.load(run)
     reward_m = None
@@ -106,17 +116,19 @@ def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool
     pictures: dict[str, Pictures] = {}
     if images:
         pictures = read_pictures(find_recording(run))
+
     stretches = record.stretches
     if not stretches:  # the robot was never armed
         stretches = [np.arange(0)]
     episodes: list[Episode] = []
     for number, rows in enumerate(stretches):
+        is_first = number == 0
         is_last = number == len(stretches) - 1
         episode_success = success
         if success and not is_last:  # it ended at a gap, not at the goal
             episode_success = False
         pictures_after_tick = -1
-        if number > 0:
+        if not is_first:  # pictures from before the gap do not show this episode
             pictures_after_tick = int(record.ticks[rows[0] - 1])
         episode = Episode(
             record=record,

@@ -59,16 +59,16 @@ UNITS = {
 
 
 def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine) -> int:
-    """Write a run in a format.
+    """Write one run as a file in another format.
 
     Args:
         runs: The run, as the only item.
-        form: "csv", "parquet", "npz" or "mcap".
+        form: Format of the file: "csv", "parquet" or "npz" for a row each tick, "mcap" for a recording.
         out: The file; None: beside the recording.
         print_text: Prints a line.
 
     Returns:
-        The exit code.
+        The exit code: 3 if the run is incomplete, otherwise 0.
 
     Raises:
         ConfigError: There are several runs, the run cannot be read, or the file cannot be written.
@@ -82,9 +82,10 @@ def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintL
     path = _reserve(out or _default_path(run, form))
     if form == "mcap":
         with exported(path) as partial:
-            count, missing = recover_recording(find_recording(run), partial)
-        print_text(f"{count} messages: {path}")
+            message_count, missing = recover_recording(find_recording(run), partial)
+        print_text(f"{message_count} messages: {path}")
         return exit_code(run, missing)
+
     record = RunRecord.load(run)
     with exported(path) as partial:
         match form:
@@ -94,7 +95,9 @@ def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintL
                 _write_csv(table(record), partial, record.missing)
             case _:
                 columns = {name: values.tolist() for name, values in table(record).items()}
-                metadata = {MISSING: json.dumps(record.missing).encode()} if record.missing else None
+                metadata = None
+                if record.missing:
+                    metadata = {MISSING: json.dumps(record.missing).encode()}
                 write_parquet(columns, partial, metadata)
     print_text(f"{len(record.time_s)} ticks: {path}")
     return exit_code(run, record.missing)
@@ -103,18 +106,18 @@ def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintL
 def export_dataset(
     runs: Sequence[Path], out: Path | None, print_text: PrintLine, *, images: bool, task: str | None, fps: float | None
 ) -> int:
-    """Write a LeRobot dataset: an episode for each run or demonstration, and one more for each gap.
+    """Write runs as a LeRobot dataset: an episode for each run or demonstration, and one more for each gap in it.
 
     Args:
         runs: Folders of runs or demonstrations, or recordings.
         out: Folder of the dataset; None: beside the first run.
         print_text: Prints a line.
         images: Whether the pictures of the cameras are included.
-        task: The task of all episodes; None: the one of each run.
-        fps: Frames a second; None: the robot's rate.
+        task: The task of all episodes in words; None: the task that each run names.
+        fps: Frames per second; None: the robot's rate.
 
     Returns:
-        The exit code.
+        The exit code: 3 if a run is incomplete, otherwise 0.
 
     Raises:
         ConfigError: A run cannot be read, the runs do not fit together, or the folder cannot be written.
@@ -126,7 +129,8 @@ def export_dataset(
     for sentence in describe_gaps(episodes):
         print_text(sentence)
     print_text(f"{size.episodes} episodes, {size.frames} frames: {path}")
-    return max(exit_code(episode.record.folder, episode.record.missing) for episode in episodes)
+    codes = [exit_code(episode.record.folder, episode.record.missing) for episode in episodes]
+    return max(codes)
 
 
 def _reserve(path: Path) -> Path:

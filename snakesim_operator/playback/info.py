@@ -181,27 +181,42 @@ def _key_numbers(key_info: KeyInfo, *, is_regular: bool) -> dict[str, float]:
 
 
 def show_recording(path: Path, print_text: PrintLine, *, as_json: bool = False) -> int:
-    """Print what a recording holds, and return the exit code: 3 if it is incomplete."""
+    """Print what a recording holds: the run, changes of parameters, messages by key, and missing data.
+
+    Args:
+        path: The recording, or the folder of a run that has one.
+        print_text: Prints a line.
+        as_json: Print one JSON object instead of lines for people.
+
+    Returns:
+        The exit code: 3 if the recording is incomplete, otherwise 0.
+    """
     info = inspect_recording(find_recording(path))
     if as_json:
         print_text(msgspec.json.encode(info).decode())
         return exit_code(path, info.missing)
+
     print_text(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
-    print_text(
-        f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.clock_mode or 'unknown'}"
-    )
+    robot = info.robot or "unknown"
+    backend = info.backend or "unknown"
+    print_text(f"  robot     {robot}, backend {backend}, {info.clock_mode or 'unknown'}")
     print_text(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     print_text(f"  ended     {info.lifecycle or 'unknown'}")
-    digest = format_digest(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
-    of_what = " of these ticks alone" if info.missing else ""
-    print_text(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
+    digest = "none"
+    if info.command_digest:
+        digest = format_digest(info.command_digest, info.own_arithmetic)
+    digest_note = " of these ticks alone" if info.missing else ""
+    print_text(f"  commands  {info.ticks} ticks applied, digest {digest}{digest_note}")
+
     for change in info.parameter_changes:
-        changes = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
-        print_text(f"  set       at {change.time_s:.2f} s by {change.requester}: {changes}")
+        changed = [f"{name}: {before} -> {after}" for name, (before, after) in change.changed.items()]
+        print_text(f"  set       at {change.time_s:.2f} s by {change.requester}: {', '.join(changed)}")
+
     print_text(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
-    for key, one in info.keys.items():
-        mean = one["bytes"] / one["count"]
-        print_text(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
+    for key, numbers in info.keys.items():
+        mean_bytes = numbers["bytes"] / numbers["count"]
+        count_and_rate = f"{numbers['count']:>9.0f}{numbers['rate_hz']:>8.1f} Hz"
+        print_text(f"  {key:<26}{count_and_rate}{mean_bytes:>10.0f} B{numbers['gaps']:>7.0f}")
     for sentence in info.missing:
         print_text(f"  missing: {sentence}")
     return exit_code(path, info.missing)

@@ -58,32 +58,41 @@ class DatasetSize:
 def write_lerobot(
     episodes: Sequence[Episode], folder: Path, write_table: WriteTable, fps: float | None = None
 ) -> DatasetSize:
-    """Writes the dataset.
+    """Write episodes as a LeRobot dataset.
 
     Args:
         episodes: Runs, or parts of runs between gaps.
-        folder: Where the dataset goes.
-        write_table: Writes columns as Parquet, with metadata of the schema.
-        fps: Frames a second, a whole fraction of the robot's rate; None: that rate.
+        folder: Folder of the dataset.
+        write_table: Writes columns as a Parquet file, with metadata of its schema.
+        fps: Frames per second, a divisor of the robot's rate; None: the robot's rate.
+
+    Returns:
+        The number of episodes and frames that were written. Episodes without a frame are left out.
 
     Raises:
-        ConfigError: The runs do not fit together.
+        ConfigError: The runs do not fit together, or a run has no frame.
     """
-    robot_hz = _common_rate_hz([one.record for one in episodes])
-    step = _step(robot_hz, fps)
+    robot_hz = _common_rate_hz([episode.record for episode in episodes])
+    ticks_per_frame = _step(robot_hz, fps)
     content = _Content.from_episodes(episodes)
-    chosen = [(episode, *_rows(episode, content, step)) for episode in episodes]
-    non_empty = [(episode, rows, shown) for episode, rows, shown in chosen if len(rows)]
+    dataset = _Dataset(folder, write_table, content, seconds_per_frame=ticks_per_frame / robot_hz)
+
+    frames_by_episode = [_rows(episode, content, ticks_per_frame) for episode in episodes]
+    folders_with_frames: set[Path] = set()
+    for episode, (rows, _) in zip(episodes, frames_by_episode, strict=True):
+        if len(rows):
+            folders_with_frames.add(episode.record.folder)
     for episode in episodes:
-        if not any(one.record is episode.record for one, _, _ in non_empty):
+        if episode.record.folder not in folders_with_frames:
             raise ConfigError(
                 f"{episode.record.folder}: no picture came while it was armed; export it without --images",
                 code="recording/missing-data",
             )
-    dataset = _Dataset(folder, write_table, content, seconds_per_frame=step / robot_hz)
-    for episode, rows, shown in non_empty:
-        dataset.add(episode, rows, shown)
-    dataset.finish(_info(episodes[0], content, robot_hz // step))
+
+    for episode, (rows, picture_numbers) in zip(episodes, frames_by_episode, strict=True):
+        if len(rows):
+            dataset.add(episode, rows, picture_numbers)
+    dataset.finish(_info(episodes[0], content, robot_hz // ticks_per_frame))
     return DatasetSize(len(dataset.rows), dataset.frame_count)
 
 
@@ -151,21 +160,33 @@ class _Dataset:
         self.frame_count += count
 
     def finish(self, info: dict[str, Any]) -> None:
-        """Writes everything that is of all episodes. info: the features."""
+        """Write the files about the dataset as a whole: episodes, tasks, statistics, missing data and info.
+
+        Args:
+            info: Content of `meta/info.json` without the totals, which are added.
+        """
         episode_columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
         self._write_table(episode_columns, self._folder / EPISODES, None)
+
         task_columns = {"task_index": list(range(len(self._tasks))), INDEX: self._tasks}
-        metadata = {b"pandas": json.dumps(_PANDAS).encode()}
-        self._write_table(task_columns, self._folder / "meta" / "tasks.parquet", metadata)
+        task_metadata = {b"pandas": json.dumps(_PANDAS).encode()}
+        self._write_table(task_columns, self._folder / "meta" / "tasks.parquet", task_metadata)
+
         statistics: dict[str, Statistics] = {}
         for name in self._frames[0]:
-            statistics[name] = compute_feature_statistics(np.concatenate([frames[name] for frames in self._frames]))
+            values = np.concatenate([frames[name] for frames in self._frames])
+            statistics[name] = compute_feature_statistics(values)
         for camera, parts in self._picture_statistics.items():
             statistics[IMAGES + camera] = merge_picture_statistics(parts)
         self._write_json("meta/stats.json", statistics)
-        missing = {number: record.missing for number, record in enumerate(self._records) if record.missing}
-        if missing:
-            self._write_json(MISSING, missing)
+
+        missing_by_episode: dict[int, list[str]] = {}
+        for number, record in enumerate(self._records):
+            if record.missing:
+                missing_by_episode[number] = record.missing
+        if missing_by_episode:
+            self._write_json(MISSING, missing_by_episode)
+
         totals = {
             "total_episodes": len(self.rows),
             "total_frames": self.frame_count,
@@ -229,23 +250,34 @@ def _step(robot_hz: int, fps: float | None) -> int:
 
 
 def _rows(episode: Episode, content: _Content, step: int) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
-    """Returns the rows that become frames, and by camera the number of its newest picture at each of them.
+    """Select the rows of an episode that become frames, and the newest picture of each camera at each frame.
 
-    They begin where every camera has shown something; no row if a camera never does.
+    The frames begin at the first row at which every camera has taken a picture during this episode.
+
+    Args:
+        episode: The episode; its rows are indices into the record of the run.
+        content: What the dataset holds, with the names of its cameras.
+        step: Number of ticks from frame to frame.
+
+    Returns:
+        rows: (frames,) rows of the record; empty if a camera has no picture.
+        picture_numbers: For each camera, (frames,) the index of the picture that the frame shows.
     """
     ticks = episode.record.ticks[episode.rows]
-    every_camera_has_shown = np.ones(len(ticks), dtype=bool)
-    newest: dict[str, NDArray[np.int64]] = {}
+    has_all_pictures = np.ones(len(ticks), dtype=bool)
+    newest_pictures: dict[str, NDArray[np.int64]] = {}
     for camera in content.cameras:
         picture_ticks = np.array(episode.pictures[camera].ticks)
-        newest[camera] = np.searchsorted(picture_ticks, ticks, side="right") - 1
-        too_old = int(np.searchsorted(picture_ticks, episode.pictures_after_tick, side="right"))
-        every_camera_has_shown &= newest[camera] >= too_old
-    if not every_camera_has_shown.any():
+        newest = np.searchsorted(picture_ticks, ticks, side="right") - 1
+        # Pictures up to this tick were taken before the gap in front of the episode.
+        first_usable = int(np.searchsorted(picture_ticks, episode.pictures_after_tick, side="right"))
+        has_all_pictures &= newest >= first_usable
+        newest_pictures[camera] = newest
+    if not has_all_pictures.any():
         return episode.rows[:0], {}
-    first = int(np.argmax(every_camera_has_shown))
-    shown = {camera: numbers[first::step] for camera, numbers in newest.items()}
-    return episode.rows[first::step], shown
+    first = int(np.argmax(has_all_pictures))
+    picture_numbers = {camera: newest[first::step] for camera, newest in newest_pictures.items()}
+    return episode.rows[first::step], picture_numbers
 
 
 def _common_rate_hz(records: Sequence[RunRecord]) -> int:
@@ -268,20 +300,34 @@ def _common_rate_hz(records: Sequence[RunRecord]) -> int:
 
 
 def _info(episode: Episode, content: _Content, fps: int) -> dict[str, Any]:
-    features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [len(names)], "names": names}
-        for name, names in _names(episode.record, posed=content.posed).items()
-    }
+    """Return the content of `meta/info.json` in a LeRobot dataset, without the totals.
+
+    Args:
+        episode: Any episode of the dataset, for the names of robot and joints.
+        content: What is known of every episode, and therefore becomes a feature.
+        fps: Frames per second.
+    """
+    features: dict[str, Any] = {}
+    for feature, names in _names(episode.record, posed=content.posed).items():
+        features[feature] = {"dtype": "float32", "shape": [len(names)], "names": names}
     for camera, (width, height) in content.cameras.items():
-        shape = {"shape": [height, width, 3], "names": ["height", "width", "channels"]}
-        features[IMAGES + camera] = {"dtype": "image", **shape}
-    scalar_types = {"timestamp": "float32", **dict.fromkeys(COUNTED, "int64"), "next.done": "bool"}
+        features[IMAGES + camera] = {
+            "dtype": "image",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+        }
+
+    scalar_types = {"timestamp": "float32"}
+    for feature in COUNTED:
+        scalar_types[feature] = "int64"
+    scalar_types["next.done"] = "bool"
     if content.rewarded:
         scalar_types["next.reward"] = "float32"
     if content.judged:
         scalar_types["next.success"] = "bool"
-    for name, dtype in scalar_types.items():
-        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    for feature, dtype in scalar_types.items():
+        features[feature] = {"dtype": dtype, "shape": [1], "names": None}
+
     return {
         "codebase_version": VERSION,
         "robot_type": episode.record.description.robot,

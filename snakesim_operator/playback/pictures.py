@@ -46,11 +46,18 @@ class Pictures:
 
 
 def read_pictures(path: Path) -> dict[str, Pictures]:
-    """Read the pictures of a recording by camera: `head` or `head_depth`.
+    """Read the pictures of a recording.
 
-    Pictures are left out if they are damaged, older than the one before, or of another size than the camera's first.
+    Pictures are left out if they are damaged, if they are not newer than the one before, or if their size differs from
+    the camera's first.
+
+    Args:
+        path: The recording.
+
+    Returns:
+        Pictures by camera. A camera `head` has its color images at `head`, and its depth images at `head_depth`.
     """
-    by_camera: dict[str, Pictures] = {}
+    pictures_by_camera: dict[str, Pictures] = {}
     for recorded in RecordingReader(path).read_messages((keys.COLOR_ALL, keys.DEPTH_ALL)):
         _, kind, name = recorded.key.split("/")
         try:
@@ -58,12 +65,14 @@ def read_pictures(path: Path) -> dict[str, Pictures]:
         except WireError:
             continue
         camera = name if kind == "color" else f"{name}_depth"
-        pictures = by_camera.setdefault(camera, Pictures(image.width, image.height))
-        if (image.width, image.height) != (pictures.width, pictures.height) or not _is_complete(image):
+        pictures = pictures_by_camera.setdefault(camera, Pictures(image.width, image.height))
+        has_same_size = (image.width, image.height) == (pictures.width, pictures.height)
+        if not has_same_size or not _is_complete(image):
             continue
-        if not pictures.ticks or image.tick > pictures.ticks[-1]:
+        is_newer = not pictures.ticks or image.tick > pictures.ticks[-1]
+        if is_newer:
             pictures.add(image.tick, _rgb_of(image))
-    return by_camera
+    return pictures_by_camera
 
 
 def _is_complete(image: ColorImage | DepthImage) -> bool:

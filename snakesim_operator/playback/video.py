@@ -117,25 +117,42 @@ def _center(record: RunRecord, row: int) -> Floats:
 
 
 def times_of_pictures(record: RunRecord, fps: float, speed: float, span_s: Span) -> Floats:
-    """Return the robot time of the pose in each picture. In a gap the last pose before it stays."""
-    known = record.time_s[record.posed]
-    if not len(known):
+    """Return the robot time of the pose that each picture of a film shows.
+
+    A picture shows the newest known pose. During a gap in the record the last pose before the gap is repeated.
+
+    Args:
+        record: The recorded run.
+        fps: Pictures per second of the film.
+        speed: Robot time divided by film time; 2 plays twice as fast.
+        span_s: Start and end of the part to film, in s since the first tick.
+
+    Returns:
+        (pictures,) times in s.
+
+    Raises:
+        ConfigError: The record has no pose, or none within the span.
+    """
+    known_s = record.time_s[record.posed]
+    if not len(known_s):
         raise ConfigError(
             f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film",
             code="recording/missing-data",
         )
-    first = max(float(known[0]), float(record.time_s[0]) + span_s[0])
-    last = min(float(known[-1]), float(record.time_s[0]) + span_s[1])
-    if last <= first:
-        lasts_s = known[-1] - known[0]
+    first_tick_s = float(record.time_s[0])
+    from_s, to_s = span_s
+    start_s = max(float(known_s[0]), first_tick_s + from_s)
+    end_s = min(float(known_s[-1]), first_tick_s + to_s)
+    if end_s <= start_s:
+        duration_s = known_s[-1] - known_s[0]
         raise ConfigError(
-            f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s",
+            f"--from {from_s:g} --to {to_s:g}: the run has poses for {duration_s:.2f} s",
             code="command/invalid-option",
         )
-    picture_times = np.arange(first, last, speed / fps)
-    rounding_s = 0.5 * record.config.period_ns * 1e-9
-    newest = np.searchsorted(known, picture_times + rounding_s, side="right") - 1
-    return known[newest]
+    picture_times_s = np.arange(start_s, end_s, speed / fps)
+    half_tick_s = 0.5 * record.config.period_ns * 1e-9  # keeps rounding from selecting the tick before
+    newest = np.searchsorted(known_s, picture_times_s + half_tick_s, side="right") - 1
+    return known_s[newest]
 
 
 def standstills_in_words(times_s: Floats, picture_s: float, period_s: float) -> list[str]:
@@ -195,23 +212,36 @@ def _open_writer(out: Path, size: tuple[int, int], fps: float, missing: Sequence
 
 @contextlib.contextmanager
 def _open_mp4(out: Path, size: tuple[int, int], fps: float, comment: str) -> Iterator[Write]:
+    """Yield a function that appends a picture to an MP4 film, and finish the film at the end.
+
+    Args:
+        out: The film's file.
+        size: Width and height in pixels.
+        fps: Pictures per second.
+        comment: Comment in the film's metadata; empty: none.
+
+    Raises:
+        OSError: The encoder failed, which shows only at the end.
+    """
     import imageio_ffmpeg
 
-    rate: Any = fps  # annotated as int, but any number will do
-    metadata = ["-metadata", f"comment={comment}"] if comment else None
+    rate: Any = fps  # imageio_ffmpeg annotates an int, but accepts any number
+    output_options = None
+    if comment:
+        output_options = ["-metadata", f"comment={comment}"]
     encoder: Any = imageio_ffmpeg.write_frames(
-        str(out), size, fps=rate, macro_block_size=2, quality=7, output_params=metadata
+        str(out), size, fps=rate, macro_block_size=2, quality=7, output_params=output_options
     )
-    encoder.send(None)
+    encoder.send(None)  # starts the generator
     picture_count = 0
 
-    def send(picture: Picture) -> None:
+    def append_picture(picture: Picture) -> None:
         nonlocal picture_count
         encoder.send(np.ascontiguousarray(picture))
         picture_count += 1
 
     try:
-        yield send
+        yield append_picture
     finally:
         encoder.close()
     _check_film(out, picture_count)
@@ -219,23 +249,34 @@ def _open_mp4(out: Path, size: tuple[int, int], fps: float, comment: str) -> Ite
 
 @contextlib.contextmanager
 def _open_gif(out: Path, fps: float, comment: str) -> Iterator[Write]:
+    """Yield a function that appends a picture to a GIF, and write the file at the end.
+
+    All pictures share the palette of the first one: the file is smaller, and the colors do not flicker.
+
+    Args:
+        out: The film's file.
+        fps: Pictures per second.
+        comment: Comment in the file, cut to MAX_COMMENT_BYTES.
+    """
     from PIL import Image
 
     pictures: list[Image.Image] = []
-    palette: list[Image.Image] = []  # of the first picture, for all: smaller, and without flicker
+    palette: Image.Image | None = None
 
-    def keep(picture: Picture) -> None:
+    def append_picture(picture: Picture) -> None:
+        nonlocal palette
         image = Image.fromarray(picture)
-        if not palette:
-            palette.append(image.quantize(GIF_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
-        pictures.append(image.quantize(palette=palette[0], dither=Image.Dither.NONE))
+        if palette is None:
+            palette = image.quantize(GIF_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        pictures.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
 
-    yield keep
+    yield append_picture
+    frame_duration_ms = 1000 / fps
     pictures[0].save(
         out,
         save_all=True,
         append_images=pictures[1:],
-        duration=1000 / fps,
+        duration=frame_duration_ms,
         loop=0,
         optimize=True,
         comment=comment.encode()[:MAX_COMMENT_BYTES],

@@ -24,27 +24,27 @@ class _JointStatesTemplate:
     """
 
     def __init__(self, joints: JointStates) -> None:
-        """Find the numbers in the encoded message.
+        """Split the encoded message at its numbers, so that `fill` can put others in their places.
 
         Args:
             joints: A message with a marker in every field that will be filled: 1.0, 2.0, 3.0 and so on, in the order
                 of the fields.
         """
-        rest = joints.SerializeToString()
+        remaining = joints.SerializeToString()
         marker = 1.0
-        layout = "<"
-        self._parts: list[bytes | float] = []  # bytes between the numbers, number, bytes, number ...
+        struct_format = "<"
+        self._parts: list[bytes | float] = []  # alternating: the bytes before a number, the number
         while True:
             encoded_marker = struct.pack("<d", marker)
-            position = rest.find(encoded_marker)
+            position = remaining.find(encoded_marker)
             if position < 0:
                 break
-            self._parts += (rest[:position], marker)
-            layout += f"{position}sd"
-            rest = rest[position + len(encoded_marker) :]
+            self._parts += (remaining[:position], marker)
+            struct_format += f"{position}sd"
+            remaining = remaining[position + len(encoded_marker) :]
             marker += 1.0
-        assert not rest, "a number ends each joint"
-        self._pack = struct.Struct(layout).pack
+        assert not remaining, "a number ends each joint"
+        self._pack = struct.Struct(struct_format).pack
         self._time_only = JointStates()
 
     def fill(self, numbers: Iterable[float], time_ns: int) -> bytes:
@@ -59,36 +59,42 @@ class BodyMessages:
     """Makes the transforms and joint states of one robot."""
 
     def __init__(self, robot: Description) -> None:
-        """Build the messages. robot: a description with one link more than joints."""
+        """Build the messages of one robot, which are later filled for each sample.
+
+        Args:
+            robot: Links and joints, tail to head; it has one link more than joints.
+        """
+        # Each link's frame is at the front end of the link behind it.
         link_frames: list[FrameTransform] = []
         for rear, front in pairwise(robot.links):
             rear_end = (rear.length_m, 0.0, 0.0)
             link_frames.append(shapes.make_frame(0, rear.name, front.name, rear_end, _NO_ROTATION))
-        tail = robot.links[0].name
-        base_frame = shapes.make_frame(0, shapes.WORLD_FRAME, tail, (0.0, 0.0, 0.0), _NO_ROTATION)
+        tail_name = robot.links[0].name
+        base_frame = shapes.make_frame(0, shapes.WORLD_FRAME, tail_name, (0.0, 0.0, 0.0), _NO_ROTATION)
         self._chain = FrameTransforms(transforms=link_frames)
         self._chain_in_world = FrameTransforms(transforms=[base_frame, *link_frames])
         self._is_pitch = [joint.axis == "pitch" for joint in robot.joints]
         self.joint_count = len(robot.joints)
 
-        # Markers for the templates: 1.0, 2.0, 3.0 ... in the order of the fields.
+        # A template needs markers 1.0, 2.0, 3.0 ... in the order of its fields: three for each measured joint state,
+        # and one for each reference angle.
         measured: list[NamedJoint] = []
         references: list[NamedJoint] = []
         for i, joint in enumerate(robot.joints):
-            first = 3 * i + 1.0
-            measured.append(NamedJoint(name=joint.name, position=first, velocity=first + 1.0, effort=first + 2.0))
+            marker = 3 * i + 1.0
+            measured.append(NamedJoint(name=joint.name, position=marker, velocity=marker + 1.0, effort=marker + 2.0))
             references.append(NamedJoint(name=joint.name, position=i + 1.0))
         self._measured = _JointStatesTemplate(JointStates(joints=measured))
         self._references = _JointStatesTemplate(JointStates(joints=references))
 
     def fill_transforms(self, angles_rad: Sequence[float], base: Pose | None, time_ns: int) -> FrameTransforms:
-        """Return each link in the frame of the link behind it, and the tail link in the world if that is known.
+        """Return the frame of each link relative to the link behind it, and of the tail link in the world if known.
 
-        The message is valid until the next call, which fills it again.
+        The same message is filled again by the next call, so that the caller must encode it before that.
 
         Args:
-            angles_rad: (n_joints,), tail to head.
-            base: Position and orientation of link 0 in the world; None if unknown.
+            angles_rad: (n_joints,) joint angles, tail to head.
+            base: Position in m and orientation wxyz of the tail link in the world; None if unknown.
             time_ns: Robot time.
         """
         message = self._chain if base is None else self._chain_in_world
@@ -105,12 +111,13 @@ class BodyMessages:
             translation.x, translation.y, translation.z = position_w
             rotation.w, rotation.x, rotation.y, rotation.z = orientation_wxyz
         for frame, angle_rad, is_pitch in zip(frames, angles_rad, self._is_pitch, strict=True):
+            half_angle_rad = 0.5 * angle_rad
             rotation = frame.rotation
-            rotation.w = math.cos(0.5 * angle_rad)
+            rotation.w = math.cos(half_angle_rad)
             if is_pitch:
-                rotation.y = math.sin(0.5 * angle_rad)
+                rotation.y = math.sin(half_angle_rad)
             else:
-                rotation.z = math.sin(0.5 * angle_rad)
+                rotation.z = math.sin(half_angle_rad)
         return message
 
     def encode_joint_states(self, joints: JointState, time_ns: int) -> bytes:

@@ -55,29 +55,33 @@ def read_chunk_length(head: bytes) -> int:
 
 
 def unpack_chunk(content: bytes) -> bytearray:
-    """Return the records within a chunk, in bytes.
+    """Decompress an MCAP chunk.
 
     Args:
-        content: Content of the chunk's record.
+        content: Content of the chunk's record: a header, the name of the compression, and the compressed records.
+
+    Returns:
+        The records in the chunk, as bytes.
 
     Raises:
-        DamagedError: Its lengths, its compression, its size or its checksum is wrong.
+        DamagedError: The lengths, the compression, the size or the checksum of the chunk is wrong.
     """
     if read_chunk_length(content) != len(content):
         raise DamagedError("a chunk whose lengths contradict each other")
-    _, _, size, crc, name_bytes = _CHUNK_HEAD.unpack_from(content)
+    _, _, unpacked_bytes, expected_crc, name_bytes = _CHUNK_HEAD.unpack_from(content)
     name_end = _CHUNK_HEAD.size + name_bytes
     compression = content[_CHUNK_HEAD.size : name_end]
-    packed = content[name_end + _PACKED_LENGTH.size :]
-    if size > MAX_RECORD_BYTES:
-        raise DamagedError(f"a chunk of {size / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
+    compressed = content[name_end + _PACKED_LENGTH.size :]
+    if unpacked_bytes > MAX_RECORD_BYTES:
+        raise DamagedError(f"a chunk of {unpacked_bytes / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
     try:
-        data = _decompress(compression, packed, size)
+        data = _decompress(compression, compressed, unpacked_bytes)
     except _UNPACKING_ERRORS as error:
         raise DamagedError(f"a chunk that cannot be unpacked ({error})") from None
-    if len(data) != size:
-        raise DamagedError(f"a chunk of {len(data)} bytes where {size} should be")
-    if crc and zlib.crc32(data) != crc:
+    if len(data) != unpacked_bytes:
+        raise DamagedError(f"a chunk of {len(data)} bytes where {unpacked_bytes} should be")
+    has_checksum = expected_crc != 0
+    if has_checksum and zlib.crc32(data) != expected_crc:
         raise DamagedError("a chunk whose checksum does not fit")
     return data
 
@@ -139,11 +143,11 @@ def parse_chunk(data: bytearray) -> Iterator[McapRecord]:
 
 
 def parse_record(opcode: int, content: memoryview) -> McapRecord:
-    """Decode the content of one record.
+    """Decode the content of one MCAP record.
 
     Args:
-        opcode: MESSAGE, or a key of _RECORD_TYPES.
-        content: The record without its head.
+        opcode: Kind of the record: a message, channel, header, metadata, schema or statistics.
+        content: The bytes behind the record's opcode and length.
 
     Raises:
         DamagedError: The content cannot be read, or is longer than what it holds.
@@ -155,7 +159,8 @@ def parse_record(opcode: int, content: memoryview) -> McapRecord:
         record = _RECORD_TYPES[opcode].read(stream)
     except _UNREADABLE:
         raise DamagedError(f"a record of kind {opcode} that cannot be read") from None
-    if stream.count != len(content):
+    read_bytes = stream.count
+    if read_bytes != len(content):
         raise DamagedError(f"a record of kind {opcode} whose lengths contradict each other")
     return record
 

@@ -30,25 +30,25 @@ class GrowingFile:
         return self._written_bytes + len(self._waiting)
 
     def flush(self) -> None:
-        """Give the waiting bytes to the disk.
+        """Write the buffered bytes to the disk.
 
         Raises:
-            OSError: The disk does not take all of them. The file then ends where it ended before, and the waiting
+            OSError: The disk does not take all of them. The file then ends where it ended before, and the buffered
                 bytes are lost.
         """
-        done = 0
+        written_count = 0
         try:
-            while done < len(self._waiting):
-                count = os.write(self._handle, self._waiting[done:])
+            while written_count < len(self._waiting):
+                count = os.write(self._handle, self._waiting[written_count:])
                 if count == 0:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                done += count
+                written_count += count
         except OSError:
             self._cut_back()
             raise
         finally:
             self._waiting.clear()
-        self._written_bytes += done
+        self._written_bytes += written_count
 
     def _cut_back(self) -> None:
         """Remove the bytes behind the last complete flush."""

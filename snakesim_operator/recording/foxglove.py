@@ -85,15 +85,21 @@ class FoxgloveChannels:
         self._state_messages = StateMessages()
 
     def convert(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
-        """Return the messages that are due with a message of the robot; none if that cannot be decoded.
+        """Convert a message of the robot into messages for a Foxglove viewer.
+
+        Drawings are not made for each message but at fixed periods, from the newest messages; a message only triggers
+        those that are due.
 
         Args:
             key: Key of the robot's message.
-            payload: The message as on the wire.
-            time_ns: Its robot time.
+            payload: The encoded message, as on the network.
+            time_ns: Robot time of the message.
+
+        Returns:
+            The messages for viewers; empty if nothing is due, or if the message cannot be decoded.
         """
         if key in _KEPT_KEYS:
-            self._newest[key] = payload, time_ns
+            self._newest[key] = (payload, time_ns)
         match key:
             case keys.JOINTS:
                 return self._convert_joints(payload, time_ns)
@@ -221,7 +227,16 @@ class FoxgloveChannels:
     # --- a few times a second
 
     def _convert_image(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
-        """Return an image with its camera's frame and calibration, if one is due."""
+        """Convert a camera image into three messages for viewers: the camera's frame, the image, its calibration.
+
+        Args:
+            key: Key of the image, `sensor/depth/CAMERA` or `sensor/color/CAMERA`.
+            payload: The encoded image.
+            time_ns: Robot time of the image.
+
+        Returns:
+            The messages; empty if no image is due, or if it cannot be decoded or does not fit to the robot.
+        """
         if not self._is_due(key, time_ns, IMAGE_PERIOD_NS):
             return []
         message_type = DepthImage if key.startswith(DEPTH_PREFIX) else ColorImage
@@ -230,28 +245,38 @@ class FoxgloveChannels:
         if robot is None or image is None or find_mismatch(image, robot) is not None:
             return []
         _, kind, camera = key.split("/", 2)
-        topic = f"{make_name_part(camera)}/{kind}"
-        frame_id = f"{make_name_part(camera)}_{kind}_optical_frame"
-        link = robot.links[image.link].name
+        camera_name = make_name_part(camera)
+        topic = f"{camera_name}/{kind}"
+        frame_id = f"{camera_name}_{kind}_optical_frame"
+        link_name = robot.links[image.link].name
         orientation = shapes.rotate_to_optical(image.orientation_l_wxyz)
-        mount = shapes.make_frame(time_ns, link, frame_id, image.position_l, orientation)
+        camera_frame = shapes.make_frame(time_ns, link_name, frame_id, image.position_l, orientation)
         raw_image = shapes.make_raw_image(image, frame_id, time_ns)
         calibration = shapes.make_calibration(image, frame_id, time_ns)
         return [
-            self._encode_frame(mount),
+            self._encode_frame(camera_frame),
             self._encode_protobuf(f"{topic}/image_raw", raw_image),
             self._encode_protobuf(f"{topic}/camera_info", calibration),
         ]
 
     def _make_drawings(self, time_ns: int) -> list[FoxgloveMessage]:
-        """Return transforms, pose, forces and scene from the newest samples, if they are due."""
+        """Make transforms, pose, contact forces and scene for viewers, from the newest messages of the robot.
+
+        Args:
+            time_ns: Robot time now.
+
+        Returns:
+            The messages; empty if no drawing is due, or if the robot or its joint angles are unknown.
+        """
         if not self._is_due("moving", time_ns, MOTION_PERIOD_NS):
             return []
         robot = self._robot
         frames = self._frames
         joints: JointState | None = self._decode_fresh(keys.JOINTS, JointState, time_ns)
         world: PoseAndContacts | None = self._decode_fresh(keys.WORLD, PoseAndContacts, time_ns)
-        if robot is None or frames is None or joints is None or not joints.has_joint_count(len(robot.joints)):
+        if robot is None or frames is None:
+            return []
+        if joints is None or not joints.has_joint_count(len(robot.joints)):
             return []
         base = self._find_base(world, time_ns)
         transforms = frames.fill_transforms(joints.angle_rad, base, time_ns)
@@ -261,7 +286,8 @@ class FoxgloveChannels:
         if world is not None:
             forces = shapes.draw_forces(world.contacts, time_ns)
             messages.append(self._encode_scene("forces", [forces]))
-        if self._state_due_ns <= time_ns:  # host and controller are silent, which is shown as well
+        # Messages of host and controller trigger the state. If both are silent, the state must show that.
+        if self._state_due_ns <= time_ns:
             messages += self._make_state(time_ns)
         messages += self._make_scene(robot, time_ns)
         return messages

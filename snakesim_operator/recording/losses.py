@@ -58,7 +58,12 @@ class Losses:
             self.gaps[-1].end_ns = end_ns
 
     def describe(self) -> list[str]:
-        """Return what is lost in words, one text for each kind of loss; empty if nothing is lost."""
+        """Describe what is lost in a recording, for people.
+
+        Returns:
+            A text for each kind of loss: damaged parts, gaps, a cut end, messages that are out of order, messages that
+            the recorder dropped, and what an earlier copy had lost. Empty if nothing is lost.
+        """
         texts: list[str] = []
         if self.damage_count:
             texts.append(self._describe_damages())
@@ -69,12 +74,12 @@ class Losses:
                 "the disk was full, or the file was cut"
             )
         if self.misplaced:
-            count = _format_count(self.misplaced, "message")
-            texts.append(f"its order: {count} behind later ones of the same key")
+            misplaced = _format_count(self.misplaced, "message")
+            texts.append(f"its order: {misplaced} behind later ones of the same key")
         dropped_count = sum(self.dropped.values())
         if dropped_count:
-            count = _format_count(dropped_count, "message")
-            texts.append(f"{count}, dropped because the disk was too slow: {_list_keys(self.dropped)}")
+            dropped = _format_count(dropped_count, "message")
+            texts.append(f"{dropped}, dropped because the disk was too slow: {_list_keys(self.dropped)}")
         earlier_texts = [f"before it was copied: {text}" for text in self.earlier if text not in texts]
         return texts + earlier_texts
 

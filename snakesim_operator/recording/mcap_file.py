@@ -48,7 +48,14 @@ class McapFile:
     """One file. Everything that is added waits for `flush`; only `flush` and `finish` raise OSError."""
 
     def __init__(self, file: GrowingFile) -> None:
-        """Write the beginning of the file. file: an empty one, which the caller closes."""
+        """Write the beginning of an MCAP file: the magic bytes and the header.
+
+        Args:
+            file: An empty file, which the caller closes.
+
+        Raises:
+            OSError: The disk does not take the bytes.
+        """
         self._file = file
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
 
@@ -119,18 +126,28 @@ class McapFile:
         self._file.flush()
 
     def finish(self) -> None:
-        """Write summary and footer. Raises OSError."""
+        """Write the rest of an MCAP file: the last chunk, the summary section, its offsets, and the footer.
+
+        Raises:
+            OSError: The disk does not take the bytes.
+        """
         self._end_chunk()
         self._file.write(_encode_records([DataEnd(0)]))
+
+        # The summary holds groups of records of one kind, then an offset for each group.
         summary_position = self._file.tell()
         summary = bytearray()
         offsets = RecordBuilder()
-        for opcode, records in self._encode_summary():
-            if records:
-                SummaryOffset(opcode, summary_position + len(summary), len(records)).write(offsets)
-                summary += records
+        for opcode, group in self._encode_summary():
+            if not group:
+                continue
+            group_position = summary_position + len(summary)
+            SummaryOffset(opcode, group_position, len(group)).write(offsets)
+            summary += group
         offsets_position = summary_position + len(summary)
         summary += offsets.end()
+
+        # The checksum covers the summary, and the footer up to the checksum itself.
         footer_without_crc = _FOOTER_WITHOUT_CRC.pack(
             Opcode.FOOTER, _FOOTER_CONTENT_BYTES, summary_position, offsets_position
         )
@@ -141,7 +158,11 @@ class McapFile:
         self._file.flush()
 
     def _encode_summary(self) -> list[tuple[Opcode, bytes]]:
-        """Return the groups of records of the summary, each with its opcode."""
+        """Return the records of the summary section, encoded and grouped by kind.
+
+        Returns:
+            The groups in the order of the file: the opcode of the records, and their bytes, which may be empty.
+        """
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
@@ -162,18 +183,24 @@ class McapFile:
         ]
 
     def _end_chunk(self) -> None:
-        """Write the chunk with an index of its messages, if it has any, and begin the next one."""
+        """Write the current chunk and its message indexes to the file, and begin an empty chunk.
+
+        A chunk without messages is not written. For the summary at the end of the file, this also counts the messages
+        and remembers where the chunk is.
+        """
         indices = {channel: index for channel, index in self._index.items() if index}
         if not indices:
             return
+
+        # Each index alternates between time and offset.
         begin_ns = min(min(index[::2]) for index in indices.values())
         end_ns = max(max(index[::2]) for index in indices.values())
-        data = self._compressor.compress(self._chunk)
-        position = self._file.tell()
+        compressed = self._compressor.compress(self._chunk)
+        chunk_position = self._file.tell()
         records = RecordBuilder()
         chunk = Chunk(
             compression=COMPRESSION,
-            data=data,
+            data=compressed,
             message_end_time=end_ns,
             message_start_time=begin_ns,
             uncompressed_crc=zlib.crc32(self._chunk),
@@ -181,17 +208,19 @@ class McapFile:
         )
         chunk.write(records)
         chunk_length = records.count
+
         index_positions: dict[int, int] = {}
         for channel, index in indices.items():
-            index_positions[channel] = position + records.count
+            index_positions[channel] = chunk_position + records.count
             _add_message_index(records, channel, index)
             self._message_counts[channel] += len(index) // 2
             self._index[channel] = []
+
         chunk_index = ChunkIndex(
             chunk_length=chunk_length,
-            chunk_start_offset=position,
+            chunk_start_offset=chunk_position,
             compression=COMPRESSION,
-            compressed_size=len(data),
+            compressed_size=len(compressed),
             message_end_time=end_ns,
             message_index_length=records.count - chunk_length,
             message_index_offsets=index_positions,
@@ -200,6 +229,7 @@ class McapFile:
         )
         chunk_index.write(self._chunk_indices)
         self._file.write(records.end())
+
         earliest_ns = min([begin_ns, *self._time_limits_ns])
         latest_ns = max([end_ns, *self._time_limits_ns])
         self._time_limits_ns = [earliest_ns, latest_ns]

@@ -21,6 +21,7 @@ CUT = "the file ends in the middle of a record"
 
 _FIRST_PRIVATE_OPCODE = 0x80
 _END_OF_OPCODES = 0x10
+_MESSAGE_INDEX_HEAD_BYTES = 6  # channel number (2 bytes), then the length of the entries (4 bytes)
 _MESSAGE_INDEX_ENTRY_BYTES = 16
 
 # Searching behind damage.
@@ -49,52 +50,74 @@ class RawRecord(NamedTuple):
 
 
 def read_record(file: BinaryIO, position: int, size: int) -> RawRecord:
-    """Read the record at a position of a file.
+    """Read the MCAP record at a position of a file. Its content is read only if a reader needs it.
 
     Args:
         file: The file.
-        position: In bytes from its beginning.
+        position: Position of the record, in bytes from the beginning of the file.
         size: Size of the file in bytes.
 
+    Returns:
+        The record. Its content is empty if its kind is neither a chunk nor one of READ_OPCODES.
+
     Raises:
-        DamagedError: There is no intact record.
+        DamagedError: There is no intact record at this position.
         OSError: The file cannot be read.
     """
     file.seek(position)
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
         raise DamagedError(CUT)
-    opcode, length = HEAD.unpack(head)
-    begin = position + HEAD.size
-    end = begin + length
-    if not 0 < opcode < _END_OF_OPCODES and opcode < _FIRST_PRIVATE_OPCODE:
+    opcode, content_length = HEAD.unpack(head)
+    content_begin = position + HEAD.size
+    record_end = content_begin + content_length
+    is_known = 0 < opcode < _END_OF_OPCODES
+    is_private = opcode >= _FIRST_PRIVATE_OPCODE
+    if not is_known and not is_private:
         raise DamagedError("no record")
-    if end > size:
+    if record_end > size:
         raise DamagedError(CUT)
-    _check_length(file, begin, opcode, length)
-    if opcode != Opcode.CHUNK and opcode not in READ_OPCODES:
-        return RawRecord(opcode, b"", end)
-    if length > MAX_RECORD_BYTES:
-        raise DamagedError(f"a record of {length / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
-    file.seek(begin)
-    content = file.read(length)
-    if len(content) != length:
+    _check_length(file, content_begin, opcode, content_length)
+
+    is_needed = opcode == Opcode.CHUNK or opcode in READ_OPCODES
+    if not is_needed:
+        return RawRecord(opcode, b"", record_end)
+    if content_length > MAX_RECORD_BYTES:
+        raise DamagedError(f"a record of {content_length / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
+    file.seek(content_begin)
+    content = file.read(content_length)
+    if len(content) != content_length:
         raise DamagedError(CUT)
-    return RawRecord(opcode, content, end)
+    return RawRecord(opcode, content, record_end)
 
 
 def _check_length(file: BinaryIO, begin: int, opcode: int, length: int) -> None:
-    """Compare the length in a record's head with the lengths in its content, where it has some. Raises DamagedError."""
+    """Check the length that a record's head states against the lengths in its content.
+
+    Only chunks, message indexes and the end of the data state or have a known length; other kinds pass.
+
+    Args:
+        file: The file; its position changes.
+        begin: Position of the record's content.
+        opcode: Kind of the record.
+        length: Length of the content in bytes, as the head states it.
+
+    Raises:
+        DamagedError: The lengths contradict each other.
+        OSError: The file cannot be read.
+    """
     match opcode:
         case Opcode.CHUNK:
             file.seek(begin)
-            if length != read_chunk_length(file.read(_PATTERN_BYTES)):
+            content_start = file.read(_PATTERN_BYTES)
+            if length != read_chunk_length(content_start):
                 raise DamagedError("a chunk whose lengths contradict each other")
         case Opcode.MESSAGE_INDEX:
             file.seek(begin)
-            index_head = file.read(6)  # channel number, then the length of the entries
-            entry_bytes = int.from_bytes(index_head[2:], "little")
-            if length != 6 + entry_bytes or entry_bytes % _MESSAGE_INDEX_ENTRY_BYTES != 0:
+            index_head = file.read(_MESSAGE_INDEX_HEAD_BYTES)
+            entries_bytes = int.from_bytes(index_head[2:], "little")
+            is_whole_entries = entries_bytes % _MESSAGE_INDEX_ENTRY_BYTES == 0
+            if length != _MESSAGE_INDEX_HEAD_BYTES + entries_bytes or not is_whole_entries:
                 raise DamagedError("an index whose lengths contradict each other")
         case Opcode.DATA_END:
             if length != _CRC_BYTES:
@@ -133,7 +156,10 @@ def _find_candidates(block: bytes) -> Iterator[int]:
 
 
 def read_summary(file: BinaryIO) -> list[McapRecord]:
-    """Return channels, schemas and statistics at the end of a file.
+    """Return the copies of channels, schemas and statistics in the summary at the end of an MCAP file.
+
+    Args:
+        file: The file; its position changes.
 
     Raises:
         DamagedError: The file has no intact end.
@@ -144,36 +170,51 @@ def read_summary(file: BinaryIO) -> list[McapRecord]:
     records: list[McapRecord] = []
     position = 0
     while position + HEAD.size <= len(summary):
-        opcode, length = HEAD.unpack_from(summary, position)
-        position += HEAD.size
+        opcode, content_length = HEAD.unpack_from(summary, position)
+        content_begin = position + HEAD.size
+        content_end = content_begin + content_length
         if opcode in _SUMMARY_OPCODES:
-            if position + length > len(summary):
+            if content_end > len(summary):
                 raise DamagedError("a summary whose lengths contradict each other")
-            records.append(parse_record(opcode, view[position : position + length]))
-        position += length
+            records.append(parse_record(opcode, view[content_begin:content_end]))
+        position = content_end
     return records
 
 
 def _read_summary_bytes(file: BinaryIO) -> bytes:
-    """Return the summary of a file whose checksum is right. Raises DamagedError, OSError."""
+    """Return the summary section of an MCAP file: the records between the end of the data and the footer.
+
+    The footer states where the summary begins, and a checksum of both. If bytes are missing in the middle of the file,
+    the stated position is wrong; then the summary is looked for behind the last DATA_END record.
+
+    Raises:
+        DamagedError: The file has no footer, or no summary fits its checksum.
+        OSError: The file cannot be read.
+    """
     size = file.seek(0, os.SEEK_END)
-    if size <= _FOOTER_BYTES:
+    footer_position = size - _FOOTER_BYTES
+    if footer_position <= 0:
         raise DamagedError(CUT)
-    file.seek(size - _FOOTER_BYTES)
+    file.seek(footer_position)
     footer = file.read(_FOOTER_BYTES)
     if not footer.endswith(MCAP0_MAGIC) or footer[: HEAD.size] != _FOOTER_HEAD:
         raise DamagedError(CUT)
-    stated_begin = int.from_bytes(footer[9:17], "little")
-    crc = int.from_bytes(footer[25:29], "little")
-    tail_begin = max(size - _FOOTER_BYTES - MAX_RECORD_BYTES, 0)
-    file.seek(tail_begin)
-    tail = file.read(size - _FOOTER_BYTES - tail_begin)
-    # The summary begins where the footer states it, or, if a part of the file is gone, behind the last DATA_END.
-    behind_data_end = tail.rfind(_DATA_END_HEAD) + len(_DATA_END_HEAD) + _CRC_BYTES
-    for begin in (stated_begin - tail_begin, behind_data_end):
+    # Content of the footer: begin of the summary (8 bytes), begin of its offsets (8 bytes), checksum (4 bytes).
+    footer_before_crc = footer[:25]
+    stated_position = int.from_bytes(footer[9:17], "little")
+    expected_crc = int.from_bytes(footer[25:29], "little")
+
+    # A summary that is larger than MAX_RECORD_BYTES is not read.
+    tail_position = max(footer_position - MAX_RECORD_BYTES, 0)
+    file.seek(tail_position)
+    tail = file.read(footer_position - tail_position)
+    stated_begin = stated_position - tail_position
+    begin_after_data = tail.rfind(_DATA_END_HEAD) + len(_DATA_END_HEAD) + _CRC_BYTES
+    for begin in (stated_begin, begin_after_data):
         summary = b""
         if 0 < begin <= len(tail):
             summary = tail[begin:]
-        if crc and zlib.crc32(footer[:25], zlib.crc32(summary)) == crc:
+        actual_crc = zlib.crc32(footer_before_crc, zlib.crc32(summary))
+        if expected_crc and actual_crc == expected_crc:
             return summary
     raise DamagedError("a summary whose checksum does not fit")

@@ -73,10 +73,12 @@ class RecordingReader:
         return self.losses.describe()
 
     def read_messages(self, keys: Collection[str] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages of the robot.
+        """Yield the messages that the robot's processes published, in the order of the file.
+
+        Messages that the recorder made for viewers are left out.
 
         Args:
-            keys: Keys to read; a pattern of the key space stands for its keys. None: all keys.
+            keys: Keys to read. A pattern of the key space stands for its keys. None: all keys.
 
         Raises:
             ConfigError: The file is no recording, or cannot be read.
@@ -85,11 +87,12 @@ class RecordingReader:
             if not isinstance(record, Message):
                 continue
             channel = self._channels[record.channel_id]
+            key = channel.topic
             encoding = channel.metadata.get("encoding")
-            if encoding is None:  # a topic made for viewers
+            if encoding is None:  # only messages of the robot have one
                 continue
-            if keys is None or channel.topic in keys or find_row_key(channel.topic) in keys:
-                yield RecordedMessage(channel.topic, record.data, encoding, record.log_time, record.publish_time)
+            if keys is None or key in keys or find_row_key(key) in keys:
+                yield RecordedMessage(key, record.data, encoding, record.log_time, record.publish_time)
 
     def read_records(self) -> Iterator[McapRecord]:
         """Yield every schema, channel, message and metadata that can be read, a channel before its messages.
@@ -114,7 +117,15 @@ class RecordingReader:
     # --- reading
 
     def _read_file(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
-        """Yield the usable records of a file; behind damage, continue at the next intact record."""
+        """Yield the usable records of a file. Behind a damaged record, continue at the next intact one.
+
+        Damage is counted in `losses`. A file that breaks off without an end record is not damage: `losses.cut_ns` is
+        then the time of its newest message.
+
+        Args:
+            file: The file, open for reading.
+            size: Size of the file in bytes.
+        """
         position = len(MCAP0_MAGIC)
         while not self.finished and position < size:
             try:
@@ -162,7 +173,10 @@ class RecordingReader:
             )
 
     def _process(self, record: McapRecord) -> Iterator[McapRecord]:
-        """Yield the record if it is usable, behind the channel and schema that it needs if those were lost."""
+        """Take note of one record, and yield it if a caller can use it.
+
+        If the channel or schema of a record was lost, the copy in the file's summary is yielded before it.
+        """
         match record:
             case Message():
                 if record.channel_id not in self._channels:
@@ -235,19 +249,29 @@ class RecordingReader:
     # --- losses
 
     def _count_message(self, message: Message) -> bool:
-        """Count what is lost before a message, and return whether the message itself is usable."""
+        """Count the messages that are lost before this one, and return whether this one is usable.
+
+        The recorder numbers the messages of each channel, so a jump of the sequence number means lost messages, and a
+        number that does not grow means a message that is behind later ones. A message is not usable if its channel is
+        lost or its time is implausible; it then counts as lost.
+        """
         channel = self._channels.get(message.channel_id)
         topic = UNKNOWN_KEYS if channel is None else channel.topic
         time_ns = message.log_time
         self._end_gap(time_ns)
-        last, gaps_then = self._last.get(message.channel_id, (0, 0))
+
+        last_sequence, gaps_then = self._last.get(message.channel_id, (0, 0))
         if self._is_counted:
-            if message.sequence > last + 1:
-                self._add_loss(topic, message.sequence - last - 1, gaps_then, time_ns)
-            elif message.sequence <= last:
+            lost_count = message.sequence - last_sequence - 1
+            if lost_count > 0:
+                self._add_loss(topic, lost_count, gaps_then, time_ns)
+            elif lost_count < 0:
                 self.losses.misplaced += 1
-        self._last[message.channel_id] = (max(message.sequence, last), len(self.losses.gaps))
-        if channel is None or time_ns >= LATEST_NS:
+        newest_sequence = max(message.sequence, last_sequence)
+        self._last[message.channel_id] = (newest_sequence, len(self.losses.gaps))
+
+        is_usable = channel is not None and time_ns < LATEST_NS
+        if not is_usable:
             self._add_loss(topic, 1, 0, self._newest_ns)
             return False
         self._newest_ns = max(self._newest_ns, time_ns)

@@ -35,10 +35,15 @@ class MessageClock:
         self._now_ns = 0  # by the newest clock
 
     def date(self, key: str, payload: bytes) -> int:
-        """Return the robot time of a message in ns.
+        """Return the robot time at which a recorded message is filed, in ns.
 
-        It is the time of the tick that the message names. A message that names none, or none near the newest clock,
-        has the time of the newest clock; before the first clock, it has its own timestamp.
+        This is the time of the tick that the message names. If the message names no tick, or one more than MAX_AWAY_NS
+        from the newest clock, it is the time of the newest clock. Before the first clock, it is the timestamp in the
+        message. A clock message itself sets the newest clock.
+
+        Args:
+            key: Key at which the message was published.
+            payload: The encoded message.
         """
         try:
             if key == keys.CLOCK:
@@ -50,7 +55,8 @@ class MessageClock:
             return _limit(dated.timestamp_ns or 0)
         if dated.tick is not None:
             tick_ns = dated.tick * self.clock.period_ns
-            if tick_ns >= 0 and abs(tick_ns - self._now_ns) <= MAX_AWAY_NS:
+            is_near_clock = abs(tick_ns - self._now_ns) <= MAX_AWAY_NS
+            if tick_ns >= 0 and is_near_clock:
                 return tick_ns
         return self._now_ns
 

@@ -104,7 +104,14 @@ def _draw_link(link: LinkDescription, time_ns: int) -> SceneEntity:
 
 
 def draw_obstacles(obstacles: Iterable[Obstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
-    """Return obstacles in the world as one entity of this name."""
+    """Return obstacles as one entity of a Foxglove scene, in the world frame.
+
+    Args:
+        obstacles: Spheres, boxes and cylinders.
+        name: Identifier of the entity; a viewer replaces an earlier entity of the same name.
+        color: Color of all obstacles.
+        time_ns: Robot time.
+    """
     entity = SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id=name)
     for obstacle in obstacles:
         x, y, z = obstacle.position_w
@@ -113,7 +120,8 @@ def draw_obstacles(obstacles: Iterable[Obstacle], name: str, color: Color, time_
         pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=orientation)
         match obstacle.shape:
             case "sphere":
-                entity.spheres.append(_make_ball(x, y, z, 2 * obstacle.radius_m, color))
+                diameter_m = 2 * obstacle.radius_m
+                entity.spheres.append(_make_ball(x, y, z, diameter_m, color))
             case "box":
                 half_x_m, half_y_m, half_z_m = obstacle.half_size_m
                 size = Vector3(x=2 * half_x_m, y=2 * half_y_m, z=2 * half_z_m)
@@ -124,7 +132,13 @@ def draw_obstacles(obstacles: Iterable[Obstacle], name: str, color: Color, time_
 
 
 def draw_forces(contacts: Iterable[WorldContact], time_ns: int) -> SceneEntity:
-    """Return an arrow for the force on the body at each contact, ARROW_M_PER_N long for each newton."""
+    """Return contact forces on the body as one entity of a Foxglove scene: an arrow at each contact.
+
+    Args:
+        contacts: Contacts in the world frame. An arrow is ARROW_M_PER_N long for each newton, and at most MAX_ARROW_M;
+            a contact without force has none.
+        time_ns: Robot time.
+    """
     entity = SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id="forces")
     for contact in contacts:
         force_n = math.hypot(*contact.force_w)
@@ -158,7 +172,13 @@ def draw_path(points_w: Iterable[Sequence[float]], time_ns: int) -> SceneEntity:
 
 
 def make_raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> RawImage:
-    """Return an image: depth in millimeters as 16UC1, color as rgb8."""
+    """Return a camera image as a Foxglove message: color as rgb8, depth as 16UC1 in millimeters.
+
+    Args:
+        image: The image.
+        frame_id: Optical frame of the camera.
+        time_ns: Robot time of the image.
+    """
     if isinstance(image, ColorImage):
         data = image.rgb
         encoding = "rgb8"
@@ -173,7 +193,7 @@ def make_raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) 
         width=image.width,
         height=image.height,
         encoding=encoding,
-        step=pixel_bytes * image.width,
+        step=pixel_bytes * image.width,  # bytes per row
         data=data,
     )
 

@@ -99,50 +99,59 @@ class StateMessages:
         self._logged: dict[str, tuple[str, str]] = {}  # by source: state, and its reason without numbers
 
     def update(self, status: bytes | None, control: bytes | None, time_ns: int) -> StateUpdate:
-        """Return what is to be shown.
+        """Combine the newest messages of host and controller into the state that viewers show.
 
         Args:
             status: Newest payload of `hal/status`; None if the host is silent.
             control: Newest payload of `control/state`; None if the controller is silent.
             time_ns: Robot time.
+
+        Returns:
+            The state, log entries about what changed since the last call, and the controller's reference angles in rad.
         """
         host_state = _decode_status(status)
         control_state = _decode_control(control)
         state = State(
+            # Reported by the host.
             lifecycle=host_state.lifecycle,
             lifecycle_reason=host_state.reason,
+            faults=len(host_state.faults),
+            # Reported by the controller.
             locomotion=control_state.state,
             reason=control_state.reason,
             propulsion_joint=control_state.propulsion_joint or "",
             jammed=control_state.jammed,
             saturated=control_state.saturated,
-            faults=len(host_state.faults),
             path_s_m=_unset_if_none(control_state.path_s_m),
             propulsion_n=_unset_if_none(control_state.propulsion_n),
             propulsion_torque_nm=_unset_if_none(control_state.propulsion_torque_nm),
             torque_headroom_nm=_unset_if_none(control_state.torque_headroom_nm),
             custom=control_state.custom,
         )
-        return StateUpdate(state, self._make_logs(state, time_ns), control_state.reference_rad)
+        logs = self._make_logs(state, time_ns)
+        return StateUpdate(state, logs, control_state.reference_rad)
 
     def _make_logs(self, state: State, time_ns: int) -> list[Log]:
-        """Return a log entry for the host and for the controller, if its state or reason has changed."""
+        """Return log entries for viewers: one for the host and one for the controller, if its state has changed.
+
+        Args:
+            state: The state of host and controller now.
+            time_ns: Robot time.
+
+        Returns:
+            An entry for each of both whose state, or the reason of it, differs from the last call; often none.
+        """
         host_level = Log.INFO
         if state.lifecycle in ("fault", "estop"):
             host_level = Log.ERROR
         host_reason, _, _ = state.lifecycle_reason.partition("; ")
+        host_entry = self._make_log("hal", state.lifecycle, host_reason, host_level, time_ns)
+
         control_level = Log.INFO
         if state.jammed or state.saturated:
             control_level = Log.WARNING
-        logs: list[Log] = []
-        for source, name, reason, level in (
-            ("hal", state.lifecycle, host_reason, host_level),
-            ("control", state.locomotion, state.reason, control_level),
-        ):
-            entry = self._make_log(source, name, reason, level, time_ns)
-            if entry is not None:
-                logs.append(entry)
-        return logs
+        control_entry = self._make_log("control", state.locomotion, state.reason, control_level, time_ns)
+        return [entry for entry in (host_entry, control_entry) if entry is not None]
 
     def _make_log(self, source: str, name: str, reason: str, level: "Log.Level.ValueType", time_ns: int) -> Log | None:
         """Return a log entry for the state of a source, or None if it is logged or was never known."""

@@ -111,6 +111,13 @@ class RecordingContents:
             self.refused[f"{recorded.key}: {error}"[:200]] += 1
 
     def _keep(self, key: str, message: Any, wall_ns: int) -> None:
+        """Store a decoded message by its type, as far as the record of a run needs it.
+
+        Args:
+            key: Key at which the message was published.
+            message: The decoded message.
+            wall_ns: Wall clock at which the message was recorded.
+        """
         match message:
             case Description():
                 self.description = message
@@ -120,16 +127,23 @@ class RecordingContents:
                 self.status = message
             case Clock(paused=True):
                 pass  # a paused clock names no tick
-            case World() | Trajectory() | ControlState():
-                if isinstance(message, Trajectory):
-                    self.searched_nodes[message.tick] = message.searched_nodes
-                stored = self.streams[key]
-                if not stored or _is_stored(stored[-1], message):
-                    stored.append(message)
+            case Trajectory():
+                self.searched_nodes[message.tick] = message.searched_nodes
+                self._add_to_stream(key, message)
+            case World() | ControlState():
+                self._add_to_stream(key, message)
+            case Clock():
+                self.messages_by_tick[key][message.tick] = message
+                if message.arm_session:
+                    self.armed_wall_ns.append(wall_ns)
             case _:
                 self.messages_by_tick[key][message.tick] = message
-                if isinstance(message, Clock) and message.arm_session:
-                    self.armed_wall_ns.append(wall_ns)
+
+    def _add_to_stream(self, key: str, message: Any) -> None:
+        """Append a message of a service, unless the stream does not need it after the one before."""
+        stream = self.streams[key]
+        if not stream or _is_stored(stream[-1], message):
+            stream.append(message)
 
     def describe_unreached(self, ticks: int) -> list[str]:
         """Describe the ticks that did not reach the recorder: nothing in the file itself shows them.
@@ -149,27 +163,32 @@ class RecordingContents:
         return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
     def collect_outputs(self, robot: Description, time_s: Floats, unreached: Sequence[str] = ()) -> RunOutputs:
-        """Return what services and custom sensors published.
+        """Return what guidance, navigation, control and custom sensors published in the run.
 
         Args:
             robot: The robot that has the custom sensors.
-            time_s: (n,) robot time of each row, for the columns of custom sensors.
+            time_s: (n,) robot time of each row, for the columns of custom sensors and of the controller's telemetry.
             unreached: Sentences about data that did not reach the recorder.
         """
         control = self.streams[keys.CONTROL_STATE].copy()
-        while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
+        # At the end of a run the host stops its clock, and control reports PowerOff: this is not a part of the run.
+        while control and control[-1].state == "PowerOff":
             control.pop()
+
+        # Messages of custom sensors are decoded only now, so that some may be refused only now.
         refused_before = self.refused.copy()
-        custom = self.make_custom_columns(robot, time_s) | make_telemetry_columns(control, time_s)
-        undecodable = describe_undecodable(self.refused - refused_before)
+        sensor_columns = self.make_custom_columns(robot, time_s)
+        newly_undecodable = describe_undecodable(self.refused - refused_before)
+
+        telemetry_columns = make_telemetry_columns(control, time_s)
         return RunOutputs(
             control=control,
             worlds=self.streams[keys.WORLD],
             trajectories=self.streams[keys.TRAJECTORY],
             searched_nodes=self.searched_nodes,
-            custom=custom,
+            custom=sensor_columns | telemetry_columns,
             replay_of=self.replay_of,
-            missing=[*undecodable, *unreached, *self.missing],
+            missing=[*newly_undecodable, *unreached, *self.missing],
             unreached=list(unreached),
         )
 
@@ -196,52 +215,69 @@ class RecordingContents:
         return columns
 
     def _rows(self, joint_count: int) -> list["_Row"]:
-        """Return the armed ticks of which joints, setpoints and clock are all known."""
-        joints = self.messages_by_tick[keys.JOINTS]
+        """Return a row for each armed tick at which joint state, applied setpoints and clock are all known.
+
+        Pose and contacts may be published less often than joint states: a row has their newest samples.
+
+        Args:
+            joint_count: Number of joints; a joint state of another size is left out.
+        """
+        joint_states = self.messages_by_tick[keys.JOINTS]
         applied = self.messages_by_tick[keys.APPLIED]
         clocks = self.messages_by_tick[keys.CLOCK]
         poses = self.messages_by_tick[keys.POSE]
         contacts = self.messages_by_tick[keys.CONTACTS]
         rows: list[_Row] = []
-        pose = [np.nan] * 7
+        newest_pose = [np.nan] * 7
         peak_n = 0.0
-        touched = 0
-        for tick in sorted(joints.keys() | poses.keys() | contacts.keys()):
+        contact_count = 0
+        for tick in sorted(joint_states.keys() | poses.keys() | contacts.keys()):
             if tick in poses:
-                pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
+                newest_pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
             if tick in contacts:
-                peak_n, touched = summarize_contacts(contacts[tick])
-            if tick not in joints or tick not in applied or tick not in clocks:
+                peak_n, contact_count = summarize_contacts(contacts[tick])
+            is_complete = tick in joint_states and tick in applied and tick in clocks
+            if not is_complete:
                 continue
-            state = joints[tick]
-            if clocks[tick].arm_session and state.has_joint_count(joint_count):
-                rows.append(_Row(tick, state, applied[tick], pose, peak_n, touched))
+            joint_state = joint_states[tick]
+            is_armed = bool(clocks[tick].arm_session)
+            if is_armed and joint_state.has_joint_count(joint_count):
+                rows.append(_Row(tick, joint_state, applied[tick], newest_pose, peak_n, contact_count))
         return rows
 
     def make_custom_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return columns of the custom sensors: at each row the newest sample, and its age.
 
-        They are called `bend_rad.left` and `age_s.left`. NaN: no sample came yet. Counts samples that cannot be
-        decoded in `refused`.
+        Samples that cannot be decoded are counted in `refused`.
 
         Args:
             robot: The robot that has the sensors.
             time_s: (n,) robot time of each row.
+
+        Returns:
+            Columns (n,) by name. A sensor `left` that measures `bend_rad` has the columns `bend_rad.left` and
+            `age_s.left`. A value is NaN before the first sample.
         """
         columns: dict[str, NDArray[np.float64]] = {}
-        for key, kind in find_custom_messages(robot).items():
+        for key, message_type in find_custom_messages(robot).items():
             sensor = key.rpartition("/")[2]
-            samples = self._custom_samples(key, kind)
+            samples = self._custom_samples(key, message_type)
             ticks = np.array(sorted(samples), dtype=np.int64)
-            row = np.searchsorted(ticks * (robot.period_ns * 1e-9), time_s + 1e-9, side="right") - 1
+            sampled_s = ticks * (robot.period_ns * 1e-9)
+            newest = np.searchsorted(sampled_s, time_s + 1e-9, side="right") - 1  # (n,); -1 before the first sample
             in_order = [samples[tick] for tick in ticks.tolist()]
-            names = dict.fromkeys(name for _, numbers in samples.values() for name in numbers) or kind.units
-            for name in names:
+
+            # The dictionary keeps the order in which the samples name their numbers.
+            number_names: dict[str, Any] = {}
+            for _, numbers in samples.values():
+                number_names |= dict.fromkeys(numbers)
+            for name in number_names or message_type.units:
                 quantity, dot, part = name.partition(".")
                 values = [numbers.get(name, np.nan) for _, numbers in in_order]
-                columns[f"{quantity}.{sensor}{dot}{part}"] = _values_at(values, row)
-            sampled_at_s = _values_at([timestamp_ns * 1e-9 for timestamp_ns, _ in in_order], row)
-            columns[f"age_s.{sensor}"] = time_s - sampled_at_s
+                columns[f"{quantity}.{sensor}{dot}{part}"] = _values_at(values, newest)
+
+            timestamps_s = [timestamp_ns * 1e-9 for timestamp_ns, _ in in_order]
+            columns[f"age_s.{sensor}"] = time_s - _values_at(timestamps_s, newest)
         return columns
 
     def _custom_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
@@ -258,19 +294,24 @@ class RecordingContents:
         return samples
 
     def make_host_record(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
-        """Return the host's statistics, as far as the recording shows them.
+        """Return the host's statistics of the run, as far as the recording shows them.
+
+        Args:
+            columns: Columns of the run by name, with a row for each tick, as in the black box.
 
         Raises:
             ConfigError: The recording holds no status of the host.
         """
         status = self.status
         if status is None:
-            why = "; ".join(["", *self.missing])
+            reasons = "; ".join(["", *self.missing])
             raise ConfigError(
-                f"{self.path}: holds no hal/status, so it is not known what became of the run{why}",
+                f"{self.path}: holds no hal/status, so it is not known what became of the run{reasons}",
                 code="recording/missing-data",
             )
-        armed = {tick for tick, clock in self.messages_by_tick[keys.CLOCK].items() if clock.lifecycle == "armed"}
+        clocks = self.messages_by_tick[keys.CLOCK]
+        armed_ticks = {tick for tick, clock in clocks.items() if clock.lifecycle == "armed"}
+        answered_ticks = armed_ticks & self.messages_by_tick[keys.JOINT_COMMAND].keys()
         wall_s = 0.0
         if self.armed_wall_ns:
             wall_s = (self.armed_wall_ns[-1] - self.armed_wall_ns[0]) * 1e-9
@@ -278,8 +319,8 @@ class RecordingContents:
             ticks=len(columns["tick"]),
             wall_s=wall_s,
             overruns=status.overruns,
-            answered_ticks=len(armed & self.messages_by_tick[keys.JOINT_COMMAND].keys()),
-            armed_ticks=len(armed),
+            answered_ticks=len(answered_ticks),
+            armed_ticks=len(armed_ticks),
             command_digest=compute_digest(columns),
             state_to_command_us={"p50": None, "p99": None},
             tick_times=status.tick_times,
@@ -336,12 +377,15 @@ def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.floa
 def read_recording(
     path: Path, selected_keys: Collection[str] = ALL, on_message: Callable[[RecordedMessage], None] | None = None
 ) -> RecordingContents:
-    """Read a recording's messages at some keys.
+    """Read the messages of a recording.
 
     Args:
-        path: The recording.
-        selected_keys: The keys to read.
-        on_message: Called with every message, at any key, so that the file need not be read again.
+        path: The recording, an MCAP file.
+        selected_keys: The keys whose messages are decoded and returned.
+        on_message: Called with every message, at any key, so that a caller need not read the file a second time.
+
+    Returns:
+        The messages, and what is missing in the file. Applied setpoints are counted even if their key is not selected.
 
     Raises:
         ConfigError: The file is no recording.
@@ -350,8 +394,10 @@ def read_recording(
 
     contents = RecordingContents(path)
     reader = RecordingReader(path)
-    read_keys = {*selected_keys, keys.APPLIED} if on_message is None else None
-    for recorded in reader.read_messages(read_keys):
+    keys_to_read = None  # all
+    if on_message is None:
+        keys_to_read = {*selected_keys, keys.APPLIED}
+    for recorded in reader.read_messages(keys_to_read):
         if recorded.key == keys.APPLIED:
             contents.ticks += 1
             contents.last_tick_ns = recorded.time_ns
@@ -359,6 +405,7 @@ def read_recording(
             on_message(recorded)
         if recorded.key in selected_keys or keys.find_row_key(recorded.key) in selected_keys:
             contents.add(recorded)
+
     contents.missing += describe_undecodable(contents.refused)
     contents.missing += [f"recording: {sentence}" for sentence in reader.missing]
     contents.finished = reader.finished

@@ -70,15 +70,15 @@ class RunRecord:
 
     @staticmethod
     def load(path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None) -> "RunRecord":
-        """Read a run's folder, also of a run that was killed, or a recording.
+        """Load the record of a run from its folder or from a recording. The run may have been killed.
 
         Args:
-            path: The folder or the recording.
-            host: The host's statistics, if known from elsewhere; None: from the store.
-            on_message: Called with every message of the recording.
+            path: The folder of the run, or the recording.
+            host: The host's statistics, if known from elsewhere; None: read them from `path`.
+            on_message: Called with every message of the recording while it is read.
 
         Raises:
-            ConfigError: It is neither of both, or damaged.
+            ConfigError: The path is neither the folder of a run nor a recording, or the record is damaged.
         """
         reader = open_run(path, host, on_message)
         try:
@@ -86,23 +86,34 @@ class RunRecord:
         except ConfigError:
             raise
         except DAMAGED as error:
-            why = f"{type(error).__name__}: {error}"[:300]
+            reason = f"{type(error).__name__}: {error}"[:300]
             raise ConfigError(
-                f"{path}: the record of this run is damaged ({why}); run it again", code="recording/not-readable"
+                f"{path}: the record of this run is damaged ({reason}); run it again", code="recording/not-readable"
             ) from None
 
     @staticmethod
     def read(reader: RunReader) -> "RunRecord":
-        """Read everything from one store, remove invalid numbers, and collect what is missing."""
+        """Read the record of a run, replace invalid numbers by NaN, and collect what is missing.
+
+        Args:
+            reader: Reads the folder of a run, or a recording.
+
+        Raises:
+            ConfigError: A part of the record cannot be read.
+        """
         config = reader.read_config()
         description = reader.read_description()
-        has_pose = config.robot.sensors.pose is not None
-        columns, invalid = replace_invalid_numbers(reader.read_ticks(), description, has_pose=has_pose)
+        has_pose_sensor = config.robot.sensors.pose is not None
+        columns, invalid_sentences = replace_invalid_numbers(reader.read_ticks(), description, has_pose=has_pose_sensor)
         outputs = reader.read_outputs(columns["time_s"])
+
+        # Ticks that the host counted but that are not in the columns are lost, even if no loss was reported.
         host = reader.read_host_record()
-        lost_ticks = max(host.lost_ticks, host.ticks - len(columns["tick"]))
+        tick_count = len(columns["tick"])
+        lost_ticks = max(host.lost_ticks, host.ticks - tick_count)
         host = msgspec.structs.replace(host, lost_ticks=lost_ticks)
-        del columns["tick"]
+
+        del columns["tick"]  # the other columns are fields of the record, by the same names
         return RunRecord(
             folder=reader.path,
             config=config,
@@ -116,7 +127,7 @@ class RunRecord:
             custom=outputs.custom,
             replay_of=outputs.replay_of,
             ending=reader.describe_ending(),
-            missing=[*invalid, *describe_unwritten(host), *outputs.missing],
+            missing=[*invalid_sentences, *describe_unwritten(host), *outputs.missing],
             unreached=outputs.unreached,
             config_path=reader.config_path,
             recording_path=reader.recording_path,

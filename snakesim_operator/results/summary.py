@@ -267,7 +267,16 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
 
 
 def _reported_numbers(record: RunRecord, motion: Motion | None, last_report: ControlState | None) -> dict[str, Any]:
-    """Return the fields of a summary that are about the states which control reported."""
+    """Return the fields of a run's summary that are about the states which the controller reported.
+
+    Args:
+        record: The recorded run.
+        motion: When the body moved, as measured; None: unknown.
+        last_report: The controller's last message; None: the controller published none.
+
+    Returns:
+        Values by field of RunSummary; None: unknown.
+    """
     propulsion_joints = None
     hand_overs = None
     if record.control:
@@ -287,25 +296,46 @@ def _reported_numbers(record: RunRecord, motion: Motion | None, last_report: Con
 
 
 def _load_numbers(record: RunRecord, *, has_power: bool) -> dict[str, Any]:
-    """Return the fields of a summary that are about torques, contact forces and energy."""
+    """Return the fields of a run's summary that are about torques, contact forces and energy.
+
+    Args:
+        record: The recorded run.
+        has_power: Whether torques and speeds are known, so that the energy can be computed.
+
+    Returns:
+        Values by field of RunSummary; None: unknown.
+    """
     has_ticks = len(record.time_s) > 0
     saturated_fraction = None
     if has_ticks:
         limits_nm = np.array([joint.torque_limit_nm for joint in record.description.joints])
-        is_saturated = (np.abs(record.torque_nm) >= SATURATED_FROM * limits_nm).any(axis=1)
-        saturated_fraction = float(is_saturated.mean())
-    tracking = force_tracking(record.control)
-    return {
+        is_saturated = np.abs(record.torque_nm) >= SATURATED_FROM * limits_nm  # (n, joints)
+        saturated_fraction = float(is_saturated.any(axis=1).mean())
+    peak_contact_force_n = None
+    if record.feels_contacts and has_ticks:
+        peak_contact_force_n = largest(record.contact_peak_n)
+
+    fields: dict[str, Any] = {
         "peak_joint_torque_nm": largest(np.abs(record.torque_nm)),
         "torque_saturated_fraction": saturated_fraction,
-        "peak_contact_force_n": largest(record.contact_peak_n) if record.feels_contacts and has_ticks else None,
-        "desired_force_correlation": tracking.correlation if tracking else None,
-        "desired_force_error": tracking.median_error if tracking else None,
-        "empty_push_points": tracking.empty if tracking else None,
-        "energy_j": energy_j(record) if has_power else None,
-        "torque_joints_j": work_j(record, Mode.TORQUE) if has_power else None,
-        "position_joints_j": work_j(record, Mode.POSITION) if has_power else None,
+        "peak_contact_force_n": peak_contact_force_n,
+        "desired_force_correlation": None,
+        "desired_force_error": None,
+        "empty_push_points": None,
+        "energy_j": None,
+        "torque_joints_j": None,
+        "position_joints_j": None,
     }
+    tracking = force_tracking(record.control)
+    if tracking:
+        fields["desired_force_correlation"] = tracking.correlation
+        fields["desired_force_error"] = tracking.median_error
+        fields["empty_push_points"] = tracking.empty
+    if has_power:
+        fields["energy_j"] = energy_j(record)
+        fields["torque_joints_j"] = work_j(record, Mode.TORQUE)
+        fields["position_joints_j"] = work_j(record, Mode.POSITION)
+    return fields
 
 
 def _advance_numbers(record: RunRecord, advance: Advance | None, *, has_power: bool) -> dict[str, Any]:
@@ -354,21 +384,34 @@ def largest(values: np.ndarray) -> float | None:
 
 
 def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
-    """Return the distances from the first known pose to the last: along the route, and straight; and the time."""
-    posed = np.flatnonzero(record.posed)
-    if len(posed) < 2:
+    """Measure how far the body moved from its first known pose to its last.
+
+    Returns:
+        path_m: Advance along the route, mean over the body, in m; None without a route or without poses.
+        net_m: Net displacement of the center of mass, in m; None without poses.
+        known_s: Time between the two poses, in s; 0 without poses.
+    """
+    posed_rows = np.flatnonzero(record.posed)
+    if len(posed_rows) < 2:
         return None, None, 0.0
-    first_row = int(posed[0])
-    last_row = int(posed[-1])
+    first_row = int(posed_rows[0])
+    last_row = int(posed_rows[-1])
     first_nodes = record.nodes_w(first_row)
     last_nodes = record.nodes_w(last_row)
     if first_nodes is None or last_nodes is None:
         return None, None, 0.0
+
     robot = record.description
-    net_m = float(np.linalg.norm(body_center_w(robot, last_nodes) - body_center_w(robot, first_nodes)))
+    displacement_w = body_center_w(robot, last_nodes) - body_center_w(robot, first_nodes)
+    net_m = float(np.linalg.norm(displacement_w))
+
+    path_m = None
     start_m = arc_position_m(record, first_row)
     end_m = arc_position_m(record, last_row)
-    path_m = None if start_m is None or end_m is None else end_m - start_m
-    ticks = int(record.ticks[last_row] - record.ticks[first_row]) + 1  # those in a gap count: the body moved in it
-    known_s = ticks * record.config.period_ns * 1e-9
+    if start_m is not None and end_m is not None:
+        path_m = end_m - start_m
+
+    # Ticks that are missing in a gap count as well, because the body moved during the gap.
+    tick_count = int(record.ticks[last_row] - record.ticks[first_row]) + 1
+    known_s = tick_count * record.config.period_ns * 1e-9
     return path_m, net_m, known_s

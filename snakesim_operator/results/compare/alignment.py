@@ -34,24 +34,34 @@ class Aligned:
 
 
 def align(a: RunRecord, b: RunRecord) -> Aligned:
-    """Put two runs on one time axis.
+    """Sample two runs at common times, over the time that both have.
 
-    They are compared tick by tick where the ticks coincide, else both at the ticks of the one that has fewer. Measured
-    values are interpolated between ticks; a setpoint holds until the next one.
+    If both have the same ticks, these are the common times. Otherwise they are the ticks of the run that has fewer, and
+    the other run is sampled there: measured values are interpolated, and a setpoint holds until the next one.
+
+    Args:
+        a: The first run.
+        b: The second run.
+
+    Returns:
+        The joints of both runs at the common times, and a description of how they were sampled.
     """
     time_a = a.time_s - zero_s(a)
     time_b = b.time_s - zero_s(b)
-    until_s = min(float(time_a[-1]), float(time_b[-1])) + SAME_INSTANT_S
-    within_a = time_a[time_a <= until_s]
-    within_b = time_b[time_b <= until_s]
-    if len(within_a) == len(within_b) and np.allclose(within_a, within_b, rtol=0, atol=SAME_INSTANT_S):
-        grid = within_a
+    common_end_s = min(float(time_a[-1]), float(time_b[-1])) + SAME_INSTANT_S
+    common_time_a = time_a[time_a <= common_end_s]
+    common_time_b = time_b[time_b <= common_end_s]
+    has_same_ticks = len(common_time_a) == len(common_time_b) and np.allclose(
+        common_time_a, common_time_b, rtol=0, atol=SAME_INSTANT_S
+    )
+    if has_same_ticks:
+        grid = common_time_a
         how = "tick by tick"
-    elif len(within_a) <= len(within_b):
-        grid = within_a
+    elif len(common_time_a) <= len(common_time_b):
+        grid = common_time_a
         how = f"{_describe_rates(a, b)}: B is interpolated at the ticks of A"
     else:
-        grid = within_b
+        grid = common_time_b
         how = f"{_describe_rates(a, b)}: A is interpolated at the ticks of B"
     return Aligned(grid, _sample_joints(a, time_a, grid), _sample_joints(b, time_b, grid), how)
 

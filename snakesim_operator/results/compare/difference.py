@@ -169,8 +169,15 @@ class Difference:
 def differ(a: RunRecord, b: RunRecord) -> Difference:
     """Compare two runs of robots with the same joints.
 
+    Args:
+        a: The first run.
+        b: The second run. All differences are B - A.
+
+    Returns:
+        The comparison over the time that both runs have in common.
+
     Raises:
-        ConfigError: They cannot be compared.
+        ConfigError: The runs cannot be compared.
     """
     _check_comparable(a, b)
     aligned = align(a, b)
@@ -178,9 +185,13 @@ def differ(a: RunRecord, b: RunRecord) -> Difference:
     joints_b = aligned.b
     time_s = aligned.time_s
     until_s = float(time_s[-1])
-    same_mode = joints_a.mode == joints_b.mode
+    same_mode = joints_a.mode == joints_b.mode  # (n, joints)
     angle = _compare_quantity("angle", "rad", time_s, joints_a.angle_rad, joints_b.angle_rad)
-    angle_pairs = zip(joints_a.angle_rad.T, joints_b.angle_rad.T, strict=True)
+    speed = _compare_quantity("speed", "rad/s", time_s, joints_a.velocity_rad_s, joints_b.velocity_rad_s)
+    torque = _compare_quantity("torque", "N·m", time_s, joints_a.torque_nm, joints_b.torque_nm)
+    angles_by_joint = zip(joints_a.angle_rad.T, joints_b.angle_rad.T, strict=True)
+    lags_and_gains = [following(time_s, angle_a, angle_b) for angle_a, angle_b in angles_by_joint]
+    hand_overs = HandOvers(_hand_overs_until(a, until_s), _hand_overs_until(b, until_s), _describe_unreported(a, b))
     return Difference(
         a=a,
         b=b,
@@ -192,21 +203,25 @@ def differ(a: RunRecord, b: RunRecord) -> Difference:
         drives=drives_in_words(a, b),
         # What was measured.
         advance=_compare_advance(a, b, until_s),
-        following=[following(time_s, in_a, in_b) for in_a, in_b in angle_pairs],
+        following=lags_and_gains,
         angle=angle,
-        speed=_compare_quantity("speed", "rad/s", time_s, joints_a.velocity_rad_s, joints_b.velocity_rad_s),
-        torque=_compare_quantity("torque", "N·m", time_s, joints_a.torque_nm, joints_b.torque_nm),
+        speed=speed,
+        torque=torque,
         # What was commanded and reported.
         targets=_compare_targets(aligned, same_mode),
         other_mode=float(1 - same_mode.mean()),
         tracking_rad=(_tracking_error_rad(joints_a), _tracking_error_rad(joints_b)),
-        hand_overs=HandOvers(_hand_overs_until(a, until_s), _hand_overs_until(b, until_s), _describe_unreported(a, b)),
+        hand_overs=hand_overs,
         divergence=_find_divergence(time_s, angle.difference),
     )
 
 
 def _check_comparable(a: RunRecord, b: RunRecord) -> None:
-    """Raise ConfigError if a run has no tick, if the joints differ, or if an array is damaged."""
+    """Check that two runs have ticks, the same joints, and arrays that fit to each other.
+
+    Raises:
+        ConfigError: A run has no tick, the joints differ, or an array is damaged.
+    """
     for record in (a, b):
         if not len(record.time_s):
             raise ConfigError(
@@ -216,7 +231,10 @@ def _check_comparable(a: RunRecord, b: RunRecord) -> None:
                 code="recording/never-armed",
             )
     if a.description.layout != b.description.layout:
-        robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]
+        robots: list[str] = []
+        for record in (a, b):
+            joint_count = len(record.description.joints)
+            robots.append(f"{record.folder} has {record.description.robot} with {joint_count} joints")
         raise ConfigError(
             f"{', '.join(robots)}: their names, order or axes are not the same, so there is no joint to compare with "
             "which. Compare runs of one robot file",
@@ -268,31 +286,35 @@ def _compare_targets(aligned: Aligned, same_mode: NDArray[np.bool_]) -> list[Gap
 def _compare_quantity(
     what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: NDArray[np.bool_] | None = None
 ) -> Gap:
-    """Compare one quantity of every joint.
+    """Compare one quantity of every joint, such as the angle, between two runs.
+
+    A value that is not finite in one of the runs is unknown; it does not count in the RMS and the maximum.
 
     Args:
         what: Name of the quantity.
-        unit: Its unit.
+        unit: Unit of the quantity.
         time_s: (n,) the common times.
         a: (n, joints) values in A.
         b: (n, joints) values in B.
         compared: (n, joints) where a comparison makes sense; None: everywhere.
     """
-    with np.errstate(invalid="ignore"):  # infinity less infinity is unknown too
+    with np.errstate(invalid="ignore"):  # infinity minus infinity is unknown too
         difference = b - a
     known = np.isfinite(difference)
-    wanted_count = known.size if compared is None else int(compared.sum())
-    unknown_fraction = 1 - known.sum() / wanted_count if wanted_count else 0.0
+    compared_count = known.size if compared is None else int(compared.sum())
+    unknown_fraction = 0.0
+    if compared_count:
+        unknown_fraction = 1 - known.sum() / compared_count
+
     squares = np.where(known, difference, 0.0) ** 2
-    known_count = known.sum(axis=0)
-    joint_rms = np.sqrt(np.where(known_count > 0, squares.sum(axis=0) / np.maximum(known_count, 1), np.nan))
-    joint_worst: list[MaxDifference | None] = []
-    for joint in range(difference.shape[1]):
-        if not known_count[joint]:
-            joint_worst.append(None)
-            continue
-        row = int(np.argmax(np.where(known[:, joint], squares[:, joint], -1.0)))
-        joint_worst.append(MaxDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint])))
+    known_count = known.sum(axis=0)  # (joints,)
+    mean_squares = squares.sum(axis=0) / np.maximum(known_count, 1)
+    joint_rms = np.sqrt(np.where(known_count > 0, mean_squares, np.nan))
+    total_rms = None
+    if known.any():
+        total_rms = float(np.sqrt(squares.sum() / known.sum()))
+
+    joint_worst = [_find_max_difference(joint, time_s, a, b, known) for joint in range(difference.shape[1])]
     known_worst = [worst for worst in joint_worst if worst is not None]
     return Gap(
         what=what,
@@ -300,11 +322,31 @@ def _compare_quantity(
         difference=difference,
         joint_rms=joint_rms,
         joint_worst=joint_worst,
-        rms=float(np.sqrt(squares.sum() / known.sum())) if known.any() else None,
+        rms=total_rms,
         worst=max(known_worst, key=lambda worst: abs(worst.difference), default=None),
         correlation=_correlation(a[known], b[known]),
         unknown_fraction=float(unknown_fraction),
     )
+
+
+def _find_max_difference(
+    joint: int, time_s: Floats, a: Floats, b: Floats, known: NDArray[np.bool_]
+) -> MaxDifference | None:
+    """Return the largest difference of one joint, or None if no value of the joint is known in both runs.
+
+    Args:
+        joint: Index of the joint.
+        time_s: (n,) the common times.
+        a: (n, joints) values in A.
+        b: (n, joints) values in B.
+        known: (n, joints) whether the value is known in both runs.
+    """
+    known_rows = np.flatnonzero(known[:, joint])
+    if not len(known_rows):
+        return None
+    squares = (b[known_rows, joint] - a[known_rows, joint]) ** 2
+    row = known_rows[np.argmax(squares)]
+    return MaxDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
 
 
 def _correlation(a: Floats, b: Floats) -> float | None:

@@ -24,7 +24,8 @@ class Following:
 def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
     """Fit lag and gain of one joint by least squares: b(t) = gain * a(t - lag) + constant.
 
-    The lag is found by a grid search whose step is halved until it is below LAG_RESOLUTION_S.
+    A grid search with the time step of the data finds the best lag. Its neighbors are then tried with a step that is
+    halved until it is below LAG_RESOLUTION_S.
 
     Args:
         time_s: (n,) the common times.
@@ -36,26 +37,31 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
     """
     if len(time_s) < MIN_INSTANTS or not (np.isfinite(a).all() and np.isfinite(b).all()):
         return None
+    # Leave out both ends, so that A is known at each time shifted by the largest lag.
     max_lag_s = min(MAX_LAG_S, float(time_s[-1] - time_s[0]) / 4)
-    within = (time_s >= time_s[0] + max_lag_s) & (time_s <= time_s[-1] - max_lag_s)
-    if within.sum() < MIN_INSTANTS or np.std(a[within]) < MIN_DEVIATION:
+    is_inside = (time_s >= time_s[0] + max_lag_s) & (time_s <= time_s[-1] - max_lag_s)
+    if is_inside.sum() < MIN_INSTANTS or np.std(a[is_inside]) < MIN_DEVIATION:
         return None
-    at_s = time_s[within]
-    target = b[within] - b[within].mean()
+    fit_time_s = time_s[is_inside]
+    centered_b = b[is_inside] - b[is_inside].mean()
 
-    def fit(lag_s: float) -> tuple[float, float, float]:
-        """Return the RMS that is left, the lag and the best gain for it."""
-        moved = np.interp(at_s - lag_s, time_s, a)
-        moved -= moved.mean()
-        power = float(moved @ moved)
-        gain = float(moved @ target) / power if power > 0 else 0.0
-        left = target - gain * moved
-        return float(np.sqrt(left @ left / len(left))), lag_s, gain
+    def fit_gain(lag_s: float) -> tuple[float, float, float]:
+        """Return the RMS of the residual, the lag, and the gain that minimizes the residual at this lag."""
+        shifted_a = np.interp(fit_time_s - lag_s, time_s, a)
+        shifted_a -= shifted_a.mean()
+        power = float(shifted_a @ shifted_a)
+        gain = float(shifted_a @ centered_b) / power if power > 0 else 0.0
+        residual = centered_b - gain * shifted_a
+        residual_rms = float(np.sqrt(residual @ residual / len(residual)))
+        return residual_rms, lag_s, gain
 
+    # Tuples compare by their first item, so that `min` selects the fit with the smallest residual.
     step_s = float(np.median(np.diff(time_s)))
-    count = max(int(max_lag_s / step_s), 1)
-    left, lag_s, gain = min(fit(lag * step_s) for lag in range(-count, count + 1))
+    max_step_count = max(int(max_lag_s / step_s), 1)
+    best = min(fit_gain(steps * step_s) for steps in range(-max_step_count, max_step_count + 1))
     while step_s > LAG_RESOLUTION_S:
         step_s /= 2
-        left, lag_s, gain = min((left, lag_s, gain), fit(lag_s - step_s), fit(lag_s + step_s))
-    return Following(lag_s, gain, left)
+        best_lag_s = best[1]
+        best = min(best, fit_gain(best_lag_s - step_s), fit_gain(best_lag_s + step_s))
+    residual_rms, lag_s, gain = best
+    return Following(lag_s, gain, residual_rms)

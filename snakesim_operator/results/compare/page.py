@@ -15,28 +15,35 @@ HAND_OVERS_SHOWN = 40
 
 
 def page(difference: Difference, tolerance_check: ToleranceCheck | None = None) -> str:
-    """Return the whole page as HTML. tolerance_check: the result of `--within`; None without this option."""
-    words = sentences(difference)
-    kind = ""
+    """Return the page that compares two runs, as HTML.
+
+    Args:
+        difference: The comparison of the runs A and B.
+        tolerance_check: The result of the option `--within`; None if the option is not set.
+    """
+    verdict = sentences(difference)
+    verdict_class = ""  # CSS class that colors the verdict; empty without a tolerance
     if tolerance_check is not None:
-        words = [*words, f"{tolerance_check.words[:1].upper()}{tolerance_check.words[1:]}."]
-        kind = "good" if tolerance_check.holds else "bad"
-    turns = list(zip_longest(difference.hand_overs.a, difference.hand_overs.b))
+        check_sentence = f"{tolerance_check.words[:1].upper()}{tolerance_check.words[1:]}."
+        verdict = [*verdict, check_sentence]
+        verdict_class = "good" if tolerance_check.holds else "bad"
+    records = (difference.a, difference.b)
+    hand_over_rows = list(zip_longest(difference.hand_overs.a, difference.hand_overs.b))
     return render(
         Path(__file__).parent / "compare.html",
         len(difference.joints),
-        title=" and ".join(record.folder.name for record in (difference.a, difference.b)),
+        title=" and ".join(record.folder.name for record in records),
         difference=difference,
         apart_rad=APART_RAD,
-        records=(difference.a, difference.b),
-        kind=kind,
-        verdict=" ".join(words),
+        records=records,
+        kind=verdict_class,
+        verdict=" ".join(verdict),
         maps=[("Angles", difference.angle), ("Torques", difference.torque)],
         figures=figures,
         worst=_worst(difference),
         who_propelled=who_propelled(difference),
-        turns=turns[:HAND_OVERS_SHOWN],
-        more_turns=len(turns) - HAND_OVERS_SHOWN,
+        turns=hand_over_rows[:HAND_OVERS_SHOWN],
+        more_turns=len(hand_over_rows) - HAND_OVERS_SHOWN,
         known=_known,
     )
 

@@ -16,54 +16,65 @@ MAX_HAND_OVERS_SHOWN = 8
 
 
 def table(difference: Difference) -> list[str]:
-    """Return the numbers of the page as lines of text."""
-    lines = [
-        _row("", "A", "B"),
-        *_compared(difference),
-        "",
-        *_settings(difference.settings),
-        *filter(None, [difference.drives]),
-        "",
-        f"over {difference.aligned.time_s[-1]:.2f} s from the first arming, {difference.aligned.how}",
-        *_distance(difference),
-        *_hand_overs(difference),
-        "",
-        f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when",
-        *(_gap(gap, difference.joints) for gap in difference.gaps),
-        *_torques_and_tracking(difference),
-        "",
-        *_by_joint(difference),
-        "",
-        *sentences(difference),
-    ]
+    """Return the comparison of two runs as lines of text for a terminal.
+
+    Args:
+        difference: The comparison of the runs A and B.
+
+    Returns:
+        Sections with an empty line between them: the runs, the settings that differ, how far they came, the differences
+        of angles, speeds and torques, a row for each joint, and sentences that sum up.
+    """
+    common_s = difference.aligned.time_s[-1]
+    gap_heading = f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when"
+    lines = [_row("", "A", "B"), *_compared(difference)]
+    lines += ["", *_settings(difference.settings)]
+    if difference.drives:
+        lines.append(difference.drives)
+    lines += ["", f"over {common_s:.2f} s from the first arming, {difference.aligned.how}"]
+    lines += _distance(difference)
+    lines += _hand_overs(difference)
+    lines += ["", gap_heading]
+    lines += [_gap(gap, difference.joints) for gap in difference.gaps]
+    lines += _torques_and_tracking(difference)
+    lines += ["", *_by_joint(difference)]
+    lines += ["", *sentences(difference)]
     return [line.rstrip() for line in lines]
 
 
 def for_scripts(difference: Difference) -> dict[str, Any]:
-    """Return the same numbers as plain values. Unknown is None."""
-    advance = difference.advance
-    divergence = difference.divergence
-    names = difference.joints
+    """Return the numbers of a comparison of two runs as plain values that JSON can hold.
+
+    Args:
+        difference: The comparison of the runs A and B.
+
+    Returns:
+        The values by name. A value that is unknown is None.
+    """
+    joint_names = difference.joints
     moved = None
+    advance = difference.advance
     if advance is not None:
         moved = {"a": advance.a_m, "b": advance.b_m, "percent": advance.percent}
     divergence = None
-    if divergence is not None:
-        divergence = {"joint": names[divergence.joint], "time_s": divergence.time_s}
+    first_divergence = difference.divergence
+    if first_divergence is not None:
+        divergence = {"joint": joint_names[first_divergence.joint], "time_s": first_divergence.time_s}
+    settings = {setting.key: {"a": setting.a, "b": setting.b} for setting in difference.settings}
     return {
         "identical": difference.identical,
         "missing": {"a": difference.a.missing, "b": difference.b.missing},
         "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
-        "settings": {setting.key: {"a": setting.a, "b": setting.b} for setting in difference.settings},
+        "settings": settings,
         "drives": drive_identities(difference.a, difference.b),
         "time_s": float(difference.aligned.time_s[-1]),
         "moved_m": moved,
-        "gaps": [_gap_values(gap, names) for gap in difference.gaps],
+        "gaps": [_gap_values(gap, joint_names) for gap in difference.gaps],
         "by_joint": _joint_values(difference),
         "divergence": divergence,
         "hand_overs": {
-            "a": _hand_over_values(difference.hand_overs.a, names),
-            "b": _hand_over_values(difference.hand_overs.b, names),
+            "a": _hand_over_values(difference.hand_overs.a, joint_names),
+            "b": _hand_over_values(difference.hand_overs.b, joint_names),
         },
     }
 
@@ -144,24 +155,32 @@ def _distance(difference: Difference) -> list[str]:
 
 
 def _hand_overs(difference: Difference) -> list[str]:
-    both = difference.hand_overs
-    names = difference.joints
-    if both.unknown:
-        return [f"  {'propulsion joints':<{NAME_WIDTH}}{both.unknown}"]
-    if not both.a and not both.b:
+    """Return the rows of the table about the joints that propelled, in order of time.
+
+    A row for each hand-over that both runs have in common gives its time in A, its time in B, and how much later it is
+    in B. If the order of the joints differs after these, two more rows name the joints that followed.
+    """
+    hand_overs = difference.hand_overs
+    joint_names = difference.joints
+    if hand_overs.unknown:
+        return [f"  {'propulsion joints':<{NAME_WIDTH}}{hand_overs.unknown}"]
+    if not hand_overs.a and not hand_overs.b:
         return ["  no joint propelled in either"]
-    lines = [_row("propulsion joints", f"{len(both.a)} in a row", f"{len(both.b)} in a row")]
-    for i, later_s in enumerate(both.later_s[:MAX_HAND_OVERS_SHOWN]):
-        a = both.a[i]
-        b = both.b[i]
-        lines.append(_row(f"  {names[a.joint]}", f"{a.start_s:.2f} s", f"{b.start_s:.2f} s", f"{later_s:+.2f} s"))
-    if both.agreed > MAX_HAND_OVERS_SHOWN:
-        lines.append(
-            f"    and {both.agreed - MAX_HAND_OVERS_SHOWN} more that agree; the last is {both.later_s[-1]:+.2f} s"
-        )
-    if not both.same_order:
-        lines.append(f"    from there on A: {order_in_words(names, both.a[both.agreed :])}")
-        lines.append(f"    from there on B: {order_in_words(names, both.b[both.agreed :])}")
+
+    lines = [_row("propulsion joints", f"{len(hand_overs.a)} in a row", f"{len(hand_overs.b)} in a row")]
+    for i, later_s in enumerate(hand_overs.later_s[:MAX_HAND_OVERS_SHOWN]):
+        in_a = hand_overs.a[i]
+        in_b = hand_overs.b[i]
+        name = f"  {joint_names[in_a.joint]}"
+        lines.append(_row(name, f"{in_a.start_s:.2f} s", f"{in_b.start_s:.2f} s", f"{later_s:+.2f} s"))
+    hidden_count = hand_overs.agreed - MAX_HAND_OVERS_SHOWN
+    if hidden_count > 0:
+        lines.append(f"    and {hidden_count} more that agree; the last is {hand_overs.later_s[-1]:+.2f} s")
+    if not hand_overs.same_order:
+        rest_a = hand_overs.a[hand_overs.agreed :]
+        rest_b = hand_overs.b[hand_overs.agreed :]
+        lines.append(f"    from there on A: {order_in_words(joint_names, rest_a)}")
+        lines.append(f"    from there on B: {order_in_words(joint_names, rest_b)}")
     return lines
 
 

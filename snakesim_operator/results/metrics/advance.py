@@ -31,19 +31,30 @@ class Advance:
 
     @staticmethod
     def from_run(record: RunRecord) -> "Advance | None":
-        """Sample a run, or return None if its pose is never known."""
+        """Compute how a run advanced, from poses sampled every SAMPLE_S.
+
+        Both ends of each stretch without a gap are sampled too, so that nothing is interpolated over a gap that begins
+        or ends between two samples.
+
+        Args:
+            record: The recorded run.
+
+        Returns:
+            The advance; None if fewer than two poses are known.
+        """
         posed_rows = np.flatnonzero(record.posed)
         if len(posed_rows) < 2:
             return None
-        step = max(round(SAMPLE_S * record.config.rate_hz), 1)
-        # Both ends of a stretch, so that nothing is interpolated over a gap that begins or ends between two samples.
+        row_step = max(round(SAMPLE_S * record.config.rate_hz), 1)
         stretch_ends: list[int] = []
         for stretch in record.stretches:
             for row in (stretch[0], stretch[-1]):
                 if record.posed[row]:
                     stretch_ends.append(row)
-        sampled_rows = [posed_rows[::step], posed_rows[-1:], np.array(stretch_ends, dtype=np.int64)]
-        rows = np.unique(np.concatenate(sampled_rows))
+        periodic_rows = posed_rows[::row_step]
+        last_row = posed_rows[-1:]
+        end_rows = np.array(stretch_ends, dtype=np.int64)
+        rows = np.unique(np.concatenate([periodic_rows, last_row, end_rows]))
         nodes = np.array([record.nodes_w(int(row)) for row in rows])
         time_s = record.time_s[rows] - record.time_s[0]
         return Advance.along(record.config.mission.goal, record.description, time_s, nodes)

@@ -30,24 +30,31 @@ class Effort:
 
     @staticmethod
     def from_run(record: RunRecord, advance: Advance | None, *, has_power: bool) -> "Effort":
-        """Compute the effort of a run.
+        """Compute how fast a run advanced along its route, and at what effort.
 
         Args:
-            record: What was recorded of the run.
+            record: The recorded run.
             advance: How the run advanced; None: the pose is unknown.
-            has_power: Whether torques and speeds are known.
+            has_power: Whether torques and speeds are known, so that the energy can be computed.
+
+        Returns:
+            The values; None where they are unknown, which is all of them without a pose.
         """
         if advance is None or advance.until_s <= 0:
             return Effort()
+        cost_of_transport = None
+        if has_power:
+            cost_of_transport = _cost_of_transport(record, advance)
+        # Dragging the robot over flat ground costs its weight times the friction: compare with that.
+        propulsive_efficiency = None
         ground = record.config.scene.ground
-        transport = _cost_of_transport(record, advance) if has_power else None
-        efficiency = None
-        if transport is not None and transport > 0 and ground.heightfield is None:
-            efficiency = ground.friction / transport
+        is_flat = ground.heightfield is None
+        if cost_of_transport is not None and cost_of_transport > 0 and is_flat:
+            propulsive_efficiency = ground.friction / cost_of_transport
         return Effort(
             body_lengths_s=advance.reached_m / advance.until_s / _body_length_m(record),
-            cost_of_transport=transport,
-            propulsive_efficiency=efficiency,
+            cost_of_transport=cost_of_transport,
+            propulsive_efficiency=propulsive_efficiency,
             jam_ratio=min(advance.stalled_s / advance.until_s, 1.0),
             impulse_n_s_per_m=_impulse_n_s_per_m(record, advance),
             torque_headroom=_torque_headroom(record, advance),
@@ -76,31 +83,43 @@ class Directions:
     def from_run(
         record: RunRecord, advance: Advance | None, net_m: float | None, known_s: float, *, has_power: bool
     ) -> "Directions":
-        """Compute the effort of a run along both directions.
+        """Compute speed and energy use along the heading, and along the net displacement of the center of mass.
 
         Args:
-            record: What was recorded of the run.
+            record: The recorded run.
             advance: How the run advanced; None: the pose is unknown.
-            net_m: Net displacement of the center of mass.
-            known_s: Time within which that displacement was measured.
-            has_power: Whether torques and speeds are known.
+            net_m: Length of the net displacement of the center of mass, in m; None: unknown.
+            known_s: Time within which that displacement was measured, in s.
+            has_power: Whether torques and speeds are known, so that the energy can be computed.
+
+        Returns:
+            The values. All are None if the displacement is unknown; those of energy are None without power.
         """
         if advance is None or net_m is None or known_s <= 0:
             return Directions()
-        length_m = _body_length_m(record)
+        body_length_m = _body_length_m(record)
         weight_n = _weight_n(record)
         used_j = energy_j(record) if has_power else None
+
         heading_m = float(advance.along_heading_m[-1])
         heading_j_per_m = _energy_per_distance(used_j, heading_m)
+        heading_cost_of_transport = None
+        if heading_j_per_m is not None:
+            heading_cost_of_transport = heading_j_per_m / weight_n
+
         displacement_j_per_m = _energy_per_distance(used_j, net_m)
+        displacement_cost_of_transport = None
+        if displacement_j_per_m is not None:
+            displacement_cost_of_transport = displacement_j_per_m / weight_n
+
         return Directions(
             heading_advance_m=heading_m,
             heading_energy_j_per_m=heading_j_per_m,
-            heading_body_lengths_s=heading_m / known_s / length_m,
-            heading_cost_of_transport=None if heading_j_per_m is None else heading_j_per_m / weight_n,
+            heading_body_lengths_s=heading_m / known_s / body_length_m,
+            heading_cost_of_transport=heading_cost_of_transport,
             displacement_energy_j_per_m=displacement_j_per_m,
-            displacement_body_lengths_s=net_m / known_s / length_m,
-            displacement_cost_of_transport=None if displacement_j_per_m is None else displacement_j_per_m / weight_n,
+            displacement_body_lengths_s=net_m / known_s / body_length_m,
+            displacement_cost_of_transport=displacement_cost_of_transport,
         )
 
 
@@ -147,16 +166,24 @@ def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
 
 
 def _form_closure_fraction(record: RunRecord, advance: Advance) -> float | None:
-    """Return the fraction of the time in which the obstacles, as the scene places them, close the form."""
+    """Return the fraction of the time in which the obstacles beside the body hold it in form closure.
+
+    The obstacles are those of the scene, at their initial places. Poses are sampled every FORM_CLOSURE_PERIOD_NS, until
+    the end of the advance.
+
+    Returns:
+        A value between 0 and 1; 0 if the scene has no obstacles; None if no sampled pose is known.
+    """
     outlines = Outlines.from_obstacles([placed.obstacle for placed in record.placed if not placed.walkable])
     if not len(outlines):
         return 0.0
     radius_m = record.description.links[0].radius_m
     half_length_m = 0.5 * _body_length_m(record)
-    row_count = int(np.searchsorted(record.time_s, record.time_s[0] + advance.until_s))
-    step = max(round(FORM_CLOSURE_PERIOD_NS / record.description.period_ns), 1)
+    end_time_s = record.time_s[0] + advance.until_s
+    end_row = int(np.searchsorted(record.time_s, end_time_s))
+    row_step = max(round(FORM_CLOSURE_PERIOD_NS / record.description.period_ns), 1)
     margins: list[float] = []
-    for row in range(0, row_count, step):
+    for row in range(0, end_row, row_step):
         nodes = record.nodes_w(row)
         if nodes is None:
             continue
@@ -164,7 +191,8 @@ def _form_closure_fraction(record: RunRecord, advance: Advance) -> float | None:
         margins.append(form_closure_margin(places_w, normals_w, half_length_m))
     if not margins:
         return None
-    return sum(margin > 0.0 for margin in margins) / len(margins)
+    closed_count = sum(margin > 0.0 for margin in margins)
+    return closed_count / len(margins)
 
 
 def _planning_fraction(record: RunRecord, advance: Advance) -> float | None:

@@ -22,19 +22,29 @@ class Estimates:
 
     @staticmethod
     def from_run(record: RunRecord) -> "Estimates":
-        """Return the estimates of a run. Distances are known only where the pose was estimated by dead reckoning."""
+        """Return where guidance got its estimates from, and the error of its dead reckoning.
+
+        Args:
+            record: The recorded run, with the world states that guidance published.
+
+        Returns:
+            The estimates. Distance and error are None if no pose was estimated by dead reckoning.
+        """
         if not record.worlds or len(record.time_s) == 0:
             return Estimates()
-        last = record.worlds[-1]
+        newest = record.worlds[-1]
         dead_reckoned = [world for world in record.worlds if world.pose_from == "dead_reckoning"]
-        errors_m = [_position_error_m(record, world) for world in dead_reckoned]
-        known_errors_m = [error_m for error_m in errors_m if error_m is not None]
-        distance_m = (
-            _distance_between_m(record, dead_reckoned[0], dead_reckoned[-1]) if len(dead_reckoned) > 1 else None
-        )
+        known_errors_m: list[float] = []
+        for world in dead_reckoned:
+            error_m = _position_error_m(record, world)
+            if error_m is not None:
+                known_errors_m.append(error_m)
+        distance_m = None
+        if len(dead_reckoned) > 1:
+            distance_m = _distance_between_m(record, dead_reckoned[0], dead_reckoned[-1])
         return Estimates(
-            pose_from=last.pose_from,
-            contacts_from=last.contacts_from,
+            pose_from=newest.pose_from,
+            contacts_from=newest.contacts_from,
             dead_reckoned_distance_m=distance_m,
             dead_reckoning_error_m=max(known_errors_m, default=None),
         )

@@ -48,26 +48,39 @@ def is_measured(push_point: WorldContact, contacts: Iterable[WorldContact]) -> b
 
 
 def pairs(states: Sequence[ControlState]) -> list[Pair]:
-    """Return desired and measured forces of all push-points while the body locomotes, in order of time."""
+    """Pair each measured push-point force with the force that the controller requested there DELAY_S earlier.
+
+    The request is the newest message that is at least DELAY_S and at most twice DELAY_S older than the measurement.
+    Push-points match by their obstacle. Desired forces below ASKED_N are left out.
+
+    Args:
+        states: The controller's messages, in order of time.
+
+    Returns:
+        The pairs of all push-points while the body locomotes, in order of time.
+    """
     delay_ns = round(DELAY_S * 1e9)
     matched: list[Pair] = []
-    before = 0
+    request_index = 0
     for state in states:
-        if state.state != "Locomoting" or len(state.measured_force_n) != len(state.push_points):
+        has_all_forces = len(state.measured_force_n) == len(state.push_points)
+        if state.state != "Locomoting" or not has_all_forces:
             continue
         requested_ns = state.timestamp_ns - delay_ns
-        while before + 1 < len(states) and states[before + 1].timestamp_ns <= requested_ns:
-            before += 1
-        request = states[before]
+        while request_index + 1 < len(states) and states[request_index + 1].timestamp_ns <= requested_ns:
+            request_index += 1
+        request = states[request_index]
         if not requested_ns - delay_ns <= request.timestamp_ns <= requested_ns:
             continue
-        desired_n: dict[str | None, float] = {}
+        desired_n_by_obstacle: dict[str | None, float] = {}
         for point, force_n in zip(request.push_points, request.desired_force_n, strict=False):
-            desired_n[point.obstacle] = force_n
-        for point, measured_force_n in zip(state.push_points, state.measured_force_n, strict=True):
-            desired_force_n = desired_n.get(point.obstacle, 0.0)
-            if point.obstacle is not None and measured_force_n is not None and desired_force_n >= ASKED_N:
-                matched.append(Pair(state.timestamp_ns, point.obstacle, desired_force_n, measured_force_n))
+            desired_n_by_obstacle[point.obstacle] = force_n
+        for point, measured_n in zip(state.push_points, state.measured_force_n, strict=True):
+            if point.obstacle is None or measured_n is None:
+                continue
+            desired_n = desired_n_by_obstacle.get(point.obstacle, 0.0)
+            if desired_n >= ASKED_N:
+                matched.append(Pair(state.timestamp_ns, point.obstacle, desired_n, measured_n))
     return matched
 
 

@@ -34,26 +34,39 @@ def contacts_beside(nodes_w: Floats, radius_m: float, outlines: Outlines) -> tup
 
 
 def form_closure_margin(places_w: Floats, normals_w: Floats, length_m: float) -> float:
-    """Return the margin of form closure, without unit and at most 1; above 0 the contacts close the form.
+    """Return how well frictionless contacts hold a planar body in form closure.
+
+    Each contact blocks the planar twists x with w_k . x < 0, where w_k = (normal, moment / length) is its wrench. A
+    twist that is perpendicular to two wrenches is a candidate for an escape. The contacts close the form if, for every
+    such twist, some contact has a positive product and some contact a negative one. The margin is the minimum over
+    these twists, scaled to length 1, of -(max_k w_k . x) * (min_k w_k . x).
 
     Args:
-        places_w: (k, 2) places of the contacts.
-        normals_w: (k, 2) normals there.
-        length_m: The length l by which moments are divided.
+        places_w: (k, 2) places of the contacts, in m.
+        normals_w: (k, 2) unit normals at the contacts.
+        length_m: Length by which moments are divided, so that all components of a wrench have one unit.
 
     Returns:
-        The margin; 0 for fewer than four contacts, which cannot close the form.
+        The margin, without unit and at most 1; the form is closed if it is positive. It is 0 for fewer than four
+        contacts, which cannot close the form.
     """
     if len(places_w) < 4:
         return 0.0
     arms = (places_w - places_w.mean(axis=0)) / length_m
-    wrenches = np.column_stack([normals_w, arms[:, 0] * normals_w[:, 1] - arms[:, 1] * normals_w[:, 0]])
-    first, second = np.array(list(combinations(range(len(wrenches)), 2))).T
-    twists = np.cross(wrenches[first], wrenches[second])
+    moments = arms[:, 0] * normals_w[:, 1] - arms[:, 1] * normals_w[:, 0]
+    wrenches = np.column_stack([normals_w, moments])  # (k, 3)
+
+    contact_pairs = np.array(list(combinations(range(len(wrenches)), 2)))
+    first, second = contact_pairs.T
+    twists = np.cross(wrenches[first], wrenches[second])  # (pairs, 3)
     sizes = np.linalg.norm(twists, axis=1)
     is_regular = sizes > SINGULAR
-    products = (twists[is_regular] / sizes[is_regular, None]) @ wrenches.T  # w_k . x, (pairs, k)
-    products[np.abs(products) < SINGULAR] = 0.0  # of the two contacts of the pair
+    unit_twists = twists[is_regular] / sizes[is_regular, None]
+
+    products = unit_twists @ wrenches.T  # w_k . x, (pairs, k)
+    # The twist of a pair is perpendicular to both of its wrenches: remove the rounding error.
+    products[np.abs(products) < SINGULAR] = 0.0
     if not len(products):
         return 0.0
-    return float(np.min(-products.max(axis=1) * products.min(axis=1)))
+    margins = -products.max(axis=1) * products.min(axis=1)
+    return float(np.min(margins))

@@ -54,61 +54,76 @@ def score(
     head_w: Sequence[float] | Floats,
     heading_rad: float,
 ) -> MapScore:
-    """Score the obstacles whose outlines are within NEAR_M of the head.
+    """Compare a perceived map with the true obstacles within NEAR_M of the head.
+
+    A reported obstacle matches the true one whose outline is nearest to its side that faces the head, if the mean
+    distance is at most MATCH_M. Otherwise it is a ghost. A visible true obstacle without a match is a miss.
 
     Args:
         reported: The obstacles of the map.
         truth: The true obstacles.
-        head_w: (2,) or more, the front of the head.
+        head_w: (2,) or more, the front of the head, in m.
         heading_rad: Direction in which the camera looks.
     """
     head = np.asarray(head_w, dtype=np.float64)[:2]
     near_truth = _within(truth, head, NEAR_M + MATCH_M)
     true_outlines = Outlines.from_obstacles(near_truth)
     result = MapScore()
-    matched: set[str] = set()
+    matched_names: set[str] = set()
     for obstacle in _within(reported, head, NEAR_M):
         result.reported += 1
-        errors_m = np.abs(true_outlines.distance_m(facing_points_w(obstacle, head))).mean(axis=0)
-        best = int(np.argmin(errors_m)) if near_truth else -1
-        if best < 0 or errors_m[best] > MATCH_M:
+        if not near_truth:
             result.ghosts += 1
             continue
-        true = near_truth[best]
-        matched.add(true.name)
-        position_error_m = math.dist(obstacle.position_w[:2], true.position_w[:2])
+        distances_m = np.abs(true_outlines.distance_m(facing_points_w(obstacle, head)))  # (points, obstacles)
+        outline_errors_m = distances_m.mean(axis=0)
+        nearest = int(np.argmin(outline_errors_m))
+        if outline_errors_m[nearest] > MATCH_M:
+            result.ghosts += 1
+            continue
+        true_obstacle = near_truth[nearest]
+        matched_names.add(true_obstacle.name)
+        position_error_m = math.dist(obstacle.position_w[:2], true_obstacle.position_w[:2])
         result.position_m.append(position_error_m)
-        result.surface_m.append(float(errors_m[best]))
-        result.size_m.append(_size_m(obstacle) - _size_m(true))
+        result.surface_m.append(float(outline_errors_m[nearest]))
+        result.size_m.append(_size_m(obstacle) - _size_m(true_obstacle))
         result.in_sd.append(position_error_m / max(obstacle.position_sd_m, 1e-4))
-    for true in visible(truth, head, heading_rad):
+    for true_obstacle in visible(truth, head, heading_rad):
         result.visible += 1
-        if true.name not in matched:
+        if true_obstacle.name not in matched_names:
             result.misses += 1
     return result
 
 
 def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
-    """Return the obstacles near the head that a camera there sees.
+    """Return the obstacles within NEAR_M of the head that a camera at the head sees.
 
-    The center of such an obstacle is in the field of view, and no other obstacle hides half of its facing side.
+    An obstacle is visible if its center is in the field of view, its outline is at least MIN_RANGE_M away, and other
+    obstacles hide less than half of the side that faces the camera.
+
+    Args:
+        truth: The true obstacles.
+        head_w: (2,) position of the camera, in m.
+        heading_rad: Direction in which the camera looks.
     """
     near = _within(truth, head_w, NEAR_M)
     outlines = Outlines.from_obstacles(near)
-    seen: list[Obstacle] = []
+    visible_obstacles: list[Obstacle] = []
     for i, obstacle in enumerate(near):
         x, y = np.array(obstacle.position_w[:2]) - head_w
         bearing_rad = (math.atan2(y, x) - heading_rad + math.pi) % (2 * math.pi) - math.pi
-        if abs(bearing_rad) > VISIBLE_FRACTION * FOV_RAD or outlines.distance_m(head_w)[i] < MIN_RANGE_M:
+        is_in_view = abs(bearing_rad) <= VISIBLE_FRACTION * FOV_RAD
+        if not is_in_view or outlines.distance_m(head_w)[i] < MIN_RANGE_M:
             continue
-        facing = facing_points_w(obstacle, head_w)
-        sight_w = head_w + SIGHT[:, None, None] * (facing - head_w)  # (steps, points, 2)
+        # Sample the line of sight to each point of the facing side, and look for other obstacles on it.
+        facing_w = facing_points_w(obstacle, head_w)
+        sight_w = head_w + SIGHT[:, None, None] * (facing_w - head_w)  # (steps, points, 2)
         is_inside = outlines.distance_m(sight_w) < 0  # (steps, points, obstacles)
-        is_inside[..., i] = False
-        hidden_fraction = is_inside.any(axis=(0, 2)).mean()
-        if hidden_fraction < 0.5:
-            seen.append(obstacle)
-    return seen
+        is_inside[..., i] = False  # an obstacle does not hide itself
+        is_hidden = is_inside.any(axis=(0, 2))  # (points,)
+        if is_hidden.mean() < 0.5:
+            visible_obstacles.append(obstacle)
+    return visible_obstacles
 
 
 def facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
@@ -140,23 +155,29 @@ def _box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
 
 
 def moved(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
-    """Return the obstacles as they are if the base, estimated at `from_w`, is really at `to_w`.
+    """Move a map rigidly, by the motion that takes the estimated pose of the base to its true pose.
 
-    This removes a wrong pose from a map's errors: what remains is the map as the robot perceives it.
+    This removes the pose error from the errors of a map, so that only the errors of perception remain.
 
     Args:
         reported: Obstacles of the map.
-        from_w: Estimated x, y and heading.
-        to_w: True x, y and heading.
+        from_w: Estimated x and y in m, and heading in rad.
+        to_w: True x and y in m, and heading in rad.
+
+    Returns:
+        Copies of the obstacles with corrected positions and yaw angles; heights stay.
     """
     rotation_rad = to_w[2] - from_w[2]
     cos = math.cos(rotation_rad)
     sin = math.sin(rotation_rad)
     corrected: list[Obstacle] = []
     for obstacle in reported:
-        x = obstacle.position_w[0] - from_w[0]
-        y = obstacle.position_w[1] - from_w[1]
-        position_w = (to_w[0] + cos * x - sin * y, to_w[1] + sin * x + cos * y, obstacle.position_w[2])
+        x, y, z = obstacle.position_w
+        offset_x = x - from_w[0]
+        offset_y = y - from_w[1]
+        corrected_x = to_w[0] + cos * offset_x - sin * offset_y
+        corrected_y = to_w[1] + sin * offset_x + cos * offset_y
+        position_w = (corrected_x, corrected_y, z)
         yaw_rad = obstacle.yaw_rad + rotation_rad
         corrected.append(msgspec.structs.replace(obstacle, position_w=position_w, yaw_rad=yaw_rad))
     return corrected

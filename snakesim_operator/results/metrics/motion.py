@@ -63,7 +63,14 @@ class Motion:
 
 
 def measure_motion(record: RunRecord) -> Motion | None:
-    """Return when the body moved, or None if its pose was never measured, so that this is unknown."""
+    """Find the intervals in which the body stood still, from the measured path of its center of mass.
+
+    Args:
+        record: The recorded run.
+
+    Returns:
+        The stops, with times from the start of the time axis; None if the pose was never measured.
+    """
     measured = _read_center(record)
     if measured is None:
         return None
@@ -77,17 +84,24 @@ def measure_motion(record: RunRecord) -> Motion | None:
         stop_end_s = run_end_s
         if last < last_sample:
             stop_end_s = _find_stop_end_s(time_s, center_w, last)
-        is_continued = bool(stops) and start_s - stops[-1].end_s < WINDOW_S
-        if is_continued:  # the motion in between is shorter than the window that would show it
-            start_s = stops.pop().start_s
+        # Motion for less than a window cannot be told from a stop: merge the stops before and after it.
+        if stops and start_s - stops[-1].end_s < WINDOW_S:
+            previous = stops.pop()
+            start_s = previous.start_s
         stops.append(Interval(start_s, max(stop_end_s, start_s), STANDING))
     return Motion(stops, run_end_s)
 
 
 def _read_center(record: RunRecord) -> tuple[Floats, Floats] | None:
-    """Return times on the axis, (m,), and the center of mass then, (m, 2), by the pose sensor or else by guidance.
+    """Return the measured path of the body's center of mass.
 
-    A pose that guidance estimated by dead reckoning is no measurement. None: there is no measured pose.
+    The pose sensor in the record is used if it has poses; otherwise the poses that guidance published. Poses that
+    guidance estimated by dead reckoning are left out, because they are no measurement.
+
+    Returns:
+        time_s: (m,) times from the start of the time axis, in s.
+        center_w: (m, 2) the center of mass in the world, in m.
+        None if fewer than two poses were measured.
     """
     advance = Advance.from_run(record)
     if advance is not None:
@@ -96,14 +110,14 @@ def _read_center(record: RunRecord) -> tuple[Floats, Floats] | None:
     samples: list[tuple[float, float, float]] = []
     for world in record.worlds:
         time_s = world.timestamp_ns * 1e-9
-        if world.center_w is None or world.pose_from != "sensor" or time_s < begin_s:
+        if time_s < begin_s or world.pose_from != "sensor" or world.center_w is None:
             continue
         x, y = world.center_w[:2]
         samples.append((time_s - begin_s, x, y))
     if len(samples) < 2:
         return None
-    rows = np.array(samples)
-    return rows[:, 0], rows[:, 1:]
+    table = np.array(samples)  # (m, 3)
+    return table[:, 0], table[:, 1:]
 
 
 def _find_window_begins(time_s: Floats) -> NDArray[np.intp]:

@@ -80,58 +80,77 @@ def lines(
     height: int = 220,
     from_zero: bool = False,
 ) -> Figure:
-    """Draw lines over time.
+    """Return a Plotly figure of lines over time.
 
     Args:
         label: Title of the chart.
         axis: Title of the vertical axis.
         drawn: The lines.
-        until_s: End of the time axis.
-        levels: Values with a name, as dotted lines.
-        shades: Spans of time with a color.
-        marks: Instants.
+        until_s: End of the time axis, in s.
+        levels: Values on the vertical axis that get a dotted line, each with its name; the name may be empty.
+        shades: Spans of time whose background is colored.
+        marks: Instants that get a dashed vertical line.
         height: Height in pixels.
-        from_zero: The vertical axis begins at 0.
+        from_zero: Whether the vertical axis begins at 0.
     """
-    shapes = [_box(bar.start_s, bar.end_s, 0, 1, "paper", fillcolor=bar.color, opacity=0.16) for bar in shades]
-    shapes += [
-        {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "line": _stroke("--soft", "dot")}
-        for y, _ in levels
-    ]
-    notes = [
-        {"xref": "paper", "x": 1, "xanchor": "right", "y": y, "yanchor": "bottom", "text": words, "showarrow": False}
-        for y, words in levels
-        if words
-    ]
-    axis_y: Figure = {"title": {"text": axis}, "rangemode": "tozero" if from_zero else "normal"}
-    layout = {"showlegend": len(drawn) > 1, "hovermode": "x unified", "yaxis": axis_y}
-    return _figure(label, [line.trace() for line in drawn], height, until_s, shapes, notes, marks, layout)
+    shapes = [_box(span.start_s, span.end_s, 0, 1, "paper", fillcolor=span.color, opacity=0.16) for span in shades]
+    notes: list[Figure] = []
+    for value, name in levels:
+        level_line = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": value, "y1": value}
+        shapes.append({**level_line, "line": _stroke("--soft", "dot")})
+        if name:
+            position = {"xref": "paper", "x": 1, "xanchor": "right", "y": value, "yanchor": "bottom"}
+            notes.append({**position, "text": name, "showarrow": False})
+    range_mode = "tozero" if from_zero else "normal"
+    layout = {
+        "showlegend": len(drawn) > 1,
+        "hovermode": "x unified",
+        "yaxis": {"title": {"text": axis}, "rangemode": range_mode},
+    }
+    traces = [line.trace() for line in drawn]
+    return _figure(label, traces, height, until_s, shapes, notes, marks, layout)
 
 
 def bars(label: str, rows: Sequence[str], drawn: Sequence[Bar], until_s: float, marks: Sequence[Mark] = ()) -> Figure:
-    """Draw what held when, in rows, the first on top. Of more than MAX_BARS the longest are drawn."""
-    drawn = sorted(drawn, key=lambda bar: bar.start_s - bar.end_s)[:MAX_BARS]
+    """Return a Plotly figure of horizontal bars over time, such as the states of a run.
+
+    Args:
+        label: Title of the chart.
+        rows: Names of the rows; the first is on top.
+        drawn: The bars, each in one of the rows. The longest MAX_BARS are drawn if there are more.
+        until_s: End of the time axis, in s.
+        marks: Instants that get a dashed vertical line.
+    """
+    longest_first = sorted(drawn, key=lambda bar: bar.start_s - bar.end_s)
+    shown = longest_first[:MAX_BARS]
+    min_labeled_s = NAMED_SHARE * until_s
+    durations_s = [bar.end_s - bar.start_s for bar in shown]
+    texts: list[str] = []
+    for bar, duration_s in zip(shown, durations_s, strict=True):
+        texts.append(bar.words if duration_s > min_labeled_s else "")
     trace = {
         "type": "bar",
         "orientation": "h",
-        "base": [round(bar.start_s, 4) for bar in drawn],
-        "x": [round(bar.end_s - bar.start_s, 4) for bar in drawn],
-        "y": [bar.row for bar in drawn],
-        "text": [bar.words if bar.end_s - bar.start_s > NAMED_SHARE * until_s else "" for bar in drawn],
+        "base": [round(bar.start_s, 4) for bar in shown],
+        "x": [round(duration_s, 4) for duration_s in durations_s],
+        "y": [bar.row for bar in shown],
+        "text": texts,
         "textposition": "inside",
         "insidetextanchor": "middle",
         "constraintext": "both",
-        "hovertext": [f"{bar.words}, {bar.start_s:.2f} to {bar.end_s:.2f} s" for bar in drawn],
+        "hovertext": [f"{bar.words}, {bar.start_s:.2f} to {bar.end_s:.2f} s" for bar in shown],
         "hoverinfo": "text",
-        "marker": {"color": [bar.color for bar in drawn], "line": {"width": 0}},
+        "marker": {"color": [bar.color for bar in shown], "line": {"width": 0}},
     }
+    bottom_to_top = list(rows)[::-1]  # Plotly puts the first category at the bottom
     layout = {
         "barmode": "overlay",
         "bargap": 0.12,
         "hovermode": "closest",
-        "yaxis": {"type": "category", "categoryarray": list(rows)[::-1], "range": [-0.5, len(rows) - 0.5]},
+        "yaxis": {"type": "category", "categoryarray": bottom_to_top, "range": [-0.5, len(rows) - 0.5]},
     }
-    return _figure(label, [trace], 64 + ROW * len(rows), until_s, [], [], marks, layout)
+    height = 64 + ROW * len(rows)
+    return _figure(label, [trace], height, until_s, [], [], marks, layout)
 
 
 def joint_map(
@@ -145,9 +164,17 @@ def joint_map(
     frames: Sequence[tuple[float, float, int]] = (),
     marks: Sequence[Mark] = (),
 ) -> Figure:
-    """Values (n, joints) over time, a row a joint, head on top; `full` is drawn in full color.
+    """Return a Plotly heatmap of one quantity of all joints over time, with a row for each joint and the head on top.
 
-    frames: begin (s), end (s) and joint index of each frame that marks a joint.
+    Args:
+        label: Title of the chart.
+        joints: Names of the joints, tail to head.
+        values: (n, joints) values at equal intervals of time.
+        unit: Unit of the values.
+        full: Absolute value that has the strongest color.
+        until_s: End of the time axis, in s.
+        frames: Rectangles that highlight a joint for some time: start in s, end in s and index of the joint.
+        marks: Instants that get a dashed vertical line.
     """
     columns = strongest(values, MAP_COLUMNS)
     step_s = until_s / len(columns)
@@ -164,10 +191,13 @@ def joint_map(
         "hovertemplate": f"%{{y}}, %{{x:.2f}} s: %{{z:.3g}} {unit}",
         "name": "",
     }
-    shapes = [_box(a, b, j - 0.5, j + 0.5, "y", line={"color": "--ink", "width": 1.2}) for a, b, j in frames]
-    height = 60 + min(max(len(joints) * 18, 120), 420)
+    shapes: list[Figure] = []
+    for start_s, end_s, joint in frames:
+        outline = {"color": "--ink", "width": 1.2}
+        shapes.append(_box(start_s, end_s, joint - 0.5, joint + 0.5, "y", line=outline))
+    rows_height = min(max(len(joints) * 18, 120), 420)
     layout = {"hovermode": "closest", "yaxis": {"type": "category", "nticks": 16, "showgrid": False}}
-    return _figure(label, [trace], height, until_s, shapes, [], marks, layout)
+    return _figure(label, [trace], 60 + rows_height, until_s, shapes, [], marks, layout)
 
 
 def thinned(values: Floats, buckets: int = BUCKETS) -> NDArray[np.intp]:
@@ -210,19 +240,35 @@ def _figure(
     marks: Sequence[Mark],
     layout: Figure,
 ) -> Figure:
-    """Return a figure with its marks and its time axis."""
+    """Assemble a Plotly figure with a time axis, and draw marks as dashed vertical lines.
+
+    Args:
+        label: Title of the chart.
+        traces: Plotly traces.
+        height: Height in pixels.
+        until_s: End of the time axis, in s.
+        shapes: Plotly shapes; those of the marks are added.
+        notes: Plotly annotations; those of the marks are added.
+        marks: Instants to mark.
+        layout: Further keys of the Plotly layout.
+    """
     for mark in marks:
-        place = {"x0": mark.time_s, "x1": mark.time_s, "yref": "paper", "y0": 0, "y1": 1}
-        shapes.append({"type": "line", "line": _stroke(mark.color, "dash"), **place})
+        line = {"x0": mark.time_s, "x1": mark.time_s, "yref": "paper", "y0": 0, "y1": 1}
+        shapes.append({"type": "line", "line": _stroke(mark.color, "dash"), **line})
         if mark.words:
-            note = {"x": mark.time_s, "yref": "paper", "y": 1, "yanchor": "top", "showarrow": False, "text": mark.words}
-            has_room_right = mark.time_s < until_s / 2
-            anchor = "left" if has_room_right else "right"
-            shift = 4 if has_room_right else -4
-            notes.append({**note, "xanchor": anchor, "xshift": shift})
+            notes.append(_mark_note(mark, until_s))
     time_axis = {"range": [0, round(until_s, 4)], "title": {"text": "time, s"}}
-    layout = {**layout, "height": height, "xaxis": time_axis, "shapes": shapes, "annotations": notes}
-    return {"label": label, "data": traces, "layout": layout}
+    full_layout = {**layout, "height": height, "xaxis": time_axis, "shapes": shapes, "annotations": notes}
+    return {"label": label, "data": traces, "layout": full_layout}
+
+
+def _mark_note(mark: Mark, until_s: float) -> Figure:
+    """Return the name of a mark as a Plotly annotation, on the side of the line that has more room."""
+    is_in_left_half = mark.time_s < until_s / 2
+    anchor = "left" if is_in_left_half else "right"
+    shift = 4 if is_in_left_half else -4  # px
+    position = {"x": mark.time_s, "yref": "paper", "y": 1, "yanchor": "top"}
+    return {**position, "showarrow": False, "text": mark.words, "xanchor": anchor, "xshift": shift}
 
 
 def _box(x0: float, x1: float, y0: float, y1: float, yref: str, **look: Any) -> Figure:

@@ -28,25 +28,28 @@ def render(
     charts: bool = True,
     **values: Any,
 ) -> str:
-    """Return a page that needs no other file.
+    """Return an HTML page that needs no other file: styles, scripts and the plotting library are embedded.
 
     Args:
-        template: The template.
-        colored_joints: How many joints need a color.
-        styles: More style sheets.
-        scripts: More scripts.
+        template: The Jinja template of the page.
+        colored_joints: How many joints need a color of their own.
+        styles: Style sheets besides those that all pages share.
+        scripts: Scripts besides those of the charts.
         charts: Whether the page has charts, which need the plotting library.
-        values: Values for the template.
+        values: Variables of the template.
     """
-    return (
-        _pages(template.parent)
-        .get_template(template.name)
-        .render(
-            style=Markup(themes(colored_joints) + _text(HERE / "page.css", *styles)),
-            library=Markup(_text(LIBRARY) if charts else ""),
-            script=Markup(_text(*([HERE / "charts.js"] if charts else []), *scripts)),
-            **values,
-        )
+    style = themes(colored_joints) + _text(HERE / "page.css", *styles)
+    library = ""
+    chart_scripts: list[Path] = []
+    if charts:
+        library = _text(LIBRARY)
+        chart_scripts = [HERE / "charts.js"]
+    page = _pages(template.parent).get_template(template.name)
+    return page.render(
+        style=Markup(style),
+        library=Markup(library),
+        script=Markup(_text(*chart_scripts, *scripts)),
+        **values,
     )
 
 

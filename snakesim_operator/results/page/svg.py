@@ -76,30 +76,39 @@ def polyline(points: list[Point], class_: str) -> str:
 
 
 def arrow(tail: Point, tip: Point, class_: str = "", *, head: float = 9.0, color: str | None = None) -> str:
-    """Return an arrow of a shaft and a filled head; a dot if it is too short.
+    """Return SVG for an arrow of a shaft and a filled head, or for a dot if the arrow would be too short.
 
     Args:
-        tail: Where it begins.
-        tip: Where it ends.
-        class_: Class in the style sheet.
+        tail: Where the arrow begins.
+        tip: Where the arrow ends.
+        class_: CSS class of the arrow.
         head: Maximum length of the head.
-        color: Color, where no style sheet has the class.
+        color: Color, for drawings whose style sheet does not have the class; None: as in the style sheet.
     """
-    stroke_width = None if color is None else SHAFT_WIDTH
     dx = tip[0] - tail[0]
     dy = tip[1] - tail[1]
     length = math.hypot(dx, dy)
     if length < 1.5:
         return element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head", fill=color)
+
+    # Unit vector along the arrow.
     ux = dx / length
     uy = dy / length
-    size = min(head, length / 1.1)
-    back = (tip[0] - ux * size, tip[1] - uy * size)
-    wide = 0.38 * size  # half of the head's width
-    corners = [tip, (back[0] - uy * wide, back[1] + ux * wide), (back[0] + uy * wide, back[1] - ux * wide)]
-    neck = (tip[0] - ux * size * 0.8, tip[1] - uy * size * 0.8)
-    shaft = line(tail, neck, f"{class_} shaft", stroke=color, stroke_width=stroke_width)
-    return shaft + element("polygon", points=points_text(corners), class_=f"{class_} head", fill=color)
+
+    # The head is a triangle: its tip, and two corners at its back.
+    head_length = min(head, length / 1.1)
+    half_width = 0.38 * head_length
+    back_x = tip[0] - ux * head_length
+    back_y = tip[1] - uy * head_length
+    left = (back_x - uy * half_width, back_y + ux * half_width)
+    right = (back_x + uy * half_width, back_y - ux * half_width)
+    head_shape = element("polygon", points=points_text([tip, left, right]), class_=f"{class_} head", fill=color)
+
+    # The shaft ends a little inside the head, so that no gap shows between them.
+    shaft_end = (tip[0] - ux * head_length * 0.8, tip[1] - uy * head_length * 0.8)
+    stroke_width = None if color is None else SHAFT_WIDTH
+    shaft = line(tail, shaft_end, f"{class_} shaft", stroke=color, stroke_width=stroke_width)
+    return shaft + head_shape
 
 
 def figure(width: float, height: float, label: str, *children: str) -> str:

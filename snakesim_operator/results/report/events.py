@@ -77,30 +77,39 @@ def select_listed(events: list[Event]) -> list[Event]:
 
 
 def drawn_snapshots(record: RunRecord, events: list[Event]) -> list[tuple[Event, Snapshot]]:
-    """Return the events that are drawn, each with the snake at that time.
+    """Choose the events of a run that get a drawing, and the snapshot of the snake that is drawn for each.
 
-    Only a few hand-overs are drawn. Events that look the same are drawn once, with the words of both.
+    Only a few hand-overs are drawn. Events whose snapshots look the same share one drawing with the words of both.
+
+    Args:
+        record: The recorded run.
+        events: All events of the run.
+
+    Returns:
+        Pairs of event and snapshot, in order of the snapshots' time.
     """
     hand_over_times_s = _hand_over_times_to_draw(events)
     chosen: list[tuple[Event, Snapshot]] = []
-    hand_overs_first = sorted(events, key=lambda event: event.joint is None)  # they show forces
+    hand_overs_first = sorted(events, key=lambda event: event.joint is None)  # snapshots of hand-overs show forces
     for event in hand_overs_first:
-        if event.joint is not None and event.time_s not in hand_over_times_s:
+        is_hand_over = event.joint is not None
+        if is_hand_over and event.time_s not in hand_over_times_s:
             continue
         snapshot = _snapshot_of_event(record, event)
         if snapshot is None:
             continue
-        later_s = snapshot.time_s - event.time_s
-        if later_s > SIMULTANEOUS_S:
-            event = replace(event, words=f"{event.words}, {later_s:.2f} s later")
-        similar = _find_similar(record, snapshot, chosen)
-        if similar is None:
+        delay_s = snapshot.time_s - event.time_s
+        if delay_s > SIMULTANEOUS_S:
+            event = replace(event, words=f"{event.words}, {delay_s:.2f} s later")
+
+        similar_index = _find_similar(record, snapshot, chosen)
+        if similar_index is None:
             chosen.append((event, snapshot))
-        else:
-            other, drawn = chosen[similar]
-            in_order = sorted((event, other), key=lambda one: one.time_s)
-            words = "; ".join(one.words for one in in_order)
-            chosen[similar] = (replace(other, words=words), drawn)
+            continue
+        similar_event, similar_snapshot = chosen[similar_index]
+        in_order = sorted((event, similar_event), key=lambda item: item.time_s)
+        words = "; ".join(item.words for item in in_order)
+        chosen[similar_index] = (replace(similar_event, words=words), similar_snapshot)
     return sorted(chosen, key=lambda pair: pair[1].time_s)
 
 
@@ -113,10 +122,11 @@ def _hand_over_times_to_draw(events: Sequence[Event]) -> set[float]:
 
 
 def _snapshot_of_event(record: RunRecord, event: Event) -> Snapshot | None:
-    """Return the snapshot that is drawn of an event.
+    """Return the snapshot that is drawn for an event, or None if the record has none.
 
-    It is the nearest one whose solved forces balance. After a hand-over these forces come a little later, and those
-    that were measured are preferred. Without any it is the body alone.
+    Snapshots in which the controller's desired forces balance are preferred: first those with the fewest forces that
+    were not measured, then the nearest in time. After a hand-over the new forces settle, so its snapshot may come up to
+    SETTLING_S later. Without a balanced snapshot the one at the time of the event is used, which shows no forces.
     """
     if event.joint is None:
         begin_s = event.time_s - SIMULTANEOUS_S
@@ -124,13 +134,15 @@ def _snapshot_of_event(record: RunRecord, event: Event) -> Snapshot | None:
     else:
         begin_s = event.time_s
         end_s = event.time_s + SETTLING_S
-    nearby = balanced_snapshots(record, begin_s, end_s)
-    candidates = [snapshot for snapshot in nearby if event.joint in (None, snapshot.propulsion_joint)]
-    return min(
-        candidates,
-        key=lambda snapshot: (count_unmeasured(snapshot), abs(snapshot.time_s - event.time_s)),
-        default=find_snapshot(record, event.time_s),
-    )
+    candidates: list[Snapshot] = []
+    for snapshot in balanced_snapshots(record, begin_s, end_s):
+        if event.joint is None or event.joint == snapshot.propulsion_joint:
+            candidates.append(snapshot)
+
+    def rank(snapshot: Snapshot) -> tuple[int, float]:
+        return count_unmeasured(snapshot), abs(snapshot.time_s - event.time_s)
+
+    return min(candidates, key=rank, default=find_snapshot(record, event.time_s))
 
 
 def _find_similar(record: RunRecord, snapshot: Snapshot, chosen: Sequence[tuple[Event, Snapshot]]) -> int | None:

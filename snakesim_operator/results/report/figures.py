@@ -43,11 +43,15 @@ def advance(record: RunRecord, moved: Series) -> Figure:
 
 
 def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
-    """Draw measured motion, states that control reported, jams, and a row for each joint that propelled."""
-    names = [joint.name for joint in record.description.joints]
-    motion = measure_motion(record)
+    """Return a chart of bars over time: measured motion, reported states, jams, and each joint that propelled.
+
+    Args:
+        record: The recorded run.
+        intervals: When which joint propelled.
+    """
+    joint_names = [joint.name for joint in record.description.joints]
     drawn: list[Bar] = []
-    rows: list[str] = []
+    motion = measure_motion(record)
     if motion is not None:
         for span in motion.spans:
             drawn.append(Bar("motion", span.start_s, span.end_s, span.what, MOTION_COLORS[span.what]))
@@ -55,14 +59,15 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
         drawn.append(Bar("control", band.start_s, band.end_s, in_words(band.what), f"--{band.what.lower()}"))
     for band in jam_bands(record):
         drawn.append(Bar("jam", band.start_s, band.end_s, "jammed", "--bad"))
-    for row in ("motion", "control", "jam"):
-        if any(bar.row == row for bar in drawn):
-            rows.append(row)
+    rows_with_bars = {bar.row for bar in drawn}
+    rows = [row for row in ("motion", "control", "jam") if row in rows_with_bars]
+
     for interval in intervals:
+        name = joint_names[interval.joint]
         words = f"{interval.duration_s:.1f} s"
-        drawn.append(Bar(names[interval.joint], interval.start_s, interval.end_s, words, color(interval.joint)))
-    propelled = sorted({interval.joint for interval in intervals}, reverse=True)
-    rows += [names[joint] for joint in propelled]
+        drawn.append(Bar(name, interval.start_s, interval.end_s, words, color(interval.joint)))
+    head_to_tail = sorted({interval.joint for interval in intervals}, reverse=True)
+    rows += [joint_names[joint] for joint in head_to_tail]
     return bars("States and propulsion joint over time", rows, drawn, end_s(record), faults(record))
 
 

@@ -41,29 +41,37 @@ class Labels:
         gaps: tuple[float, ...] = (12, 20, 30, 44),
         away_from: Point | None = None,
     ) -> str:
-        """Return a label near a point, at the distance and in the direction that covers least.
+        """Return SVG for a label near a point, at the place of lowest cost among several distances and directions.
+
+        A place costs more if the label would cover other items, be far from the point, or lie towards `away_from`.
+        Later labels keep off the place that is chosen.
 
         Args:
             at: The point that the label names.
             words: The text.
             class_: CSS classes of the text.
-            gaps: Distances from the point that are tried.
-            away_from: A point in whose direction the label should not lie.
+            gaps: Distances from the point to try, in units of the drawing.
+            away_from: A point in whose direction the label should not lie; None: any direction will do.
         """
         width = text_width(words, TEXT_HEIGHT)
-        candidates: list[tuple[float, Box]] = []
+        min_cost = math.inf
+        best_box: Box = (0.0, 0.0, 0.0, 0.0)
         for gap in gaps:
             for direction_deg in DIRECTIONS_DEG:
                 cos = math.cos(math.radians(direction_deg))
                 sin = math.sin(math.radians(direction_deg))
-                x = at[0] + cos * (gap + width / 2)
-                y = at[1] + sin * (gap + TEXT_HEIGHT / 2)
-                box = (x - width / 2, y - TEXT_HEIGHT / 2, x + width / 2, y + TEXT_HEIGHT / 2)
+                center_x = at[0] + cos * (gap + width / 2)
+                center_y = at[1] + sin * (gap + TEXT_HEIGHT / 2)
+                left = center_x - width / 2
+                top = center_y - TEXT_HEIGHT / 2
+                box = (left, top, center_x + width / 2, center_y + TEXT_HEIGHT / 2)
                 cost = self._covering_cost(box) + GAP_WEIGHT * gap + _direction_cost(at, (cos, sin), away_from)
-                candidates.append((cost, box))
-        _, box = min(candidates, key=lambda candidate: candidate[0])
-        self.keep_off(box, LABEL_WEIGHT)
-        return text((box[0] + box[2]) / 2, box[3] - 2.5, words, class_, anchor="middle")
+                if cost < min_cost:
+                    min_cost = cost
+                    best_box = box
+        self.keep_off(best_box, LABEL_WEIGHT)
+        left, _, right, bottom = best_box
+        return text((left + right) / 2, bottom - 2.5, words, class_, anchor="middle")
 
     def _covering_cost(self, box: Box) -> float:
         covered = sum(weight * _overlap(box, occupied) for occupied, weight in self._occupied)

@@ -35,46 +35,59 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:
-    """Return the whole page as HTML."""
+    """Return the report of one run as an HTML page.
+
+    Args:
+        record: The recorded run.
+        summary: The numbers of the run.
+    """
     events = find_events(record, summary)
     all_intervals = find_propulsion_intervals(record)
-    intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
-    joints: list[tuple[int, list[Propulsion]]] = []
-    for joint in most_used_joints(intervals):
-        joints.append((joint, [interval for interval in all_intervals if interval.joint == joint]))
+    shown_intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
+    intervals_by_joint: list[tuple[int, list[Propulsion]]] = []
+    for joint in most_used_joints(shown_intervals):
+        intervals_of_joint = [interval for interval in all_intervals if interval.joint == joint]
+        intervals_by_joint.append((joint, intervals_of_joint))
+    propelling_joints = {interval.joint for interval in shown_intervals}
+    config_json = msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode()
     return render(
         HERE / "report.html",
         len(record.description.joints),
         styles=[HERE / "figure.css"],
         scripts=[HERE / "playback.js"],
+        # The run and its verdict.
         title=record.config.title or summary.scenario,
         record=record,
         summary=summary,
         verdict=verdict(record, summary),
-        pretty=with_subscript,
-        in_words=in_words,
         film=playback(record),
-        names=[joint.name for joint in record.description.joints],
+        # Sections and figures.
         events=select_listed(events),
         snapshots=_describe_snapshots(record, events),
         pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
+        figures=figures,
+        names=[joint.name for joint in record.description.joints],
+        limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
+        intervals=shown_intervals,
+        joints=intervals_by_joint,
+        propelled=len(propelling_joints),
+        begin_s=zero_s(record),
+        # Explanations of numbers that are not good.
         why_empty=why_empty(record),
         why_at_limit=why_at_limit(record),
         why_late=why_late(summary),
-        tick_times=TICK_TIMES,
         why_refused=why_refused(summary),
-        limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
-        intervals=intervals,
-        joints=joints,
-        propelled=len({interval.joint for interval in intervals}),
-        figures=figures,
-        begin_s=zero_s(record),
+        # Lists and tables.
+        tick_times=TICK_TIMES,
         first_faults=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
         numbers=_numbers(summary),
         config_file=_config_file(record),
-        config=msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode(),
+        config=config_json,
+        # Functions for the template.
+        pretty=with_subscript,
+        in_words=in_words,
     )
 
 
@@ -95,22 +108,32 @@ def playback_page(record: RunRecord, summary: RunSummary) -> str:
 
 
 def _describe_snapshots(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
-    """Return the drawings of each event, and the numbers beside them."""
+    """Return what the template shows for each event that is drawn: drawings as SVG, and numbers.
+
+    Args:
+        record: The recorded run.
+        events: All events of the run; only some of them are drawn.
+
+    Returns:
+        A dictionary for each event: the event, its snapshot, the top view, the force polygon (None without balanced
+        forces), and `pushed_n`, the measured contact force in the direction of travel.
+    """
     chosen = drawn_snapshots(record, events)
     snapshots = [snapshot for _, snapshot in chosen]
+    top_views = views(record, snapshots, VIEW_WIDTH)
     balances = [snapshot.balance for snapshot in snapshots if snapshot.balance is not None]
     cards: list[dict[str, Any]] = []
-    for (event, snapshot), view in zip(chosen, views(record, snapshots, VIEW_WIDTH), strict=True):
-        polygon = None
-        if snapshot.balance is None:
+    for (event, snapshot), view in zip(chosen, top_views, strict=True):
+        balance = snapshot.balance
+        if balance is None:
             nodes = nodes_xy_w(record, snapshot.row)
-            forward = nodes[-1] - nodes[0]
+            forward = nodes[-1] - nodes[0]  # from the tail to the head
+            polygon = None
         else:
-            forward = snapshot.balance.resultant_n
+            forward = balance.resultant_n
             scale = common_scale(balances, *POLYGON_SIZE, upright=view.upright)
-            polygon = Markup(
-                force_polygon(snapshot.balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
-            )
+            drawing = force_polygon(balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
+            polygon = Markup(drawing)
         cards.append(
             {
                 "event": event,

@@ -28,29 +28,35 @@ def common_scale(balances: list[Balance], width: float, height: float, *, uprigh
 def force_polygon(
     balance: Balance, measured: list[WorldContact], width: float, height: float, scale: float, *, upright: bool = False
 ) -> str:
-    """Draw the force polygon.
+    """Draw the force polygon as SVG: the commanded force and the contact forces, each from the tip of the one before.
+
+    The polygon closes if the forces balance. An arrow beside it shows the resultant of the contact forces.
 
     Args:
-        balance: The solved forces.
-        measured: The contacts that were measured at the time.
+        balance: The controller's desired forces.
+        measured: The contacts that were measured at the time; they decide how each force is drawn.
         width: Width of the drawing.
         height: Height of the drawing.
         scale: Units of the drawing per newton.
-        upright: Rotate by a quarter, as the top view beside it.
+        upright: Whether to rotate by a quarter turn, as the top view beside the polygon is.
     """
     contact_classes, resultant_class = balance.force_classes(measured)
     corners = _place_corners(_drawn_corners_n(balance, upright), width, height, scale)
     labels = Labels(width, height - FOOT)
-    for a, b in pairwise(corners):
-        labels.keep_off_line(a, b, 5)
+    for start, end in pairwise(corners):
+        labels.keep_off_line(start, end, 5)
+
     is_closed = balance.gap_n * scale < CLOSED_UNITS
-    ring = corners[:-1] if is_closed else corners
-    parts = [element("polygon", points=points_text(ring), class_="polygon-fill")]
+    outline = corners[:-1] if is_closed else corners
+    parts = [element("polygon", points=points_text(outline), class_="polygon-fill")]
+    # The first side is the tether force; the commanded force points the other way.
     parts.append(arrow(corners[1], corners[0], "commanded", head=11))
-    for (a, b), class_ in zip(pairwise(corners[1:]), contact_classes, strict=True):
-        parts.append(arrow(a, b, class_, head=11))
+    contact_sides = pairwise(corners[1:])
+    for (start, end), class_ in zip(contact_sides, contact_classes, strict=True):
+        parts.append(arrow(start, end, class_, head=11))
     parts.append(_draw_resultant(corners, resultant_class, labels))
     parts += _draw_names(balance, corners, labels)
+
     newtons = round_below(0.3 * width / scale)
     parts.append(scale_bar(8, height - 8, newtons * scale, f"{newtons:g} N", "force-bar"))
     words = f"Force polygon of {len(balance.contacts)} contact forces; it closes to {balance.gap_n:.2g} N"
@@ -103,20 +109,32 @@ def _draw_names(balance: Balance, corners: list[Point], labels: Labels) -> list[
 
 
 def _draw_resultant(corners: list[Point], class_: str, labels: Labels) -> str:
-    """Draw the resultant from the first contact force to the end of the last, outside the polygon.
+    """Draw the resultant of the contact forces as an arrow beside the force polygon.
 
-    Without the offset it would lie on the commanded force.
+    The resultant goes from the start of the first contact force to the end of the last. There it would cover the
+    commanded force, so the arrow is shifted by RESULTANT_OFFSET to the outside of the polygon.
+
+    Args:
+        corners: Corners of the polygon in the drawing; the first side is the commanded force.
+        class_: CSS class of the arrow.
+        labels: Labels of the drawing, which must not cover the arrow.
+
+    Returns:
+        The arrow as SVG; empty if the resultant is zero.
     """
-    start = corners[1]
-    end = corners[-1]
-    length = math.hypot(end[0] - start[0], end[1] - start[1])
+    start_x, start_y = corners[1]
+    end_x, end_y = corners[-1]
+    dx = end_x - start_x
+    dy = end_y - start_y
+    length = math.hypot(dx, dy)
     if length < 1e-6:
         return ""
-    normal = (-(end[1] - start[1]) / length, (end[0] - start[0]) / length)
-    center = _center_of(corners)
-    inward = (center[0] - start[0]) * normal[0] + (center[1] - start[1]) * normal[1]
-    offset = -RESULTANT_OFFSET if inward > 0 else RESULTANT_OFFSET
-    a = (start[0] + offset * normal[0], start[1] + offset * normal[1])
-    b = (end[0] + offset * normal[0], end[1] + offset * normal[1])
-    labels.keep_off_line(a, b, 6, 2.0)
-    return arrow(a, b, class_, head=14)
+    normal_x = -dy / length
+    normal_y = dx / length
+    center_x, center_y = _center_of(corners)
+    center_distance = (center_x - start_x) * normal_x + (center_y - start_y) * normal_y
+    offset = -RESULTANT_OFFSET if center_distance > 0 else RESULTANT_OFFSET
+    shifted_start = (start_x + offset * normal_x, start_y + offset * normal_y)
+    shifted_end = (end_x + offset * normal_x, end_y + offset * normal_y)
+    labels.keep_off_line(shifted_start, shifted_end, 6, 2.0)
+    return arrow(shifted_start, shifted_end, class_, head=14)

@@ -66,22 +66,28 @@ class Pushing:
 
 
 def pushing(record: RunRecord) -> Pushing | None:
-    """Return the section, or None if the controller reported no push-points, or one propulsion joint at a time.
+    """Return the section of the report about pushing with many push-points at once.
 
-    A propulsion joint has sections of its own.
+    Args:
+        record: The recorded run.
+
+    Returns:
+        The section, or None if it does not apply: the controller reported no push-points, or it drives one propulsion
+        joint at a time, which other sections of the report cover.
     """
     states = [state for state in record.control if state.push_points]
     has_propulsion_joint = any(state.propulsion_joint is not None for state in states)
     if not states or has_propulsion_joint or not len(record.time_s):
         return None
     stops = _find_stops(record)
-    longest = sorted(stops, key=lambda stop: stop.start_s - stop.end_s)[:MAX_STOPS]
+    longest_first = sorted(stops, key=lambda stop: stop.start_s - stop.end_s)
+    shown_stops = longest_first[:MAX_STOPS]
     score, map_errors = _score_maps(record)
     return Pushing(
         forces=_force_chart(record),
         obstacles=_obstacle_chart(record),
-        stops=sorted(longest, key=lambda stop: stop.start_s),
-        shorter=len(stops) - len(longest),
+        stops=sorted(shown_stops, key=lambda stop: stop.start_s),
+        shorter=len(stops) - len(shown_stops),
         score=score,
         position_mm=_position_errors_mm(score),
         map_errors=map_errors,
@@ -194,37 +200,47 @@ def _find_stops(record: RunRecord) -> list[StandingSpan]:
 
 
 def _score_maps(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
-    """Compare the perceived maps, within a meter of the head, with the truth: in total, and over time."""
+    """Compare the perceived maps of a run with the true obstacles within a meter of the head.
+
+    At most about MAX_MAPS_SCORED maps are scored, at equal intervals.
+
+    Returns:
+        The total over all maps, and a chart over time of errors, missed obstacles and ghosts. Both are None if the
+        mission does not use a perceived map, the scene has no obstacles, or no pose is known.
+    """
     truth = [placed.obstacle for placed in record.placed if not placed.walkable]
     if record.config.mission.map != "perceived" or not truth:
         return None, None
+    start_s = zero_s(record)
     total = MapScore()
     times_s: list[float] = []
     median_errors_mm: list[float] = []
-    misses: list[float] = []
-    ghosts: list[float] = []
+    miss_counts: list[float] = []
+    ghost_counts: list[float] = []
     step = max(len(record.worlds) // MAX_MAPS_SCORED, 1)
     for world in record.worlds[::step]:
-        nodes = record.nodes_w(record.row_at(world.timestamp_ns * 1e-9))
+        world_time_s = world.timestamp_ns * 1e-9
+        nodes = record.nodes_w(record.row_at(world_time_s))
         if nodes is None:
             continue
-        x, y = nodes[-1, :2] - nodes[-2, :2]
-        map_score = score(world.obstacles, truth, nodes[-1], math.atan2(y, x))
+        head_w = nodes[-1]
+        forward_x, forward_y = nodes[-1, :2] - nodes[-2, :2]
+        map_score = score(world.obstacles, truth, head_w, math.atan2(forward_y, forward_x))
         total.add(map_score)
-        times_s.append(world.timestamp_ns * 1e-9 - zero_s(record))
+        median_error_mm = math.nan
         if map_score.position_m:
-            median_errors_mm.append(1e3 * float(np.median(map_score.position_m)))
-        else:
-            median_errors_mm.append(math.nan)
-        misses.append(map_score.misses)
-        ghosts.append(map_score.ghosts)
+            median_error_mm = 1e3 * float(np.median(map_score.position_m))
+        times_s.append(world_time_s - start_s)
+        median_errors_mm.append(median_error_mm)
+        miss_counts.append(map_score.misses)
+        ghost_counts.append(map_score.ghosts)
     if not times_s:
         return None, None
     time_s = np.array(times_s)
     drawn = [
         Line("position error, median, mm", time_s, np.array(median_errors_mm), "--measured"),
-        Line("missed", time_s, np.array(misses, dtype=np.float64), "--bad", shape="hv"),
-        Line("ghosts", time_s, np.array(ghosts, dtype=np.float64), "--commanded", shape="hv"),
+        Line("missed", time_s, np.array(miss_counts, dtype=np.float64), "--bad", shape="hv"),
+        Line("ghosts", time_s, np.array(ghost_counts, dtype=np.float64), "--commanded", shape="hv"),
     ]
     label = "Map against truth over time"
     return total, lines(label, "mm, or how many", drawn, end_s(record), height=190, from_zero=True)

@@ -18,26 +18,35 @@ TOUCHING_M = 0.0005  # a smaller gap is a touch: the body's outline is that of i
 
 
 def why_empty(record: RunRecord) -> str:
-    """Return why push-points carried nothing: whether an obstacle stands there, and whether the body touched it."""
-    empty = [pair for pair in pairs(record.control) if pair.measured_force_n < EMPTY_N]
-    gaps_m = _gaps_at(record, empty)
+    """Explain why push-points carried no force, in words for the report.
+
+    For each push-point that should push but carried less than EMPTY_N, the sentence tells apart three causes: no
+    obstacle is near, the body does not touch the obstacle, or the body touches it without force.
+
+    Returns:
+        The explanation, or UNKNOWN if the record does not show the gaps.
+    """
+    empty_pairs = [pair for pair in pairs(record.control) if pair.measured_force_n < EMPTY_N]
+    gaps_m = _gaps_at(record, empty_pairs)
     if not gaps_m:
         return UNKNOWN
-    total = len(gaps_m)
-    without_obstacle = gaps_m.count(np.inf)
+    total_count = len(gaps_m)
+    no_obstacle_count = gaps_m.count(np.inf)
     apart_m = [gap_m for gap_m in gaps_m if TOUCHING_M < gap_m < np.inf]
-    touching = total - without_obstacle - len(apart_m)
-    words: list[str] = []
-    if without_obstacle:
-        words.append(f"no obstacle stood within {NEAR_M:g} m of {_percent(without_obstacle, total)} of them")
+    touching_count = total_count - no_obstacle_count - len(apart_m)
+    causes: list[str] = []
+    if no_obstacle_count:
+        percent = _percent(no_obstacle_count, total_count)
+        causes.append(f"no obstacle stood within {NEAR_M:g} m of {percent} of them")
     if apart_m:
+        percent = _percent(len(apart_m), total_count)
         median_mm = 1e3 * float(np.median(apart_m))
-        share = _percent(len(apart_m), total)
-        words.append(f"the body was off the obstacle in {share} of them, by {median_mm:.1f} mm (median)")
-    if touching:
-        words.append(f"it touched in {_percent(touching, total)} of them")
-    name, count = Counter(pair.obstacle for pair in empty).most_common(1)[0]
-    return f"{'; '.join(words)}; most often {name}, {count} of {len(empty)}"
+        causes.append(f"the body was off the obstacle in {percent} of them, by {median_mm:.1f} mm (median)")
+    if touching_count:
+        causes.append(f"it touched in {_percent(touching_count, total_count)} of them")
+    obstacle_counts = Counter(pair.obstacle for pair in empty_pairs)
+    name, count = obstacle_counts.most_common(1)[0]
+    return f"{'; '.join(causes)}; most often {name}, {count} of {len(empty_pairs)}"
 
 
 def _gaps_at(record: RunRecord, empty: Sequence[Pair]) -> list[float]:
@@ -84,28 +93,35 @@ def why_refused(summary: RunSummary) -> str:
 def _gap_m(record: RunRecord, pair: Pair, place_w: Floats, outlines: Sequence[Floats]) -> float | None:
     """Return the gap between the body and the obstacle at a push-point, seen from above.
 
+    The body is a chain of capsules: its gap to a point is the distance to the axis of a link, minus the link's radius.
+
     Args:
-        record: What was recorded of the run.
-        pair: The push-point at one moment.
-        place_w: (2,) its place.
-        outlines: The obstacles, each as points (n, 2).
+        record: The recorded run.
+        pair: Desired and measured force of the push-point, with its timestamp.
+        place_w: (2,) position of the push-point, in m.
+        outlines: The obstacles, each as points (n, 2) of its outline.
 
     Returns:
-        The gap in m; infinite: no obstacle is near; None: the pose is unknown.
+        The gap in m; infinite: no obstacle is within NEAR_M of the push-point; None: the pose is unknown.
     """
-    nodes_w = record.nodes_w(record.row_at(pair.timestamp_ns * 1e-9)) if len(record.time_s) else None
+    if not len(record.time_s):
+        return None
+    nodes_w = record.nodes_w(record.row_at(pair.timestamp_ns * 1e-9))
     if nodes_w is None:
         return None
     distances_m = [float(np.hypot(*(outline - place_w).T).min()) for outline in outlines]
     nearest = int(np.argmin(distances_m))
     if distances_m[nearest] > NEAR_M:
         return np.inf
+
+    # Project each point of the outline onto the axis of each link.
     nodes = nodes_w[:, :2]
-    links = np.diff(nodes, axis=0)
+    links = np.diff(nodes, axis=0)  # (links, 2)
     from_nodes = outlines[nearest][:, None] - nodes[:-1]  # (points, links, 2)
-    fraction = np.clip((from_nodes * links).sum(axis=2) / (links**2).sum(axis=1), 0.0, 1.0)
+    fraction = (from_nodes * links).sum(axis=2) / (links**2).sum(axis=1)
+    clipped_fraction = np.clip(fraction, 0.0, 1.0)  # (points, links): position along the link, 0 at its rear end
+    axis_distances_m = np.linalg.norm(from_nodes - clipped_fraction[..., None] * links, axis=2)
     radii_m = np.array([link.radius_m for link in record.description.links])
-    axis_distances_m = np.linalg.norm(from_nodes - fraction[..., None] * links, axis=2)
     return float((axis_distances_m - radii_m).min())
 
 

@@ -86,13 +86,21 @@ class Snapshot:
 
 
 def balance_of(state: ControlState) -> Balance | None:
-    """Return the forces that the controller solved for, or None if it solved for none."""
-    pairs = list(zip(state.push_points, state.desired_force_n, strict=False))
-    if len(pairs) < MIN_CONTACTS or not state.propulsion_n:
+    """Return the contact forces that the controller solved for, with the propulsion force that they balance.
+
+    Args:
+        state: A message of the controller.
+
+    Returns:
+        The forces in order of their places from tail to head; None if the controller solved for none, or if the
+        direction of travel at the first push-point is unknown.
+    """
+    solved = list(zip(state.push_points, state.desired_force_n, strict=False))
+    if len(solved) < MIN_CONTACTS or not state.propulsion_n:
         return None
-    pairs.sort(key=lambda pair: pair[0].body_s_m)
-    contacts = [contact for contact, _ in pairs]
-    sizes = [size for _, size in pairs]
+    solved.sort(key=lambda pair: pair[0].body_s_m)
+    contacts = [contact for contact, _ in solved]
+    sizes_n = [size_n for _, size_n in solved]
     normals = np.array([contact.normal_w[:2] for contact in contacts])
     tangent = np.array(contacts[0].tangent_w[:2])
     tangent_length = float(np.hypot(*tangent))
@@ -100,32 +108,38 @@ def balance_of(state: ControlState) -> Balance | None:
         return None
     return Balance(
         contacts=contacts,
-        size_n=sizes,
-        contact_n=normals * np.array(sizes)[:, None],
+        size_n=sizes_n,
+        contact_n=normals * np.array(sizes_n)[:, None],
         tether_n=-state.propulsion_n * tangent / tangent_length,
     )
 
 
 def balanced_snapshots(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Snapshot]:
-    """Return the moments of locomotion whose solved forces balance, in order of time.
+    """Return the moments of locomotion with a propulsion joint at which the controller's solved forces balance.
 
     Args:
-        record: What was recorded of the run.
-        begin_s: Reports before this time are left out.
-        end_s: Reports after this time are left out.
+        record: The recorded run.
+        begin_s: Messages of the controller before this time are left out, in s.
+        end_s: Messages of the controller after this time are left out, in s.
+
+    Returns:
+        The snapshots whose pose is known, in order of time.
     """
     if not len(record.time_s):
         return []
     snapshots: list[Snapshot] = []
     for state in record.control:
-        at_s = reported_at_s(record, state)
-        if not begin_s <= at_s <= end_s or state.propulsion_joint is None or state.state != "Locomoting":
+        time_s = reported_at_s(record, state)
+        if not begin_s <= time_s <= end_s:
+            continue
+        if state.propulsion_joint is None or state.state != "Locomoting":
             continue
         balance = balance_of(state)
         if balance is None or not _is_balanced(balance):
             continue
-        snapshot = _make_snapshot(record, at_s, state, balance)
-        if record.nodes_w(snapshot.row) is not None:
+        snapshot = _make_snapshot(record, time_s, state, balance)
+        is_pose_known = record.nodes_w(snapshot.row) is not None
+        if is_pose_known:
             snapshots.append(snapshot)
     return snapshots
 

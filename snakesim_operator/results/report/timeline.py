@@ -119,27 +119,34 @@ def commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
     return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
 
 
-@lru_cache(maxsize=2)  # the chart and the comparison ask for it
+@lru_cache(maxsize=2)  # the chart and the comparison of two runs ask for the same series
 def distance(record: RunRecord) -> Series | None:
-    """Return the advance since the first tick.
+    """Return how far the robot advanced since the first tick, as a series over time.
 
-    It is measured along the route; without a route as the distance of the tail; without a pose as the controller
-    reported it.
+    The best available measure is used: the mean position of the body along the route; without a route, the distance of
+    the tail end from where it was; without a measured pose, the advance that the controller reported.
+
+    Args:
+        record: The recorded run.
+
+    Returns:
+        The series, whose label says how it is measured; None if nothing is known of the advance.
     """
-    count = len(record.time_s)
-    if not count:
+    tick_count = len(record.time_s)
+    if not tick_count:
         return reported_distance(record)
-    rows = np.unique(np.linspace(0, count - 1, min(count, POSE_SAMPLES)).astype(int))
-    rows = rows[record.posed[rows]]
-    if len(rows) > 1:
-        time_s = record.time_s[rows] - zero_s(record)
-        arc = [arc_position_m(record, int(row)) for row in rows]
-        if None not in arc:
-            along = np.array(arc, dtype=np.float64)
-            return Series(time_s, along - along[0], "advance along the route, mean over the body")
-        moved = record.position_w_m[rows, :2] - record.position_w_m[rows[0], :2]
-        return Series(time_s, np.hypot(*moved.T), "distance of the tail end from where it was")
-    return reported_distance(record)
+    sample_count = min(tick_count, POSE_SAMPLES)
+    sampled_rows = np.unique(np.linspace(0, tick_count - 1, sample_count).astype(int))
+    rows = sampled_rows[record.posed[sampled_rows]]
+    if len(rows) < 2:
+        return reported_distance(record)
+    time_s = record.time_s[rows] - zero_s(record)
+    route_positions_m = [arc_position_m(record, int(row)) for row in rows]
+    if None not in route_positions_m:
+        along_m = np.array(route_positions_m, dtype=np.float64)
+        return Series(time_s, along_m - along_m[0], "advance along the route, mean over the body")
+    displacement_w = record.position_w_m[rows, :2] - record.position_w_m[rows[0], :2]
+    return Series(time_s, np.hypot(*displacement_w.T), "distance of the tail end from where it was")
 
 
 def reported_distance(record: RunRecord) -> Series | None:

@@ -33,12 +33,21 @@ MEASURED_OFFSET = 7.0  # of a measured force from its contact, so that it does n
 
 
 def top_view(record: RunRecord, snapshot: Snapshot, view: View) -> str:
-    """Draw the snake, the obstacles and the forces of one snapshot."""
+    """Draw the snake, the obstacles and the forces of one snapshot as SVG.
+
+    Args:
+        record: The recorded run.
+        snapshot: The time to draw, with the forces then.
+        view: Window of the ground, scale of length and scale of force.
+    """
     nodes = nodes_xy_w(record, snapshot.row)
     labels = Labels(view.width, view.height - FOOT)
+    # Later parts cover earlier ones, and later labels avoid what is already drawn.
     parts = [ground(record, view, labels), body(record, view, nodes, labels)]
-    parts += [_draw_measured_force(contact, view, labels) for contact in snapshot.measured_contacts]
+    for contact in snapshot.measured_contacts:
+        parts.append(_draw_measured_force(contact, view, labels))
     parts.append(_draw_solved_forces(snapshot, view, labels))
+
     description = f"Top view at {snapshot.time_s:.2f} s"
     joint = snapshot.propulsion_joint
     if joint is not None:
@@ -51,8 +60,8 @@ def top_view(record: RunRecord, snapshot: Snapshot, view: View) -> str:
     if snapshot.balance is not None:
         for i in range(len(snapshot.balance.contacts)):
             parts.append(_label_push_point(i, snapshot.balance, view, labels))
-    for end, word in ((nodes[0], "tail"), (nodes[-1], "head")):
-        parts.append(labels.place_label(view.at(end), word, "halo soft", gaps=(16, 24, 34)))
+    parts.append(labels.place_label(view.at(nodes[0]), "tail", "halo soft", gaps=(16, 24, 34)))
+    parts.append(labels.place_label(view.at(nodes[-1]), "head", "halo soft", gaps=(16, 24, 34)))
     return figure(view.width, view.height, description, *parts, scales(view))
 
 
@@ -73,6 +82,13 @@ def _draw_route(record: RunRecord, view: View) -> str:
 
 
 def _draw_obstacle(item: Placed, view: View, labels: Labels) -> str:
+    """Draw one obstacle as SVG, with a tooltip; empty if it is not in the window.
+
+    Args:
+        item: The obstacle, and whether the snake can climb it or push it away.
+        view: Window and scale of the drawing.
+        labels: Labels of the drawing, which avoid the obstacle.
+    """
     obstacle: Obstacle = item.obstacle
     if not view.shows(obstacle):
         return ""
@@ -83,13 +99,13 @@ def _draw_obstacle(item: Placed, view: View, labels: Labels) -> str:
     else:
         class_ = "peg"
     x, y = view.at(obstacle.position_w)
-    reach = reach_m(obstacle) * view.scale
-    labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
+    half_extent = reach_m(obstacle) * view.scale
+    labels.keep_off((x - half_extent, y - half_extent, x + half_extent, y + half_extent), 0.15)
     tooltip = title(_describe_obstacle(item))
-    if obstacle.shape != "box":
-        return element("circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
-    corners = [view.at(corner) for corner in outline_w(obstacle)]
-    return element("polygon", tooltip, points=points_text(corners), class_=class_)
+    if obstacle.shape == "box":
+        corners = [view.at(corner) for corner in outline_w(obstacle)]
+        return element("polygon", tooltip, points=points_text(corners), class_=class_)
+    return element("circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
 
 
 def _describe_obstacle(item: Placed) -> str:
@@ -118,22 +134,33 @@ def outline_w(obstacle: Obstacle) -> Floats:
 
 
 def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:
-    """Draw the links as capsules, then the joints.
+    """Draw the snake's links as thick lines with round ends, then its joints as dots, as SVG.
 
-    The links are drawn tail to head, so that every link shows its cap over the one behind.
+    The links are drawn tail to head, so that every link shows its round end over the link behind it.
+
+    Args:
+        record: The recorded run, with the radii of the links.
+        view: Window and scale of the drawing.
+        nodes: (links + 1, 2) ends of the links in the world, tail to head, in m.
+        labels: Labels of the drawing, which avoid the body.
     """
+    edge_width = 1.2  # of the dark edge that a wider line below the link leaves visible on each side
     points = [view.at(node) for node in nodes]
     links = record.description.links
     parts: list[str] = []
     for i, link in enumerate(links):
-        kind = "head-link" if i == len(links) - 1 else "link"
+        class_ = "head-link" if i == len(links) - 1 else "link"
+        rear_x, rear_y = points[i]
+        front_x, front_y = points[i + 1]
         width = 2 * link.radius_m * view.scale
-        a = points[i]
-        b = points[i + 1]
-        for class_, stroke_width in ((f"{kind}-edge", width), (kind, width - 2.4)):
-            thick = max(stroke_width, 1.0)
-            parts.append(element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=thick))
-        labels.keep_off_line(a, b, width / 2, 0.4)
+        layers = [(f"{class_}-edge", width), (class_, width - 2 * edge_width)]
+        for layer_class, layer_width in layers:
+            stroke_width = max(layer_width, 1.0)
+            line = element(
+                "line", x1=rear_x, y1=rear_y, x2=front_x, y2=front_y, class_=layer_class, stroke_width=stroke_width
+            )
+            parts.append(line)
+        labels.keep_off_line(points[i], points[i + 1], width / 2, 0.4)
     for x, y in points[1:-1]:
         parts.append(element("circle", cx=x, cy=y, r=2.4, class_="joint"))
     return "".join(parts)
@@ -153,22 +180,30 @@ def _draw_measured_force(contact: WorldContact, view: View, labels: Labels) -> s
 
 
 def _draw_solved_forces(snapshot: Snapshot, view: View, labels: Labels) -> str:
-    """Draw the solved forces and their resultant."""
+    """Draw the controller's desired contact forces and their resultant as arrows, in SVG; empty without any.
+
+    Args:
+        snapshot: The time to draw, with the desired and the measured forces.
+        view: Window of the ground, scale of length and scale of force.
+        labels: Labels of the drawing, which avoid the arrows.
+    """
     balance = snapshot.balance
     if balance is None:
         return ""
     parts: list[str] = []
     contact_classes, resultant_class = balance.force_classes(snapshot.measured_contacts)
     for contact, force_n, class_ in zip(balance.contacts, balance.contact_n, contact_classes, strict=True):
-        foot = view.at(contact.position_w)
-        tip = view.along(foot, force_n, view.force_scale)
-        parts.append(arrow(foot, tip, class_, head=11))
-        labels.keep_off_line(foot, tip, 5)
-    start = view.at(balance.contacts[0].position_w)
-    tip = view.along(start, balance.resultant_n, view.force_scale)
-    labels.keep_off_line(start, tip, 7, 2.0)
-    parts.append(arrow(start, tip, "resultant under", head=14))
-    parts.append(arrow(start, tip, resultant_class, head=14))
+        tail = view.at(contact.position_w)
+        tip = view.along(tail, force_n, view.force_scale)
+        parts.append(arrow(tail, tip, class_, head=11))
+        labels.keep_off_line(tail, tip, 5)
+
+    # The resultant acts through the first push-point. A wider arrow below it separates it from the body.
+    tail = view.at(balance.contacts[0].position_w)
+    tip = view.along(tail, balance.resultant_n, view.force_scale)
+    labels.keep_off_line(tail, tip, 7, 2.0)
+    parts.append(arrow(tail, tip, "resultant under", head=14))
+    parts.append(arrow(tail, tip, resultant_class, head=14))
     return "".join(parts)
 
 
@@ -185,20 +220,27 @@ def _label_push_point(i: int, balance: Balance, view: View, labels: Labels) -> s
 
 
 def scales(view: View) -> str:
-    """Draw the scales of length and of force, and the directions of the axes."""
-    y = view.height - 10
-    meters = round_below(0.25 * (view.width - 2 * EDGE) / view.scale)
-    length_text = f"{meters * 100:g} cm" if meters < 1 else f"{meters:g} m"
+    """Draw the bars that show the scales of length and of force, and the axes x and y, at the bottom of a top view.
+
+    Args:
+        view: Window of the ground, scale of length and scale of force; without forces, its force scale is 0.
+    """
     x = EDGE
-    parts = [scale_bar(x, y, meters * view.scale, length_text)]
-    x += meters * view.scale + text_width(length_text, MAX_TEXT_SIZE) + SCALE_SPACING
+    y = view.height - 10
+    max_length_m = 0.25 * (view.width - 2 * EDGE) / view.scale
+    length_m = round_below(max_length_m)
+    length_text = f"{length_m * 100:g} cm" if length_m < 1 else f"{length_m:g} m"
+    parts = [scale_bar(x, y, length_m * view.scale, length_text)]
+
     if view.force_scale > 0:
-        newtons = round_below(0.8 * LONGEST_ARROW / view.force_scale)
-        parts.append(scale_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
-    corner = (view.width - 46, view.height - 8)
+        x += length_m * view.scale + text_width(length_text, MAX_TEXT_SIZE) + SCALE_SPACING
+        force_n = round_below(0.8 * LONGEST_ARROW / view.force_scale)
+        parts.append(scale_bar(x, y, force_n * view.force_scale, f"{force_n:g} N", "force-bar"))
+
+    origin = (view.width - 46, view.height - 8)
     for direction, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):
-        tip = view.along(corner, direction, 20)
-        parts.append(arrow(corner, tip, "axes", head=6))
-        beyond = view.along(corner, direction, 28)
-        parts.append(text(beyond[0], beyond[1] + 4, name, "small soft", anchor="middle"))
+        tip = view.along(origin, direction, 20)
+        parts.append(arrow(origin, tip, "axes", head=6))
+        label_x, label_y = view.along(origin, direction, 28)
+        parts.append(text(label_x, label_y + 4, name, "small soft", anchor="middle"))
     return "".join(parts)

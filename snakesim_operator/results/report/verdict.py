@@ -92,65 +92,80 @@ def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> 
 
 
 def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> Verdict:
-    """Judge a run that was not meant to locomote: it is good if it moved every joint.
+    """Judge a run that tests the joints and is not meant to locomote: it is good if it moved every joint.
+
+    A joint was moved if its target deviated by more than MOVED_RAD from the median of its targets.
 
     Args:
-        record: What was recorded of the run.
-        summary: Its numbers.
+        record: The recorded run.
+        summary: The numbers of the run.
         command: The command that judges such a run in detail.
     """
-    moved_all = False
-    joints = [joint.name for joint in record.description.joints]
+    all_joints_moved = False
     if not len(record.target):
         words = "No joint was moved: the robot was never armed."
     else:
-        deviation_rad = np.abs(record.target - np.nanmedian(record.target, axis=0))
+        deviation_rad = np.abs(record.target - np.nanmedian(record.target, axis=0))  # (n, joints)
         max_deviation_rad = np.nanmax(deviation_rad, axis=0)
-        moved = [name for name, way in zip(joints, max_deviation_rad, strict=True) if way > MOVED_RAD]
-        moved_all = len(moved) == len(joints)
-        if moved_all:
+        unmoved: list[str] = []
+        for joint, joint_deviation_rad in zip(record.description.joints, max_deviation_rad, strict=True):
+            was_moved = joint_deviation_rad > MOVED_RAD  # False for NaN, which is a joint without any target
+            if not was_moved:
+                unmoved.append(joint.name)
+        all_joints_moved = not unmoved
+        if all_joints_moved:
             words = f"Every joint was moved. Judge the run with `{command} {record.folder}`."
         else:
-            unmoved = ", ".join(name for name in joints if name not in moved)
-            words = f"Not moved: {unmoved}. Run it again with a longer --duration."
+            words = f"Not moved: {', '.join(unmoved)}. Run it again with a longer --duration."
     ending = describe_ending(summary.ended)
     words = f"{words} Ran for {summary.duration_s:.1f} s; {describe_trouble(summary)}.{ending}"
-    is_good = moved_all and summary.ended == COMPLETE
+    is_good = all_joints_moved and summary.ended == COMPLETE
     return Verdict("good" if is_good else "poor", words)
 
 
 def _judge_motion(record: RunRecord, summary: RunSummary, motion: Motion) -> Verdict:
-    """Judge a run without a fault whose pose is known, by the measured motion.
+    """Judge a run that no fault stopped and whose pose is known, by the measured motion.
 
-    What control reported is added to it.
+    The run is poor if it did not locomote, if it jammed or stood still for long, or if it ended early or behind its
+    start. The controller's own report is added to the words, also where it contradicts the measurement.
+
+    Args:
+        record: The recorded run.
+        summary: The numbers of the run.
+        motion: When the body moved and when it stood.
     """
     moved = describe_distance(record, summary)
     trouble = describe_trouble(summary)
     ending = describe_ending(summary.ended)
     if _did_not_locomote(summary):
-        kind = "Jammed" if summary.jammed else "Did not locomote"
-        why = _why_not_locomoted(summary)
-        return Verdict("poor", f"{kind}: {as_sentence(why)} {moved}; {trouble}.{ending}")
+        outcome = "Jammed" if summary.jammed else "Did not locomote"
+        reason = as_sentence(_why_not_locomoted(summary))
+        return Verdict("poor", f"{outcome}: {reason} {moved}; {trouble}.{ending}")
 
     pushed = describe_hand_overs(summary) or describe_pushed_obstacles(record)
     stop = stop_of(record, motion)
     standing_fraction = 1.0 - motion.moving_fraction
     stood_long = summary.jammed or standing_fraction > MAX_STANDING_FRACTION
     if stop is not None and not stop.on_purpose and stood_long:
-        kind = "Jammed" if summary.jammed else "Stopped"
-        why = stop.why.removeprefix("jammed: ")
-        stopped = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {why}"
+        outcome = "Jammed" if summary.jammed else "Stopped"
+        reason = stop.why.removeprefix("jammed: ")
+        stopped = f"{outcome} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {reason}"
         return Verdict("poor", f"{stopped} {moved}; {pushed}{trouble}.{ending}")
 
-    until_end = ", and was still moving at the end" if stop is None and not ending else ""
+    still_moving = ""
+    if stop is None and not ending:
+        still_moving = ", and was still moving at the end"
     jam = "it jammed on the way; " if summary.jammed else ""
     stopped = ""
     if stop is not None:
         stopped = f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
     contradiction = describe_contradiction(record, motion)
+    words = f"{moved}{still_moving}; {pushed}{jam}{trouble}.{stopped}{contradiction}{ending}"
+
+    ended_early = bool(ending)
     went_backward = (summary.path_distance_m or 0.0) < 0
-    is_poor = bool(ending) or went_backward or distance_m(summary) is None
-    words = f"{moved}{until_end}; {pushed}{jam}{trouble}.{stopped}{contradiction}{ending}"
+    is_distance_unknown = distance_m(summary) is None
+    is_poor = ended_early or went_backward or is_distance_unknown
     return Verdict("poor" if is_poor else "good", words)
 
 

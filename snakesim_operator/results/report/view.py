@@ -91,23 +91,40 @@ def map_view(record: RunRecord, nodes: list[Floats], units_per_n: float, width: 
 
 
 def _windows(record: RunRecord, point_sets: list[Floats], units_per_n: float, width: float) -> list[View]:
-    """Return one window for each set of points, (k, 2)."""
-    spans = np.ptp(point_sets[0], axis=0)
-    upright = bool(spans[1] > 1.3 * spans[0])
+    """Return a window of the ground around each set of points, all of one size and one scale.
+
+    If the first set is taller than wide, the ground is rotated by a quarter turn. A window grows so that it does not
+    cut obstacles.
+
+    Args:
+        record: The recorded run, with its obstacles.
+        point_sets: Points in the world to show, (k, 2) in m.
+        units_per_n: Scale of force, in units of the drawing per newton.
+        width: Width of the drawings.
+    """
+    span_x, span_y = np.ptp(point_sets[0], axis=0)
+    upright = bool(span_y > 1.3 * span_x)
     unscaled = View(np.zeros(2), 1.0, units_per_n, 0.0, 0.0, upright)
-    turned = [unscaled.rotate(points) for points in point_sets]
-    max_span_m = max(float(np.ptp(points[:, 0])) for points in turned)
-    air_m = AIR * max_span_m / (width - 2 * AIR)
+    rotated_sets = [unscaled.rotate(points) for points in point_sets]
+    max_span_m = max(float(np.ptp(points[:, 0])) for points in rotated_sets)
+    margin_m = AIR * max_span_m / (width - 2 * AIR)
+
     boxes: list[tuple[Floats, Floats]] = []
-    for points in turned:
-        low = points.min(axis=0) - air_m
-        high = points.max(axis=0) + air_m
+    for points in rotated_sets:
+        low = points.min(axis=0) - margin_m
+        high = points.max(axis=0) + margin_m
         boxes.append(_grow_around_obstacles(record, unscaled, low, high))
+
+    # The largest window sets the scale of all.
     width_m, height_m = np.max([high - low for low, high in boxes], axis=0)
     scale = width / float(width_m)
     height = min(float(height_m) * scale, TALLEST * width)
-    half = np.array([width, height]) / (2 * scale)
-    return [View((low + high) / 2 - half, scale, units_per_n, width, height + FOOT, upright) for low, high in boxes]
+    half_size_m = np.array([width, height]) / (2 * scale)
+    windows: list[View] = []
+    for low, high in boxes:
+        corner = (low + high) / 2 - half_size_m
+        windows.append(View(corner, scale, units_per_n, width, height + FOOT, upright))
+    return windows
 
 
 def _grow_around_obstacles(record: RunRecord, unscaled: View, low: Floats, high: Floats) -> tuple[Floats, Floats]:
