@@ -44,7 +44,7 @@ class Relay(Generic[MessageT]):
             message_type: Their message type.
             every_cycles: Number of bridge cycles from one forwarded sample to the next.
             forward: Receives each forwarded sample.
-            is_wanted: Returns whether a ROS node reads the result at present.
+            has_subscriber: Returns whether a ROS node reads the result at present.
             forwards_all: Forward all samples since the last poll instead of the newest one, for a key whose samples
                 complete each other.
         """
