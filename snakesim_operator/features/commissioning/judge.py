@@ -156,7 +156,12 @@ class _JointJudge:
         return float(motion.with_modules(self._order).motion_at_joints()[joint])
 
     def _judge_mounting(self, joint: int, turned: float) -> dict[JointProperty, PropertyFinding]:
-        """Judge order, sign, gear and zero of a joint."""
+        """Judge how the module of a joint is mounted: its order, sign, gear and zero.
+
+        Args:
+            joint: Index of the joint.
+            turned: Motion of the links divided by the motion that the encoder measured, with its sign; NaN if unknown.
+        """
         if self._order[joint] != joint:
             return self._findings_on_swapped(joint)
         zero = _judge_zero(self._run_in_place, joint, straight=self._straight)

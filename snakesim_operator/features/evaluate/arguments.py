@@ -52,6 +52,7 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_optimize(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim study optimize`."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
