@@ -29,15 +29,13 @@ from snakesim_hal.base.terminal import print_stderr  # noqa: E402
 
 
 def main() -> int:
-    """The command's exit code.
+    """Run a command, and return its exit code.
 
     Ctrl-C ends a command at once, by the signal itself, also during import and exit, where
     Python would print a traceback. `snakesim run` and `snakesim drive emulate can`, which must shut
     down in order, handle the signal themselves.
     """
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:  # closed by the caller, as by `>&-`: else the next file opened gets its number
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
+    _open_closed_streams()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     protect_children()
@@ -47,14 +45,42 @@ def main() -> int:
 
         return command()
     except (MemoryError, ImportError, SystemError, OSError) as error:
-        if isinstance(error, OSError) and error.errno != errno.ENOMEM:
+        if not _is_out_of_memory(error):
             raise
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if not isinstance(error, MemoryError) and limit == resource.RLIM_INFINITY:  # not for lack of memory
-            raise
-        allowed = "this computer has" if limit == resource.RLIM_INFINITY else f"`ulimit -v` allows, {limit // 2**20} MB"
-        print_stderr(f"snakesim: this command needs more memory than {allowed}")
+        print_stderr(f"snakesim: this command needs more memory than {_describe_memory_limit()}")
         return 1
+
+
+def _open_closed_streams() -> None:
+    """Connect each standard stream that the caller has closed, as by `>&-`, to /dev/null.
+
+    Otherwise the next file that is opened gets the stream's number.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            mode = "r" if number == 0 else "w"
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Return whether an error was caused by a lack of memory.
+
+    With a limited address space, a library that cannot be mapped may raise an ImportError or a SystemError.
+    """
+    if isinstance(error, MemoryError):
+        return True
+    is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+    if isinstance(error, OSError) and error.errno != errno.ENOMEM:
+        return False
+    return is_limited
+
+
+def _describe_memory_limit() -> str:
+    """Return what limits the memory of this process."""
+    limit_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit_bytes == resource.RLIM_INFINITY:
+        return "this computer has"
+    return f"`ulimit -v` allows, {limit_bytes // 2**20} MB"
 
 
 if __name__ == "__main__":

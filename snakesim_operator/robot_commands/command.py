@@ -42,18 +42,21 @@ def arm(
     """Arm a robot, if its name and its backend are those that the operator names.
 
     Args:
-        robot: name of the robot.
-        backend: its backend.
-        where: selects the robot's network.
-        print_text: prints a line for the operator.
-        unchecked: whether to arm also without a check of the joints.
-        wait_s: time in which to try again while no robot answers, or while it is not ready. Other refusals end the
+        robot: Expected name of the robot.
+        backend: Expected backend of the robot.
+        where: Selects the robot's network.
+        print_text: Prints a line for the operator.
+        unchecked: Whether to arm the robot even if its joints were not checked.
+        wait_s: Time in which to try again while no robot answers, or while it is not ready. Other refusals end the
             wait, because only an operator can remove their cause.
 
+    Returns:
+        0, the exit code of the command.
+
     Raises:
-        NotReadyError: the robot is not ready, at the end of the wait.
-        RefusedError: another robot or backend is there, or the host refuses.
-        NotConnectedError: no robot answers, at the end of the wait.
+        NotReadyError: The robot is not ready, at the end of the wait.
+        RefusedError: Another robot or backend is there, or the host refuses.
+        NotConnectedError: No robot answers, at the end of the wait.
     """
     deadline_s = time.monotonic() + wait_s
     reported = ""
@@ -148,10 +151,26 @@ def request_from_host(
     link: Link,
     print_text: PrintLine,
 ) -> int:
-    """Query the robot's host, and check who answers. done: in words. Raises RefusedError, NotConnectedError."""
+    """Send a request to the robot's host, confirm the answer by the robot's status, and print it.
+
+    Args:
+        session: Session on the robot's network.
+        key: Key at which the host answers.
+        request: The request.
+        done: What is done if the host accepts, in words, such as "armed".
+        link: How the session reaches the robot, for messages.
+        print_text: Prints a line for the operator.
+
+    Returns:
+        0, the exit code of the command.
+
+    Raises:
+        NotConnectedError: No host answers.
+        RefusedError: The host refuses, or the status does not confirm the answer.
+    """
     statuses = session.latched_reader(keys.STATUS, Status)
     answers = [answer for _, answer in session.request_all(key, request, ANSWER_S)]
-    doubt, shown = judge(answers, statuses)
+    doubt, status = judge(answers, statuses)
     name = link.namespace
     if not answers:
         raise NotConnectedError(
@@ -159,14 +178,15 @@ def request_from_host(
             "robot moves, `snakesim estop`"
         )
     if doubt is not None:
-        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.reason}"
+        status_text = "unknown" if status is None else f"{status.lifecycle} - {status.reason}"
         raise RefusedError(
-            f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}", code="robot/not-confirmed"
+            f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {status_text}", code="robot/not-confirmed"
         )
-    if not answers[0].ok:
-        refused = NotReadyError if answers[0].refusal == "not_ready" else RefusedError
-        raise refused(f"{name}: not {done}: {answers[0].reason}")
-    print_text(f"{name}: {done}: {answers[0].reason}")
+    answer = answers[0]
+    if not answer.ok:
+        refused = NotReadyError if answer.refusal == "not_ready" else RefusedError
+        raise refused(f"{name}: not {done}: {answer.reason}")
+    print_text(f"{name}: {done}: {answer.reason}")
     return 0
 
 
@@ -182,24 +202,31 @@ def request_while_driving(
 
 
 def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
-    """Check the answers of hosts by the robot's status.
+    """Check whether the robot's status confirms the answer of its host.
+
+    An unauthorized process may answer in the host's name, or the host may answer and then hang.
+
+    Args:
+        answers: All answers to one request.
+        statuses: Reads the status that the robot's host publishes.
 
     Returns:
         Why the answers are not confirmed, or None if one host answered and its status confirms it; and the newest
         status.
     """
     if len(answers) > 1:
-        return f"{len(answers)} answered in its name; at least one is an impostor", _wait_for_status(statuses, None)
-    announced = answers[0].lifecycle if answers else None
-    shown = _wait_for_status(statuses, announced)
+        newest_status = _wait_for_status(statuses, None)
+        return f"{len(answers)} answered in its name; at least one is an impostor", newest_status
+    answered_lifecycle = answers[0].lifecycle if answers else None
+    status = _wait_for_status(statuses, answered_lifecycle)
     hosts = {answer.host for answer in answers}
-    if shown is not None:
-        hosts.add(shown.host)
+    if status is not None:
+        hosts.add(status.host)
     if len(hosts) > 1:
-        return "the answer is not from the host that publishes its status; one of them is an impostor", shown
-    if shown is None or shown.lifecycle != announced:
-        return "its status does not show it; the host may hang, and the answer be from an impostor", shown
-    return None, shown
+        return "the answer is not from the host that publishes its status; one of them is an impostor", status
+    if status is None or status.lifecycle != answered_lifecycle:
+        return "its status does not show it; the host may hang, and the answer be from an impostor", status
+    return None, status
 
 
 def _wait_for_status(statuses: Reader[Status], lifecycle: str | None) -> Status | None:

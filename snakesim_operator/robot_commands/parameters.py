@@ -207,26 +207,30 @@ def _wait_for_change(session: Session, before: ControlParameters) -> ControlPara
 def _check_controller_continues(
     states: Reader[ControlState], now: ControlParameters | None, changes: Mapping[str, Any]
 ) -> None:
-    """Raise ControllerError if the controller cannot continue with these changes.
+    """Wait until the controller has run with changed parameters, or until GOES_ON_S have passed.
 
-    While the robot is armed, control reports its state 20 times a second. Otherwise nothing shows it before the arming.
+    While the robot is armed, control reports its state 20 times a second. While it is not armed, control reports
+    nothing, and whether the controller can continue is not known before the robot is armed.
 
     Args:
-        states: Control's reports since the changes were requested.
-        now: The parameters in force with them; None: control publishes none any more.
-        changes: Values by name.
+        states: Reads control's reports since the changes were requested.
+        now: The parameters in force after the change; None: control publishes none any more.
+        changes: The changed values by name.
+
+    Raises:
+        ControllerError: The controller cannot continue with these values, so control has ended.
     """
-    deadline = time.monotonic() + GOES_ON_S
-    while time.monotonic() < deadline:
-        reported = states.drain()
-        for state in reported:
-            if state.failed:
+    deadline_s = time.monotonic() + GOES_ON_S
+    while time.monotonic() < deadline_s:
+        reports = states.drain()
+        for report in reports:
+            if report.failed:
                 values_text = ", ".join(f"{name}={format_value(value)}" for name, value in changes.items())
                 raise ControllerError(
-                    f"{values_text}: set, and then control has ended: {state.reason}. The robot stops. Start control "
+                    f"{values_text}: set, and then control has ended: {report.reason}. The robot stops. Start control "
                     "again with another value"
                 )
-        if now is not None and any(state.tick > now.tick for state in reported):
+        if now is not None and any(report.tick > now.tick for report in reports):
             return
         time.sleep(LOOK_S)
 
@@ -244,7 +248,15 @@ def known_name(name: str, in_force: ControlParameters) -> str:
 
 
 def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
-    """Print all parameters for `snakesim param list`. Returns the exit code."""
+    """Print all parameters of the running controller, for `snakesim param list`.
+
+    Args:
+        where: Selects the robot.
+        as_json: Print one JSON object instead of a table.
+
+    Returns:
+        0, the exit code of the command.
+    """
     with open_session(only_robot(where, "param list"), CONNECT_S) as session:
         in_force = read_parameters_in_force(session)
     parameters = read_parameters(in_force)
@@ -257,10 +269,11 @@ def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
     else:
         origin = f"set by {in_force.requester} at {in_force.timestamp_ns * 1e-9:g} s"
     print_line(f"controller {in_force.controller}, {len(parameters)} parameters, {origin}")
+    # Three aligned columns, then the description.
     rows = [(PREFIX + parameter.name, parameter.value_with_unit, parameter.range) for parameter in parameters]
-    widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
+    column_widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row, parameter in zip(rows, parameters, strict=True):
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        cells = [cell.ljust(width) for cell, width in zip(row, column_widths, strict=True)]
         line = "  ".join([*cells, parameter.description])
         print_line("  " + line.rstrip())
     return 0

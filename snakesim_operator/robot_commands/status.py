@@ -47,16 +47,26 @@ class _Robot:
 
 
 def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
-    """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
+    """Print the state of every reachable robot, and name robots of this computer that do not answer.
+
+    Args:
+        where: Selects the robots.
+        as_json: Print one JSON object instead of text.
+
+    Returns:
+        0 if there is a robot, all robots answer and none has a fault; otherwise 1.
+    """
+    local_robots = where.local()
+    local_endpoints = {robot.endpoint for robot in local_robots}
     robots: list[_Robot] = []
-    running_here = {robot.endpoint for robot in where.local()}
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            robots += _find_robots(link, _choose_connect_time(link, running_here))
+            robots += _find_robots(link, _choose_connect_time(link, local_endpoints))
     reachable = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
     silent = [robot for robot in where.local() if (robot.endpoint, robot.namespace) not in reachable]
-    without_faults = bool(robots) and all(robot.status.lifecycle in ("armed", "disarmed") for robot in robots)
-    exit_code = 0 if without_faults and not silent else 1
+    has_fault = any(robot.status.lifecycle not in ("armed", "disarmed") for robot in robots)
+    is_all_right = bool(robots) and not has_fault and not silent
+    exit_code = 0 if is_all_right else 1
     if as_json:
         print_json({"robots": [_as_json(robot) for robot in robots], "silent": silent})
         return exit_code
@@ -245,21 +255,29 @@ def _describe_faults(status: Status) -> list[str]:
 
 
 def _next_commands(link: Link, status: Status) -> list[str]:
-    """Return the commands that the operator may type next."""
-    where = flags_of(link, status.robot)
-    arm = f"`snakesim robot arm {status.robot} {status.backend}{where}`"
+    """Return lines with the commands that the operator may type next, which depend on the state of the robot.
+
+    Args:
+        link: How to reach the robot; the commands get the same options.
+        status: The newest status of the robot.
+    """
+    flags = flags_of(link, status.robot)
+    reset = f"`snakesim robot reset{flags}`"
+    arm = f"`snakesim robot arm {status.robot} {status.backend}{flags}`"
     if status.lifecycle in ("fault", "estop"):
-        return [f"  next: `snakesim robot reset{where}`, then {arm}"]
+        return [f"  next: {reset}, then {arm}"]
     if status.isolated and status.lifecycle == "disarmed":
-        lines = [f"  next: `snakesim robot reset{where}`, to end the isolation of {', '.join(status.isolated)}"]
+        lines = [f"  next: {reset}, to end the isolation of {', '.join(status.isolated)}"]
         if status.ready_to_arm:
             lines.append(f"  or, without: {arm}")
         return lines
     if status.lifecycle == "armed":
         return [
-            f"  next: `snakesim console{where}` to watch, `snakesim robot disarm{where}` or `snakesim estop` to stop it"
+            f"  next: `snakesim console{flags}` to watch, `snakesim robot disarm{flags}` or `snakesim estop` to stop it"
         ]
     if status.ready_to_arm:
         return [f"  next: {arm}"]
-    missing = ", ".join(f"`snakesim start service {name} SCENARIO{where}`" for name in status.waiting_for)
-    return [f"  next: {missing or '`snakesim status` again: what prevents arming is named above'}"]
+    starts = [f"`snakesim start service {name} SCENARIO{flags}`" for name in status.waiting_for]
+    if starts:
+        return [f"  next: {', '.join(starts)}"]
+    return ["  next: `snakesim status` again: what prevents arming is named above"]

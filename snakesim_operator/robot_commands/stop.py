@@ -22,25 +22,35 @@ AskPort = Callable[[Address], StopAnswer | None]  # raises NotConnectedError whe
 
 
 def estop(where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Stop the addressed robots. Returns 0 when every known robot has confirmed that it is stopped, else 1."""
-    local = local_stop_ports(where)
-    elsewhere = stop_ports_elsewhere(where, local)
+    """Stop the addressed robots in every way at once, and print the result for each robot.
+
+    Each robot is stopped by datagrams to its stop port and by a query over its network. Either is enough.
+
+    Args:
+        where: Selects the robots.
+        print_text: Prints a line for the operator.
+
+    Returns:
+        0 if every known robot has confirmed that it is stopped, otherwise 1.
+    """
+    local_ports = local_stop_ports(where)
+    remote_ports = stop_ports_elsewhere(where, local_ports)
 
     def request(address: Address) -> StopAnswer | None:
         return request_stop(*address, get_user_name(), LIMIT_S)
 
-    with ThreadPoolExecutor(2 * len(local) + len(elsewhere) + 1) as pool:
-        local_futures = [pool.submit(stop_at_port, request, address, robot) for address, robot in local.items()]
-        remote_futures = [pool.submit(stop_at_port, request, address, robot) for address, robot in elsewhere.items()]
-        # Imported only now: the datagrams are sent meanwhile.
+    with ThreadPoolExecutor(2 * len(local_ports) + len(remote_ports) + 1) as pool:
+        local_futures = [pool.submit(stop_at_port, request, address, robot) for address, robot in local_ports.items()]
+        remote_futures = [pool.submit(stop_at_port, request, address, robot) for address, robot in remote_ports.items()]
+        # This import takes a while. The threads send their datagrams meanwhile.
         from snakesim_operator.robot_commands.stop_by_query import ask_network
 
         network_futures = [pool.submit(ask_network, link, LIMIT_S) for link in where.networks()]
-        here = _collect(local_futures)
-        there = _collect(remote_futures)
-        shown = [result for future in network_futures for result in future.result()]
-    results = combine_results(here, there, shown)
-    for line in describe_results(results, here, shown):
+        local_results = _collect(local_futures)
+        remote_results = _collect(remote_futures)
+        network_results = [result for future in network_futures for result in future.result()]
+    results = combine_results(local_results, remote_results, network_results)
+    for line in describe_results(results, local_results, network_results):
         print_text(line)
     if not results:
         print_text(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")

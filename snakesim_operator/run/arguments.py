@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim run`."""
     add_scenario(parser)
     parser.add_argument(
         "--fault",
@@ -59,6 +60,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    """Run `snakesim run`, in processes or in this one, and return its exit code."""
     check_network(arguments)
     if arguments.in_process:
         from snakesim_operator.run.guarded_process import run_guarded  # before anything large is loaded

@@ -25,22 +25,24 @@ class StartupTimeout:
         self._waited_s = 0.0
 
     def ends(self, status: Status | None, now_s: float) -> bool:
-        """Return whether the time is over.
+        """Count the time that has passed up to a status, and return whether it exceeds the limit.
+
+        While ticks advance, robot time is counted. Otherwise wall time is counted, at most MAX_STEP_S for each status.
 
         Args:
-            status: the newest one; None before the first.
-            now_s: time of a monotonic clock.
+            status: The newest status of the host; None before the first.
+            now_s: Time of a monotonic clock in seconds.
         """
-        last = self._last_status
-        if status is None or status is last:
+        previous = self._last_status
+        if status is None or status is previous:
             return False
         since_arrival_s = now_s - self._last_arrival_s
         self._last_status = status
         self._last_arrival_s = now_s
-        if last is None or self._starts_again(last, status):
+        if previous is None or self._starts_again(previous, status):
             self._waited_s = 0.0
-        elif status.tick > last.tick:
-            self._waited_s += (status.timestamp_ns - last.timestamp_ns) * 1e-9
+        elif status.tick > previous.tick:
+            self._waited_s += (status.timestamp_ns - previous.timestamp_ns) * 1e-9
         else:
             self._waited_s += min(since_arrival_s, MAX_STEP_S)
         return self._waited_s > self.limit_s

@@ -25,12 +25,26 @@ POLL_S = 1.0  # Python code runs again after so long, so that an exception can b
 
 
 def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
-    """Call a function of a module in a process of its own. Raises the SnakesimError that it raises there."""
-    with TemporaryDirectory(prefix="snakesim-") as folder:  # also for the child's own, which Ctrl-C kills
-        (Path(folder) / CALL_FILE).write_bytes(pickle.dumps((function, arguments)))
+    """Call a function in a process of its own, and return its result.
+
+    Function, arguments and result travel as pickle files in a temporary folder.
+
+    Args:
+        function: A function on the top level of a module.
+        **arguments: Its keyword arguments.
+
+    Raises:
+        SnakesimError: The function raised this error there, or the process ended without a result.
+    """
+    # The child gets the folder for its temporary files, too, which then are removed even if Ctrl-C kills it.
+    with TemporaryDirectory(prefix="snakesim-") as folder:
+        call_path = Path(folder) / CALL_FILE
+        answer_path = Path(folder) / ANSWER_FILE
+        call_path.write_bytes(pickle.dumps((function, arguments)))
+        variables = {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}
         process = subprocess.Popen(
             python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
-            env=child_environment(common_environment(), {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}),
+            env=child_environment(common_environment(), variables),
             stdin=subprocess.DEVNULL,
         )
         try:
@@ -42,8 +56,8 @@ def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
             process.wait()
         if process.returncode:
             raise errors.SnakesimError(f"the process of the run ended with exit code {process.returncode}; see above")
-        answer = pickle.loads((Path(folder) / ANSWER_FILE).read_bytes())
-    if isinstance(answer, tuple):
+        answer = pickle.loads(answer_path.read_bytes())
+    if isinstance(answer, tuple):  # the error that the function raised
         error_name, lines, code = answer
         error_type = getattr(errors, error_name, errors.SnakesimError)
         error = error_type(*lines)

@@ -108,19 +108,26 @@ class ProcessFaults:
             step_wall_clock(-self._stepped_s)
 
     def _answer(self, question: Query, robot: Description | None, lifecycle: LifecycleState) -> Answer:
-        """Check a request, begin or end its fault if that is allowed, and return the answer."""
+        """Carry out a request to begin or end a fault, if it is allowed, and return the answer to it.
+
+        Args:
+            question: The request as it was received.
+            robot: Description of the robot; None while it is not known.
+            lifecycle: State of the robot, which every answer contains.
+        """
 
         def refuse(reason: str, refusal: str) -> Answer:
             return Answer(ok=False, reason=reason[:MAX_REASON_CHARACTERS], refusal=refusal, lifecycle=lifecycle)
 
-        prohibition = "the robot is not known yet" if robot is None else self._describe_prohibition(robot)
+        if robot is None:
+            return refuse("the robot is not known yet", "not_allowed")
+        prohibition = self._describe_prohibition(robot)
         if prohibition is not None:
             return refuse(prohibition, "not_allowed")
         try:
             request = self._decoder.decode(question.payload, question.encoding)
-            injection = check_injection(
-                Injection(request.kind, request.target, 0.0, request.for_s or inf, request.amount)
-            )
+            end_s = request.for_s or inf
+            injection = check_injection(Injection(request.kind, request.target, 0.0, end_s, request.amount))
             if request.end:
                 self._end(injection)
                 return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)

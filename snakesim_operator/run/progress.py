@@ -62,26 +62,28 @@ class Progress(OneLine):
         self._armed_s = 0.0
 
     def update(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
-        """Update the line, if an update is due.
+        """Update the progress line, if an update is due.
 
         Args:
-            status: the newest one of the host; None while there is none.
-            control: the newest state that control published.
-            armed: whether the run has armed the robot.
+            status: The newest status of the host; None while there is none.
+            control: The newest state that the controller published.
+            armed: Whether the run has armed the robot.
         """
-        now = time.monotonic()
+        now_s = time.monotonic()
         if status is None:
             return
         self._count_armed_time(status)
-        if now < self._next and armed == self._armed:
+        is_due = now_s >= self._next or armed != self._armed
+        if not is_due:
             return
         if armed and self._origin is None:
-            self._origin = (now, status.tick / self._rate_hz)
+            self._origin = (now_s, status.tick / self._rate_hz)
         if armed and not self._armed_s:
             return  # armed since the last status: only the next status shows for how long
         self._armed = armed
-        self._next = now + (TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S)
-        text = self._describe_run(status, control, now) if armed else f"starting: {status.reason}"
+        period_s = TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S
+        self._next = now_s + period_s
+        text = self._describe_run(status, control, now_s) if armed else f"starting: {status.reason}"
         if self.terminal or text != self._last:
             self.show_text(text)
         self._last = text

@@ -139,30 +139,31 @@ def _conclude(request: RunRequest, supervisor: Supervisor, files: RunFiles, endi
 
 @contextlib.contextmanager
 def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles, Path]]:
-    """Lock the run's folder for as long as the context lives, and write the configuration.
+    """Lock the run's folder for as long as the context lives, and write the configuration into it.
 
-    A run whose folder is not writable continues, but leaves no files.
+    If the folder is not writable, the run continues without files. Its processes then read the configuration from
+    memory, because each of them needs a path.
 
     Args:
-        config: configuration of the run.
-        out: the folder; None for the default one.
+        config: Configuration of the run.
+        out: The folder; None for the default one.
 
     Yields:
         The writer of the run's files, and the path of the configuration.
     """
     out = out or default_folder(config.name)
     content = encode_config(config)
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as resources:
         try:
-            folder = held.enter_context(locked_folder(out, print_line))
+            folder = resources.enter_context(locked_folder(out, print_line))
             write_atomically(folder / CONFIG, content)
         except OSError as error:
-            held.close()
+            resources.close()
             print_line(f"warning: --out {out}: {error.strerror}; the run continues, but nothing of it is recorded")
-            memory = os.memfd_create("snakesim-config")
-            held.callback(os.close, memory)
-            os.write(memory, content)
-            yield RunFiles(None, _warn), Path(f"/proc/{os.getpid()}/fd/{memory}")
+            memory_file = os.memfd_create("snakesim-config")
+            resources.callback(os.close, memory_file)
+            os.write(memory_file, content)
+            yield RunFiles(None, _warn), Path(f"/proc/{os.getpid()}/fd/{memory_file}")
         else:
             yield RunFiles(folder, _warn), folder / CONFIG
 
@@ -286,26 +287,34 @@ def _print_start(config: RunConfig, link: Link) -> None:
 
 @contextlib.contextmanager
 def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
-    """Connect to the run's network as soon as the host has opened it.
+    """Connect to the run's network, and try again until the host has opened it.
+
+    Args:
+        link: How to reach the network.
+        supervisor: Reports whether a process of the run has ended.
+        ending: Reports whether the operator has interrupted the run.
+
+    Yields:
+        The session, which is closed when the context ends.
 
     Raises:
-        NotConnectedError: a process has ended, the operator interrupted the run, or the host took too long.
+        NotConnectedError: A process has ended, the operator interrupted the run, or the host took too long.
     """
-    began_s = time.monotonic()
-    reported_s = began_s
+    start_s = time.monotonic()
+    last_report_s = start_s
     with contextlib.ExitStack() as stack:
         while True:
             try:
                 session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
                 break
             except NotConnectedError:
-                ended = supervisor.describe_first_end()
-                if ended is not None:
-                    raise NotConnectedError(ended, code="run/failed") from None
-                now = time.monotonic()
-                if now > began_s + SERVICE_START_LIMIT_S or ending.interrupted:
+                ended_process = supervisor.describe_first_end()
+                if ended_process is not None:
+                    raise NotConnectedError(ended_process, code="run/failed") from None
+                now_s = time.monotonic()
+                if now_s > start_s + SERVICE_START_LIMIT_S or ending.interrupted:
                     raise
-                if now > reported_s + REPORT_PERIOD_S:
-                    print_line(f"starting: the host has not opened its network yet, after {now - began_s:.0f} s")
-                    reported_s = now
+                if now_s > last_report_s + REPORT_PERIOD_S:
+                    print_line(f"starting: the host has not opened its network yet, after {now_s - start_s:.0f} s")
+                    last_report_s = now_s
         yield session

@@ -108,7 +108,10 @@ class RunFiles:
             self._changed.notify_all()
 
     def _write_files(self) -> None:
-        """Carry out the tasks in order, in a thread. A task that fails is retried until the files are closed."""
+        """Carry out the write tasks in order, until the files are closed and no task is left. Runs in a thread.
+
+        A task that fails is tried again after RETRY_S. Once the files are being closed, it is given up instead.
+        """
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._tasks or self._closing)
@@ -116,16 +119,18 @@ class RunFiles:
                     break
                 task = self._tasks[0]
             bytes_before = len(task.content)
-            self._failure = self._attempt(task)
+            self._failure = self._attempt(task)  # without the lock, because writing may take long
             if self._failure:
                 self.warn(self._failure)
             with self._changed:
-                if not self._failure or self._closing:
+                is_finished = not self._failure or self._closing
+                if is_finished:
                     self._tasks.popleft()
                     self._waiting_bytes -= bytes_before
                     self._lost = self._lost or self._failure
                 else:
-                    self._waiting_bytes -= bytes_before - len(task.content)
+                    written_bytes = bytes_before - len(task.content)
+                    self._waiting_bytes -= written_bytes
                     self._changed.notify_all()
                     self._changed.wait_for(lambda: self._closing, RETRY_S)
                 self._changed.notify_all()

@@ -81,26 +81,32 @@ def write_completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[st
 
 
 def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Completions]:
-    """Yield what can follow a parser, and each parser below it."""
-    here = Completions(path)
-    below: list[Completions] = []
+    """Yield what can follow a command on the command line, then the same for each of its subcommands.
+
+    Args:
+        parser: The parser of the command.
+        path: The words of the command, such as `snakesim robot`.
+    """
+    completions = Completions(path)
+    subcommand_completions: list[Completions] = []
     for action in parser._actions:
-        if action.help == argparse.SUPPRESS and action.option_strings:  # only other processes use it
+        is_internal = action.help == argparse.SUPPRESS and action.option_strings  # only other processes use it
+        if is_internal:
             continue
         choices = _choices(action)
         if isinstance(action, argparse._SubParsersAction):
-            here.words += choices
-            for name, inner in action.choices.items():
-                below += _walk(inner, f"{path} {name}")
+            completions.words += choices
+            for name, subparser in action.choices.items():
+                subcommand_completions += _walk(subparser, f"{path} {name}")
         elif not action.option_strings:
-            here.words += choices
-        elif action.nargs == 0:
-            here.options += action.option_strings
+            completions.words += choices
         else:
-            here.options += action.option_strings
-            here.values |= dict.fromkeys(action.option_strings, choices)
-    yield here
-    yield from below
+            completions.options += action.option_strings
+            takes_value = action.nargs != 0
+            if takes_value:
+                completions.values |= dict.fromkeys(action.option_strings, choices)
+    yield completions
+    yield from subcommand_completions
 
 
 def _choices(action: argparse.Action) -> list[str]:

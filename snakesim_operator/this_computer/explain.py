@@ -60,23 +60,33 @@ def _find_inner_keys(keys: Mapping[str, Key], table: str) -> list[Key]:
 
 
 def _unknown_key_error(keys: Mapping[str, Key], name: str, full_name: str) -> ConfigError:
-    """Return the error for a key that does not exist, with a similar key or those of the same table."""
+    """Return the error for a key that does not exist. It names a similar key, or all keys of the same table.
+
+    Args:
+        keys: All keys of the scenario by their dotted names.
+        name: The key as the user typed it.
+        full_name: The same key with the section of the chosen controller or backend.
+    """
     problem = f"--explain {shorten(name)}: there is no such key"
-    *parents, last = full_name.split(".")
+    *parents, last_word = full_name.split(".")
     while parents and ".".join(parents) not in keys:
         parents.pop()
-    table = ".".join(parents)
-    siblings = _find_inner_keys(keys, table) if table else [key for key in keys.values() if "." not in key.name]
-    nearest = _find_nearest_key(last, siblings) if table else None
+    table = ".".join(parents)  # the innermost table that exists; empty: the top of the scenario
+    if table:
+        siblings = _find_inner_keys(keys, table)
+        nearest = _find_nearest_key(last_word, siblings)
+    else:
+        siblings = [key for key in keys.values() if "." not in key.name]
+        nearest = None
     if nearest is None:
-        nearest = _find_nearest_key(last, list(keys.values()))
+        nearest = _find_nearest_key(last_word, list(keys.values()))
     if nearest is None and not table:
         nearest = keys.get(find_nearest_word(full_name, keys) or "")
     if nearest is not None:
         return ConfigError(f"{problem}; did you mean `{nearest.name}`?")
-    known = ", ".join(key.doc.name for key in siblings)
+    sibling_names = ", ".join(key.doc.name for key in siblings)
     where = f"`{table}` has" if table else "the tables and keys at the top are"
-    return ConfigError(f"{problem}; {where} {shorten(known, MAX_KEYS_IN_ERROR)}")
+    return ConfigError(f"{problem}; {where} {shorten(sibling_names, MAX_KEYS_IN_ERROR)}")
 
 
 def _find_nearest_key(last_part: str, keys: Sequence[Key]) -> Key | None:

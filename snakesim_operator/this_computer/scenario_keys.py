@@ -49,17 +49,22 @@ def list_keys(loaded: Loaded, named: str = "") -> dict[str, Key]:
     """Return every key of a scenario by its dotted name.
 
     Args:
-        loaded: the checked scenario, with the origin of each value.
-        named: a key; if it is in the section of a plugin that the scenario does not use, that section is listed too.
+        loaded: The checked scenario, with the origin of each value.
+        named: A key; if it is in the section of a plugin that the scenario does not use, that section is listed too.
     """
     config = loaded.config
     values = msgspec.to_builtins(config)
-    given_exceptions = values["robot"]["joints"]
-    values["robot"]["joints"] = {joint.name: given_exceptions.get(joint.name, {}) for joint in config.robot.joint_table}
+    # The file names only joints that differ from the others. The list shows every joint.
+    joints_in_file = values["robot"]["joints"]
+    values["robot"]["joints"] = {joint.name: joints_in_file.get(joint.name, {}) for joint in config.robot.joint_table}
+
     keys: dict[str, Key] = {}
     for key in _keys_of_struct(RunConfig, values, ""):
-        keys[key.name] = _merge_kinds(keys[key.name], key) if key.name in keys else key
-    keys[JOINTS] = replace(keys[JOINTS], value=given_exceptions)
+        if key.name in keys:
+            keys[key.name] = _merge_kinds(keys[key.name], key)
+        else:
+            keys[key.name] = key
+    keys[JOINTS] = replace(keys[JOINTS], value=joints_in_file)
     for section, group in PLUGIN_SECTIONS.items():
         for key in _keys_of_plugins(loaded, section, group, named):
             keys[key.name] = key
@@ -148,15 +153,30 @@ def _holds_tables(option: inspect.Type) -> bool:
 
 
 def _keys_of_plugins(loaded: Loaded, section: str, group: str, named: str) -> Iterator[Key]:
-    """Yield the keys of controllers or backends: of the chosen one, of those with values, and of the named one."""
+    """Yield the keys of controllers or backends: of the chosen one, of those with values, and of the named one.
+
+    Args:
+        loaded: The checked scenario.
+        section: "controllers" or "backends".
+        group: The entry-point group at which installed plugins of this kind register.
+        named: A key whose plugin is listed even if the scenario does not use it; may be empty.
+    """
     config = loaded.config
-    sections: Mapping[str, dict[str, Any]] = config.controllers if section == "controllers" else config.backends
-    chosen = config.controller if section == "controllers" else config.backend
-    plugins = {name: name for name in [*sections, *_name_in(named, section)] if name in list_installed(group)}
+    if section == "controllers":
+        values_by_name: Mapping[str, dict[str, Any]] = config.controllers
+        chosen = config.controller
+    else:
+        values_by_name = config.backends
+        chosen = config.backend
+    installed_names = list_installed(group)
+    plugins: dict[str, str] = {}  # name of the section -> name or path of the plugin
+    for name in [*values_by_name, *_name_in(named, section)]:
+        if name in installed_names:
+            plugins[name] = name
     plugins[chosen.rpartition(":")[2]] = chosen
-    for name in sorted({*plugins, *sections}):
+    for name in sorted({*plugins, *values_by_name}):
         key = f"{section}.{name}"
-        values = sections.get(name, {})
+        values = values_by_name.get(name, {})
         plugin = find_installed(group, plugins[name]) if name in plugins else None
         if plugin is None:
             yield Key(key, replace(ANY_VALUE, name=name, type_words="table"), values)

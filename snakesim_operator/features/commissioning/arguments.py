@@ -57,6 +57,7 @@ def _add_jog(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_check(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim robot check`."""
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run")
     add_write(parser, "that it was checked is written into it, if all of it was confirmed")
     parser.add_argument(

@@ -139,7 +139,20 @@ def _connect(path: Path, selection: RobotSelection, command: str) -> Iterator[Ha
 
 
 def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
-    """Write the present pose as the straight pose into a robot file. Return 0. Raises SnakesimError."""
+    """Write the present pose as the straight pose into a robot file.
+
+    Args:
+        path: The robot file.
+        selection: Which robot to address.
+        wait_for_enter: Whether to ask the person to lay the robot straight, and wait for Enter.
+
+    Returns:
+        0, the exit code.
+
+    Raises:
+        RefusedError: The robot moves, is armed or does not answer.
+        ConfigError: The robot file cannot be used.
+    """
     with _connect(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
             print_line("Lay the robot straight on a flat floor, take your hands off it, then press Enter.")

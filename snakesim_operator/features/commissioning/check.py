@@ -137,7 +137,17 @@ def _join_names(joints: Sequence[str], rows: Sequence[JointVerdict]) -> str:
 
 
 def _write_result(path: Path, record: RunRecord, rows: Sequence[JointVerdict], request: CheckRequest) -> None:
-    """Write into a robot file that it was checked, if every property was confirmed. Raises ConfigError."""
+    """Write into a robot file that the robot was checked, if every property of every joint was confirmed.
+
+    Args:
+        path: The robot file.
+        record: The run of the joint check.
+        rows: The verdict on each joint.
+        request: What a person states about the robot.
+
+    Raises:
+        ConfigError: The drives were emulated, or the file is not that of the checked robot.
+    """
     robot = record.description
     joints = record.config.robot.joint_table
     must_be_own(path)

@@ -44,26 +44,32 @@ class Unfollowed:
 def find_unfollowed(
     robot: RobotFile, period_s: float, angle_rad: Floats, velocity_rad_s: Floats, link_rate_rad_s: Floats
 ) -> Unfollowed | None:
-    """Return the first joint whose link disagrees with its encoder; None if there is none, or no link has a gyro.
+    """Return the first joint from the tail whose link does not turn as its encoder measures.
+
+    The angular rate of each link is computed from the encoders, starting at the clamped tail link, which does not
+    move, and compared with the gyro on that link.
 
     Args:
-        robot: whose tail link is clamped.
-        period_s: of a tick.
-        angle_rad: by the encoders, (n, joints).
-        velocity_rad_s: by the encoders, (n, joints).
-        link_rate_rad_s: by gyros in the links' frames, (n, links, 3); NaN where none reported.
+        robot: The robot, whose tail link is clamped.
+        period_s: Period of a tick.
+        angle_rad: (n, joints), by the encoders.
+        velocity_rad_s: (n, joints), by the encoders.
+        link_rate_rad_s: (n, links, 3), by gyros, each in the frame of its link; NaN where no gyro reported.
+
+    Returns:
+        The joint and how it disagrees; None if all agree, or if no link has a gyro.
     """
     omega_rad_s = np.zeros((len(angle_rad), 3))  # angular velocity of a link, in its own frame
     for joint, axis_name in enumerate(robot.axes):
         axis = np.array(AXES[axis_name])
-        rotation = rotations_about(axis, angle_rad[:, joint])  # from the link ahead to the link behind the joint
-        of_link_behind_rad_s = np.einsum("nji,nj->ni", rotation, omega_rad_s)
-        omega_rad_s = of_link_behind_rad_s + velocity_rad_s[:, joint, None] * axis
         component = YAW if axis_name == "yaw" else PITCH
+        rotation = rotations_about(axis, angle_rad[:, joint])  # from the link ahead to the link behind the joint
+        link_behind_rad_s = np.einsum("nji,nj->ni", rotation, omega_rad_s)  # in the frame of the link ahead
+        omega_rad_s = link_behind_rad_s + velocity_rad_s[:, joint, None] * axis
         unfollowed = _compare_gyro(
             joint,
             joint_rad_s=velocity_rad_s[:, joint],
-            behind_rad_s=of_link_behind_rad_s[:, component],
+            behind_rad_s=link_behind_rad_s[:, component],
             acceleration_rad_s2=np.gradient(omega_rad_s[:, component], period_s),
             gyro_rad_s=link_rate_rad_s[:, joint + 1, component],
         )
@@ -75,20 +81,32 @@ def find_unfollowed(
 def _compare_gyro(
     joint: int, *, joint_rad_s: Floats, behind_rad_s: Floats, acceleration_rad_s2: Floats, gyro_rad_s: Floats
 ) -> Unfollowed | None:
-    """Compare the gyro ahead of a joint with the encoders, all about the joint's axis, (n,) each.
+    """Compare the gyro on the link ahead of a joint with the encoders.
 
     Ratio of the joint, delay and bias of the gyro are fitted by least squares; what remains is the disagreement:
 
         gyro = behind + ratio * joint - delay * acceleration + bias
+
+    Args:
+        joint: Index of the joint.
+        joint_rad_s: (n,) velocity of the joint by its encoder.
+        behind_rad_s: (n,) angular rate of the link behind the joint by the encoders, about the joint's axis.
+        acceleration_rad_s2: (n,) angular acceleration of the link ahead by the encoders, about the joint's axis.
+        gyro_rad_s: (n,) angular rate of the link ahead by its gyro, about the joint's axis; NaN where unknown.
+
+    Returns:
+        How the link disagrees with its encoder; None if it agrees, or if the gyro reported too rarely.
     """
-    known = ~np.isnan(gyro_rad_s)
-    if known.sum() < MIN_SAMPLES:
+    is_known = ~np.isnan(gyro_rad_s)
+    if is_known.sum() < MIN_SAMPLES:
         return None
-    regressors = np.column_stack((joint_rad_s, acceleration_rad_s2, np.ones(len(joint_rad_s))))[known]
-    by_gyro_rad_s = (gyro_rad_s - behind_rad_s)[known]
-    values = np.linalg.lstsq(regressors, by_gyro_rad_s, rcond=None)[0]
-    ratio = float(values[0])
-    disagreement_rad_s = float(np.std(by_gyro_rad_s - regressors @ values))
+    bias_column = np.ones(len(joint_rad_s))
+    regressors = np.column_stack((joint_rad_s, acceleration_rad_s2, bias_column))[is_known]
+    joint_by_gyro_rad_s = (gyro_rad_s - behind_rad_s)[is_known]
+    coefficients = np.linalg.lstsq(regressors, joint_by_gyro_rad_s, rcond=None)[0]
+    ratio = float(coefficients[0])
+    residuals_rad_s = joint_by_gyro_rad_s - regressors @ coefficients
+    disagreement_rad_s = float(np.std(residuals_rad_s))
     rate_rad_s = float(np.std(joint_rad_s + behind_rad_s))
     if disagreement_rad_s > max(MAX_DISAGREEMENT * rate_rad_s, MIN_DISAGREEMENT_RAD_S):
         return Unfollowed(joint, "backlash", ratio)

@@ -62,18 +62,24 @@ class JointIdentification:
 def identify_joints(
     config: RunConfig, columns: Mapping[str, Floats], link_rate_rad_s: Floats | None = None
 ) -> list[JointIdentification]:
-    """Identify every joint of a run, tail to head.
+    """Identify the parameters of every joint from the measurements of a run.
+
+    If the model of one joint fails, results of other joints that depend on it are withheld.
 
     Args:
-        config: configuration of the run.
+        config: Configuration of the run.
         columns: `angle_rad`, `velocity_rad_s`, `torque_nm` and `target`, each (ticks, joints).
-        link_rate_rad_s: angular rates by the gyros of the links, (ticks, links, 3), in the links' frames; NaN where
+        link_rate_rad_s: Angular rates by the gyros of the links, (ticks, links, 3), in the links' frames; NaN where
             no gyro reported; None: the links have no gyros.
+
+    Returns:
+        One result for each joint, tail to head.
     """
     period_s = config.period_ns * 1e-9
     joints = config.robot.joint_table
     loads, loads_by_angle = _link_loads(config.robot, period_s, columns)
-    rows: list[JointIdentification] = []
+    results: list[JointIdentification] = []
+    failing_joints: dict[int, str] = {}  # index -> name
     for i, joint in enumerate(joints):
         record = JointRecord(
             period_s=period_s,
@@ -83,16 +89,19 @@ def identify_joints(
             target_rad=columns["target"][:, i],
             torque_limit_nm=joint.limits.torque_nm,
         )
-        rows.append(_identify_or_explain(joint, record, loads[:, i], loads_by_angle[:, i]))
-    failing = {i: rows[i].joint for i, joint in enumerate(joints) if _is_judged_and_fails(rows[i], joint.drive)}
+        result = _identify_or_explain(joint, record, loads[:, i], loads_by_angle[:, i])
+        results.append(result)
+        if _is_judged_and_fails(result, joint.drive):
+            failing_joints[i] = result.joint
     if link_rate_rad_s is not None:
         unfollowed = find_unfollowed(
             config.robot, period_s, columns["angle_rad"], columns["velocity_rad_s"], link_rate_rad_s
         )
         if unfollowed is not None:
-            failing[unfollowed.joint] = rows[unfollowed.joint].joint
-            rows[unfollowed.joint] = rows[unfollowed.joint].withheld(unfollowed.reason)
-    return [_withhold_beside_failing(row, i, failing) for i, row in enumerate(rows)]
+            result = results[unfollowed.joint]
+            failing_joints[unfollowed.joint] = result.joint
+            results[unfollowed.joint] = result.withheld(unfollowed.reason)
+    return [_withhold_beside_failing(result, i, failing_joints) for i, result in enumerate(results)]
 
 
 def _link_loads(robot: RobotFile, period_s: float, columns: Mapping[str, Floats]) -> tuple[Floats, Floats]:

@@ -33,7 +33,12 @@ def render_page(record: RunRecord, rows: Sequence[JointIdentification]) -> str:
 
 
 def _draw_torques(row: JointIdentification, period_s: float) -> list[Figure]:
-    """Return one figure for each model: its torque over the measured torque."""
+    """Return one figure for each of the two models of a joint, with the measured torque and that of the model in N·m.
+
+    Args:
+        row: What was identified of the joint; without both models there is no figure.
+        period_s: Period of a tick.
+    """
     if row.servo is None or row.balance is None:
         return []
     measured, by_balance = row.balance.torque_nm.T

@@ -75,7 +75,13 @@ def identify(run: Path, robot_file: Path | None, out: Path | None, *, as_json: b
 
 
 def _find_judged_ticks(record: RunRecord) -> slice:
-    """Return the longest part in which every value is known and all joints are in position mode. Raises ConfigError."""
+    """Return the rows of the longest part of a run in which the joints can be identified.
+
+    In that part every value is known, all joints are in position mode, and no tick is missing.
+
+    Raises:
+        ConfigError: The run is of another controller, or has no such part.
+    """
     if record.config.controller != CONTROLLER:
         raise ConfigError(
             f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "

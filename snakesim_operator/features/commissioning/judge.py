@@ -156,7 +156,12 @@ class _JointJudge:
         return float(motion.with_modules(self._order).motion_at_joints()[joint])
 
     def _judge_mounting(self, joint: int, turned: float) -> dict[JointProperty, PropertyFinding]:
-        """Judge order, sign, gear and zero of a joint."""
+        """Judge how the module of a joint is mounted: its order, sign, gear and zero.
+
+        Args:
+            joint: Index of the joint.
+            turned: Motion of the links divided by the motion that the encoder measured, with its sign; NaN if unknown.
+        """
         if self._order[joint] != joint:
             return self._findings_on_swapped(joint)
         zero = _judge_zero(self._run_in_place, joint, straight=self._straight)
@@ -244,45 +249,62 @@ def _judge_sign(turned: float, drive: Drive) -> PropertyFinding:
 
 
 def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_backlash_rad: float) -> PropertyFinding:
-    """Judge whether a joint's links turn as far as its encoder counts. lost: its backlash; None: not known."""
+    """Judge whether a joint's links turn as far as its encoder measures.
+
+    Args:
+        turned: Motion of the links divided by the motion that the encoder measured, with its sign; NaN if unknown.
+        lost: Backlash of the joint; None if it is not known.
+        drive: The drive as the robot file has it.
+        allowed_backlash_rad: Largest backlash that is not judged as wrong.
+    """
     if np.isnan(turned):
         return PropertyFinding("unknown", BY_GEAR)
-    if abs(turned) < MAX_RATIO_ERROR:
-        return PropertyFinding("wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash")
     ratio = abs(turned)
+    if ratio < MAX_RATIO_ERROR:
+        return PropertyFinding("wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash")
     reasons: list[str] = []
     if lost is not None and lost.lost_rad > max(allowed_backlash_rad, lost.noise_rad):
-        ratio = abs(lost.ratio)
+        ratio = abs(lost.ratio)  # not reduced by the backlash
         backlash = f"{lost.lost_rad:.3f} rad ({np.rad2deg(lost.lost_rad):.1f} degrees)"
         reasons.append(
             f"backlash of {backlash}: its drive turns that much further than its link when the load reverses, "
             f"{allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash"
         )
     if abs(ratio - 1) >= MAX_RATIO_ERROR:
-        or_backlash = ""
+        other_cause = ""
         if lost is None:
-            or_backlash = ", or backlash, as it moved to one side only or its gyros are noisy"
-        reasons.append(f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}{or_backlash}")
+            other_cause = ", or backlash, as it moved to one side only or its gyros are noisy"
+        reasons.append(f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}{other_cause}")
     if reasons:
         return PropertyFinding("wrong", "; ".join(reasons))
     return CONFIRMED
 
 
 def _judge_zero(run: CheckMeasurements, joint: int, *, straight: bool) -> PropertyFinding:
-    """Judge a joint's zero by gravity if that gives its angle, otherwise by the pose in which the robot was laid."""
+    """Judge the zero of a joint's angle.
+
+    If accelerometers measure the joint's angle by gravity, the encoder is compared with it. Otherwise it is compared
+    with zero, if the robot was laid straight.
+
+    Args:
+        run: Measurements of the check.
+        joint: Index of the joint.
+        straight: Whether a person states that the robot lay straight at the start.
+    """
     at_rest = run.at_rest()
-    by_gravity_rad = None
+    before_motion = run.before_motion()
+    angle_by_gravity_rad = None
     if run.axes[joint] == "pitch":
-        by_gravity_rad = _angle_by_gravity(run, joint, at_rest)
-    if by_gravity_rad is not None:
-        error_rad = float(np.mean(run.angle_rad[at_rest, joint])) - by_gravity_rad
+        angle_by_gravity_rad = _angle_by_gravity(run, joint, at_rest)
+    if angle_by_gravity_rad is not None:
+        error_rad = float(np.mean(run.angle_rad[at_rest, joint])) - angle_by_gravity_rad
         allowed_rad = LEVEL_RAD
     elif not straight:
         return PropertyFinding("unknown", NOT_STRAIGHT)
-    elif not run.before_motion().any():
+    elif not before_motion.any():
         return PropertyFinding("unknown", NO_REST)
     else:
-        error_rad = float(np.mean(run.angle_rad[run.before_motion(), joint]))
+        error_rad = float(np.mean(run.angle_rad[before_motion, joint]))
         allowed_rad = STRAIGHT_RAD
     if abs(error_rad) <= allowed_rad:
         return CONFIRMED

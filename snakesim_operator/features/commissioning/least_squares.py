@@ -97,35 +97,40 @@ class Fit:
 
 
 def solve(regressors: Floats, target: Floats, instruments: Floats, blocks: NDArray[np.int64]) -> Fit:
-    """Solve a least-squares problem with instruments.
+    """Solve a least-squares problem with instruments: find b so that Z' (y - X b) = 0.
+
+    The covariance of b is estimated by the jackknife: the problem is solved again without each block of the record.
 
     Args:
         regressors: X, (rows, k).
         target: y, (rows,).
         instruments: Z, (rows, k); the regressors themselves for ordinary least squares.
-        blocks: for each row, the number of the block of the record that it belongs to, (rows,).
+        blocks: (rows,), for each row, the number of the block of the record that it belongs to.
 
     Raises:
-        ValueError: the rows are too few or do not determine the values.
+        ValueError: The rows are too few or do not determine the values.
     """
-    numbers = np.unique(blocks)
-    n = len(numbers)
-    k = regressors.shape[1]
-    if n < MIN_BLOCKS_PER_VALUE * k:
+    block_ids = np.unique(blocks)
+    block_count = len(block_ids)
+    value_count = regressors.shape[1]
+    if block_count < MIN_BLOCKS_PER_VALUE * value_count:
         raise ValueError("too little motion is left to judge; let it run longer, with larger motion")
-    normal = instruments.T @ regressors
-    if _condition(normal, instruments, regressors) > MAX_CONDITION:
+    normal_matrix = instruments.T @ regressors
+    if _condition(normal_matrix, instruments, regressors) > MAX_CONDITION:
         raise ValueError("its motion does not tell the values apart; was it moved at all?")
     right_side = instruments.T @ target
-    values: Floats = np.linalg.solve(normal, right_side).astype(np.float64)
-    changes: list[Floats] = []  # of the values, when one block is left out
-    for number in numbers:
-        left_out = blocks == number
-        normal_without = normal - instruments[left_out].T @ regressors[left_out]
-        right_side_without = right_side - instruments[left_out].T @ target[left_out]
-        changes.append(np.linalg.solve(normal_without, right_side_without) - values)
-    covariance: Floats = (np.array(changes).T @ np.array(changes) * ((n - 1) / n)).astype(np.float64)
-    return Fit(values, covariance, n - k, target - regressors @ values)
+    values: Floats = np.linalg.solve(normal_matrix, right_side).astype(np.float64)
+    jackknife_changes: list[Floats] = []  # of the values, when one block is left out
+    for block in block_ids:
+        left_out = blocks == block
+        reduced_matrix = normal_matrix - instruments[left_out].T @ regressors[left_out]
+        reduced_right_side = right_side - instruments[left_out].T @ target[left_out]
+        reduced_values = np.linalg.solve(reduced_matrix, reduced_right_side)
+        jackknife_changes.append(reduced_values - values)
+    scatter = np.array(jackknife_changes).T @ np.array(jackknife_changes)
+    covariance: Floats = (scatter * ((block_count - 1) / block_count)).astype(np.float64)
+    residuals = target - regressors @ values
+    return Fit(values, covariance, block_count - value_count, residuals)
 
 
 def _condition(normal: Floats, instruments: Floats, regressors: Floats) -> float:

@@ -72,17 +72,27 @@ def measure_link_shares(run: CheckMeasurements, joint: int) -> LinkShares:
 def _fractions_of_links(
     run: CheckMeasurements, joint: int, commanded: Select, moving: Select, components: Sequence[int]
 ) -> Floats:
-    """Return how much of the joint's motion each link made about an axis of each joint, (links, joints).
+    """Return the motion of every link while one joint moved, as a fraction of that joint's motion by its encoder.
 
     A joint's axis is the same in both of its links' frames, so that their fractions about it may be subtracted. Those
     across it may be, as long as the joint is nearly straight.
+
+    Args:
+        run: Measurements of the check.
+        joint: Index of the joint that moved.
+        commanded: (ticks,) where the joint had a moving target.
+        moving: (ticks,) where it moved fast enough for a ratio of rates.
+        components: For each joint of the robot, the component of the links' rates to use: about or across its axis.
+
+    Returns:
+        (links, joints), NaN where unknown.
     """
-    speed = run.velocity_rad_s[:, joint]
-    by_component: dict[int, list[float]] = {}
+    speed_rad_s = run.velocity_rad_s[:, joint]
+    fractions_by_component: dict[int, list[float]] = {}  # one fraction for each link
     for component in set(components):
-        rates = run.link_rate_rad_s[:, :, component].T
-        by_component[component] = [_fit_fraction(rate, speed, moving) for rate in rates]
-    fractions = np.array([by_component[component] for component in components]).T
+        link_rates_rad_s = run.link_rate_rad_s[:, :, component].T
+        fractions_by_component[component] = [_fit_fraction(rate, speed_rad_s, moving) for rate in link_rates_rad_s]
+    fractions = np.array([fractions_by_component[component] for component in components]).T
     if np.isnan(fractions[0]).all():  # link 0 has no IMU; motion capture may have measured its angle
         angle_rad = _remove_mean(run.angle_rad[:, joint], commanded)
         for k, component in enumerate(components):
@@ -104,28 +114,33 @@ def _fit_fraction(signal: Floats, reference: Floats, where: Select) -> float:
 
 
 def find_order(motions: Sequence[LinkShares | None]) -> Order:
-    """Return whose module is in the place of each joint's.
+    """Find joint modules whose ids are swapped.
 
-    The pair whose exchange leaves the smallest misfit is exchanged, as long as the exchange explains the motions of
-    both joints. Both motions count together: one alone may tell little, when the floor lets few links turn.
+    Repeatedly exchanges the pair of modules whose exchange leaves the smallest misfit between IMUs and encoders, as
+    long as the exchange explains the motions of both joints. Both motions count together, because one alone may show
+    little if the floor lets few links turn.
 
     Args:
-        motions: what was measured while each joint moved; None where a joint did not move.
+        motions: What was measured while each joint moved; None where a joint did not move.
+
+    Returns:
+        For each joint, the index of the joint whose module is in its place.
     """
     order = np.arange(len(motions))
     pairs = [(j, k) for j in range(len(motions)) for k in range(j + 1, len(motions))]
     while pairs:
         misfits = [_total_misfit(motions, _with_swap(order, *pair)) for pair in pairs]
-        best = pairs[int(np.argmin(misfits))]
-        swapped = _with_swap(order, *best)
-        motions_of_pair = [motions[j] for j in best]
-        misfit_before = _total_misfit(motions_of_pair, order)
+        best_pair = pairs[int(np.argmin(misfits))]
+        swapped_order = _with_swap(order, *best_pair)
+        pair_motions = [motions[joint] for joint in best_pair]
+        misfit_before = _total_misfit(pair_motions, order)
+        misfit_after = _total_misfit(pair_motions, swapped_order)
         if misfit_before < MIN_SWAP_MISFIT:
             break
-        if _total_misfit(motions_of_pair, swapped) > MAX_REMAINING_MISFIT * misfit_before:
+        if misfit_after > MAX_REMAINING_MISFIT * misfit_before:
             break
-        order = swapped
-        pairs = [pair for pair in pairs if not {*pair} & {*best}]
+        order = swapped_order
+        pairs = [pair for pair in pairs if set(pair).isdisjoint(best_pair)]
     return order
 
 

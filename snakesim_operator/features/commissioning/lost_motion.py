@@ -40,34 +40,57 @@ class LostMotion:
 
 
 def find_lost_motion(run: CheckMeasurements, joint: int) -> LostMotion | None:
-    """Return the motion that is lost in a joint that moved to and fro; None if it is not known."""
-    moved = np.flatnonzero(run.moved_by_target(joint))
-    by_gyros = _integrate_link_angle(run, joint)
-    if by_gyros is None or len(moved) < MIN_SAMPLES:
+    """Measure the backlash of a joint that moved back and forth.
+
+    Fits the ratio of the link's rate to the drive's rate and the delay between their sensors. The backlash is the range
+    of the drive angle minus the link angle divided by that ratio.
+
+    Args:
+        run: Measurements of the check.
+        joint: Index of the joint.
+
+    Returns:
+        The backlash and its noise; None if the joint moved too little, or no gyro measured its link.
+    """
+    moved_rows = np.flatnonzero(run.moved_by_target(joint))
+    link_angle = _integrate_link_angle(run, joint)
+    if link_angle is None or len(moved_rows) < MIN_SAMPLES:
         return None
-    link_rad, drift = by_gyros
+    link_rad, drift_rad_per_sqrt_s = link_angle
     encoder_rad = run.angle_rad[:, joint]
+
+    # The part of the record in which the joint moved, where the slopes are valid.
     half_window = max(round(SLOPE_HALF_WINDOW_S / run.period_s), 1)
     margin = round(MARGIN_S / run.period_s)
-    begin = max(moved[0] - margin, 2 * half_window)
-    end = min(moved[-1] + margin, len(encoder_rad) - 2 * half_window)
+    begin = max(moved_rows[0] - margin, 2 * half_window)
+    end = min(moved_rows[-1] + margin, len(encoder_rad) - 2 * half_window)
     window = slice(begin, end)
-    drive_rate = _slope(encoder_rad, half_window, run.period_s)
-    acceleration = _slope(drive_rate, half_window, run.period_s)[window]
+
+    # Ratio and delay.
+    whole_drive_rate = _slope(encoder_rad, half_window, run.period_s)
+    drive_rate = whole_drive_rate[window]
+    acceleration = _slope(whole_drive_rate, half_window, run.period_s)[window]
     link_rate = _slope(link_rad, half_window, run.period_s)[window]
-    drive_rate = drive_rate[window]
-    ratio = _find_ratio(drive_rate, link_rate)
-    if ratio is None:
+    approximate_ratio = _find_ratio(drive_rate, link_rate)
+    if approximate_ratio is None:
         return None
-    ratio, delay_s = _refine_ratio(ratio, drive_rate, link_rate, acceleration)
+    ratio, delay_s = _refine_ratio(approximate_ratio, drive_rate, link_rate, acceleration)
+
+    # Difference of drive and link, as a moving average, and its noise.
     difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
     mean_window = np.full(2 * half_window - 1, 1 / (2 * half_window - 1))
     difference_rad = np.convolve(difference_rad, mean_window, "valid")
     duration_s = len(difference_rad) * run.period_s
-    encoder_noise_rad = float(np.std(np.diff(encoder_rad[run.at_rest()]))) / np.sqrt(2)
-    gyro_drift_rad = drift * np.sqrt(duration_s) / abs(ratio)
-    noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad / np.sqrt(half_window)))
+    gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s) / abs(ratio)
+    encoder_noise_rad = _measure_encoder_noise(run, joint) / np.sqrt(half_window)
+    noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
     return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
+
+
+def _measure_encoder_noise(run: CheckMeasurements, joint: int) -> float:
+    """Return the standard deviation of the noise of a joint's encoder in rad, measured while the robot was at rest."""
+    differences_rad = np.diff(run.angle_rad[run.at_rest(), joint])
+    return float(np.std(differences_rad)) / np.sqrt(2)
 
 
 def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
@@ -100,24 +123,33 @@ def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, accelerat
 
 
 def _integrate_link_angle(run: CheckMeasurements, joint: int) -> tuple[Floats, float] | None:
-    """Return the joint's angle by the gyros of its links, (n,), up to a constant, and how it drifts by their noise.
+    """Return a joint's angle by the gyros of its two links, and the drift of that angle by the gyros' noise.
 
-    The drift is a standard deviation after one second; it grows with the square root of time. None without gyros.
+    For the joint at the tail, motion capture may replace a missing gyro on the tail link.
+
+    Args:
+        run: Measurements of the check.
+        joint: Index of the joint.
+
+    Returns:
+        (ticks,) angle in rad up to a constant, and the standard deviation of its drift after one second in rad, which
+        grows with the square root of time; None if a link was not measured.
     """
     component = run.component(joint)
-    behind = _read_gyro(run, joint, component)
-    ahead = _read_gyro(run, joint + 1, component)
-    if ahead is None:
+    gyro_behind = _read_gyro(run, joint, component)
+    gyro_ahead = _read_gyro(run, joint + 1, component)
+    if gyro_ahead is None:
         return None
-    ahead_rate, ahead_drift = ahead
-    if behind is not None:
-        behind_rate, behind_drift = behind
-        return _integrate(ahead_rate - behind_rate, run.period_s), float(np.hypot(ahead_drift, behind_drift))
+    rate_ahead, drift_ahead = gyro_ahead
+    if gyro_behind is not None:
+        rate_behind, drift_behind = gyro_behind
+        angle_rad = _integrate(rate_ahead - rate_behind, run.period_s)
+        return angle_rad, float(np.hypot(drift_ahead, drift_behind))
     base_rad = run.base_turn_rad[:, component]
     if joint == 0 and not np.isnan(base_rad).all():
-        known = np.flatnonzero(~np.isnan(base_rad))
-        base_rad = np.interp(np.arange(len(base_rad)), known, base_rad[known])
-        return _integrate(ahead_rate, run.period_s) - base_rad, ahead_drift
+        known_rows = np.flatnonzero(~np.isnan(base_rad))
+        base_rad = np.interp(np.arange(len(base_rad)), known_rows, base_rad[known_rows])
+        return _integrate(rate_ahead, run.period_s) - base_rad, drift_ahead
     return None
 
 

@@ -96,22 +96,23 @@ def arrange_by_tick(imus: Iterable[Imu], ticks: Sequence[int], links: int) -> tu
 def collect_measurements(
     config: RunConfig, robot: Description, ticks: Sequence[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
 ) -> CheckMeasurements:
-    """Return what joints, IMUs and motion capture measured.
+    """Collect what joints, IMUs and motion capture measured in a run of the joint check, one row for each tick.
 
     Args:
-        config: of the run.
-        robot: its description.
-        ticks: the tick of every row.
-        columns: those of `COLUMNS`, one row a tick.
-        imus: every IMU message of the run.
+        config: Configuration of the run.
+        robot: Description of the robot.
+        ticks: The tick of every row.
+        columns: Recorded signals by name, such as `angle_rad`, each with one row for each tick.
+        imus: Every IMU message of the run.
     """
     rates, forces = arrange_by_tick(imus, ticks, len(robot.links))
     pose_sensor = config.robot.sensors.pose
     delay_ticks = 0
     if pose_sensor is not None:
         delay_ticks = round(pose_sensor.delay_s * config.rate_hz)
-    poses = np.full_like(columns["orientation_wxyz"], np.nan)
-    poses[: len(poses) - delay_ticks] = columns["orientation_wxyz"][delay_ticks:]
+    # Move each pose to the tick at which it was true. The last ticks have none.
+    orientations_wxyz = np.full_like(columns["orientation_wxyz"], np.nan)
+    orientations_wxyz[: len(orientations_wxyz) - delay_ticks] = columns["orientation_wxyz"][delay_ticks:]
     target_rad = remove_clamped_targets(columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad)
     return CheckMeasurements(
         period_s=config.period_ns * 1e-9,
@@ -124,7 +125,7 @@ def collect_measurements(
         target_rad=target_rad,
         link_rate_rad_s=rates,
         link_force_m_s2=forces,
-        base_turn_rad=_integrate_base_rate(poses),
+        base_turn_rad=_integrate_base_rate(orientations_wxyz),
     )
 
 

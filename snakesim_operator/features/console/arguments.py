@@ -10,6 +10,7 @@ from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim console`."""
     parser.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
     parser.add_argument(
         "--at", type=number_type(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds into the recording"

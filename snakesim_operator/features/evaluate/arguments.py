@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from snakesim_hal.base.step_limit import Pulse
 
+MAX_TITLE_CHARACTERS = 200  # of a suite
+
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file")
@@ -50,6 +52,7 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_optimize(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim study optimize`."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
@@ -117,6 +120,12 @@ def _guarded_if_one_run(arguments: argparse.Namespace, act: "Callable[[argparse.
 
 
 def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
+    """Run `snakesim study evaluate`, and return its exit code.
+
+    Args:
+        arguments: The parsed command line.
+        pulse: Shows another process that a single run makes progress; None if no process watches.
+    """
     from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
     from snakesim_operator.features.evaluate.suite import override_suite, read_suite
 
@@ -124,12 +133,15 @@ def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
     suite = override_suite(suite, _parse_settings(arguments.set))
     names = (arguments.controllers or "").split(",")
     controllers = [name.strip() for name in names if name.strip()]
+
+    # The command that runs one of the cases again, for the report.
     command = ["snakesim", "study", "evaluate", arguments.suite]
     if controllers:
         command += ["--controllers", ",".join(controllers)]
     if arguments.rows:
         command += ["--rows", arguments.rows]
     command += _repeat_option("--set", arguments.set)
+
     request = EvaluationRequest(
         suite=suite,
         source=source,
@@ -144,15 +156,29 @@ def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
 
 
 def _sweep_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
+    """Run `snakesim study sweep` as the evaluation of a suite that varies one scenario, and return its exit code.
+
+    Args:
+        arguments: The parsed command line.
+        pulse: Shows another process that a single run makes progress; None if no process watches.
+    """
     from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
     from snakesim_operator.features.evaluate.suite import Suite, parse_vary
 
-    title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"[:200]
+    title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"
     vary = dict(map(parse_vary, arguments.vary))
-    suite = Suite(title=title, scenario=arguments.scenario, set=_parse_settings(arguments.set), vary=vary)
+    suite = Suite(
+        title=title[:MAX_TITLE_CHARACTERS],
+        scenario=arguments.scenario,
+        set=_parse_settings(arguments.set),
+        vary=vary,
+    )
+
+    # The command that runs one of the cases again, for the report.
     command = ["snakesim", "study", "sweep", arguments.scenario]
     command += _repeat_option("--vary", arguments.vary)
     command += _repeat_option("--set", arguments.set)
+
     request = EvaluationRequest(
         suite=suite,
         source="sweep",
@@ -173,6 +199,7 @@ def _shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[st
 
 
 def _optimize(arguments: argparse.Namespace) -> int:
+    """Run `snakesim study optimize`, and return its exit code. If it is stopped, print how to continue it."""
     _check_extra()
     from snakesim_hal.base.process import stop_signals_raise
     from snakesim_hal.base.terminal import print_line
@@ -180,6 +207,7 @@ def _optimize(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.conclusion import INTERRUPTED
     from snakesim_operator.run.folder import default_folder
 
+    # Most fields of a request have the name of their option.
     values = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)}
     storage = arguments.storage or default_folder("optimize").with_suffix(".db")
     values["storage"] = storage
@@ -188,7 +216,7 @@ def _optimize(arguments: argparse.Namespace) -> int:
     with stop_signals_raise():
         try:
             return optimize(SearchRequest(**values))
-        except KeyboardInterrupt:  # no trial that is done is lost
+        except KeyboardInterrupt:  # the storage keeps every finished trial
             if storage.is_file():
                 print_line(f"stopped: {storage} keeps the trials that are done; the same command continues with")
                 print_line(f"  --storage {shlex.quote(str(storage))}")

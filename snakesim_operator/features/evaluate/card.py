@@ -237,29 +237,37 @@ def _controllers(card: Card) -> list[str]:
 
 
 def _compare_pair(card: Card, controller: str, other: Card, other_controller: str, *, label: str) -> list[Comparison]:
-    """Compare two controllers in each row in which both were tried on the same fields; p is not corrected yet.
+    """Compare the success of two controllers in each row in which both were tried on the same fields.
+
+    McNemar's test of paired outcomes: only fields count in which exactly one of the controllers reached the goal. The
+    p-values are not corrected for multiple comparisons yet.
 
     Args:
-        card: the card of the first controller.
-        controller: its name.
-        other: the card of the second controller.
-        other_controller: its name.
-        label: how the second controller is shown.
+        card: The card of the first controller.
+        controller: Its name.
+        other: The card of the second controller.
+        other_controller: Its name.
+        label: How the second controller is shown.
     """
-    other_crossed = {
-        crossing.same: crossing.crossed for crossing in other.crossings if crossing.controller == other_controller
-    }
-    outcomes: dict[str, list[tuple[bool, bool]]] = {}  # row -> whether first and second crossed each shared field
+    other_outcomes: dict[str, bool] = {}  # configuration without its controller -> whether it reached the goal
+    for crossing in other.crossings:
+        if crossing.controller == other_controller:
+            other_outcomes[crossing.same] = crossing.crossed
+
+    pairs_by_row: dict[str, list[tuple[bool, bool]]] = {}  # (first, second) reached the goal, for each shared field
     for crossing in card.crossings:
-        if crossing.controller == controller and crossing.same in other_crossed:
-            pairs = outcomes.setdefault(crossing.row, [])
-            pairs.append((crossing.crossed, other_crossed[crossing.same]))
+        if crossing.controller == controller and crossing.same in other_outcomes:
+            pair = (crossing.crossed, other_outcomes[crossing.same])
+            pairs_by_row.setdefault(crossing.row, []).append(pair)
+
     comparisons: list[Comparison] = []
-    for row in dict.fromkeys(crossing.row for crossing in card.crossings):
-        if row in outcomes:
-            pairs = outcomes[row]
-            only_one = pairs.count((True, False))
-            only_other = pairs.count((False, True))
-            p = mcnemar(only_one, only_other)
-            comparisons.append(Comparison(row, controller, label, len(pairs), only_one, only_other, p))
+    rows_in_order = dict.fromkeys(crossing.row for crossing in card.crossings)
+    for row in rows_in_order:
+        if row not in pairs_by_row:
+            continue
+        pairs = pairs_by_row[row]
+        only_first = pairs.count((True, False))
+        only_second = pairs.count((False, True))
+        p = mcnemar(only_first, only_second)
+        comparisons.append(Comparison(row, controller, label, len(pairs), only_first, only_second, p))
     return comparisons

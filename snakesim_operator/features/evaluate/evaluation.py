@@ -77,7 +77,14 @@ def evaluate(request: EvaluationRequest, pulse: Pulse | None = None) -> int:
 
 
 def _run_all_cases(request: EvaluationRequest) -> int:
-    """Run all cases that are not done yet, and write the results. Return the exit code."""
+    """Run all cases that have no result in the output folder yet, and write the results.
+
+    Returns:
+        The exit code: 0; 1 if a case could not run; INTERRUPTED if the operator stopped it.
+
+    Raises:
+        ConfigError: The request is invalid.
+    """
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out", code="command/invalid-option")
     check_address(request.cluster)
@@ -87,17 +94,18 @@ def _run_all_cases(request: EvaluationRequest) -> int:
     cases = select_rows(cases, request.rows, request.source)
     out = request.out or default_folder(request.name)
     with store.open_store(out, resume=request.resume) as results:
-        todo = list({case.id: case for case in cases if case.id not in results.done}.values())
-        todo.sort(key=lambda case: case.field)  # if it is stopped, every row has results of the same fields
+        # Cases of two rows with the same configuration have the same id, and run once.
+        cases_to_run = list({case.id: case for case in cases if case.id not in results.done}.values())
+        cases_to_run.sort(key=lambda case: case.field)  # if it is stopped, every row has results of the same fields
         if request.resume:
-            print_line(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
+            print_line(f"{len(cases) - len(cases_to_run)} of {len(cases)} cases are done already")
         try:
-            if todo:
-                _run_on_workers(request, todo, results, out)
+            if cases_to_run:
+                _run_on_workers(request, cases_to_run, results, out)
             _report(request, cases, results.done, out, other_cards)
         except KeyboardInterrupt:
-            done = sum(case.id in results.done for case in cases)
-            print_line(f"stopped: {done} of {len(cases)} cases are done; the same command continues with")
+            done_count = sum(case.id in results.done for case in cases)
+            print_line(f"stopped: {done_count} of {len(cases)} cases are done; the same command continues with")
             seed_option = f" --seed {seed}" if request.suite.fresh else ""
             print_line(f"  --resume --out {shlex.quote(str(out))}{seed_option}")
             return INTERRUPTED
@@ -171,24 +179,38 @@ def _run_on_workers(request: EvaluationRequest, todo: Sequence[Case], results: s
 def _report(
     request: EvaluationRequest, cases: Sequence[Case], done: store.Results, out: Path, other_cards: Sequence[Card]
 ) -> None:
-    """Print the table and the worst failures, and write tables, score card and page."""
+    """Print the table of results and the worst failures, and write tables, score card and page.
+
+    Args:
+        request: The options of the evaluation.
+        cases: All cases, in the order of the table.
+        done: The outcome of each case by its id.
+        out: The output folder.
+        other_cards: Score cards of other evaluations to compare with.
+    """
     rows = group_results(cases, done)
     for line in table_lines(rows):
         print_line(line)
     if any(row.runs == 1 and row.crossed is None for row in rows):
         print_line("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
     _print_errors(cases, done)
+
     best = best_controller(rows)
-    failures = _find_failures(request, [case for case in cases if case.controller == best], done)
+    cases_of_best = [case for case in cases if case.controller == best]
+    failures = _find_failures(request, cases_of_best, done)
     _print_failures(best, failures)
-    paths = store.write_tables(out, cases, done)
+
+    table_paths = store.write_tables(out, cases, done)
     card = make_card(request.name, cases, done)
     if request.suite.fresh or other_cards:
         for line in card_lines(card, compare(card, other_cards)):
             print_line(line)
-    write_text(out / CARD, msgspec.json.format(msgspec.json.encode(card), indent=1).decode())
-    write_text(out / PAGE, render_page(request.suite.title or request.name, request.source, rows, failures))
-    for path in (*paths, out / CARD, out / PAGE):
+    card_path = out / CARD
+    page_path = out / PAGE
+    title = request.suite.title or request.name
+    write_text(card_path, msgspec.json.format(msgspec.json.encode(card), indent=1).decode())
+    write_text(page_path, render_page(title, request.source, rows, failures))
+    for path in (*table_paths, card_path, page_path):
         print_line(f"written: {path}")
 
 

@@ -91,25 +91,31 @@ def optimize(request: SearchRequest) -> int:
 
 
 def _search(request: SearchRequest, study: Study, space: Mapping[str, Span], trials: int) -> None:
-    """Run a number of trials, as many at a time as there are workers, and print the progress."""
+    """Run trials in batches of as many as there are workers, and print the progress after each batch.
+
+    Args:
+        request: The options of the search.
+        study: Proposes the values of each trial, and stores its result.
+        space: The range of each varied key.
+        trials: How many trials to run.
+    """
     start_s = time.monotonic()
-    left = trials
+    remaining = trials
     numbers = free_numbers(study)
     with workers(request.cluster, request.workers) as pool:
-        while left > 0:
+        while remaining > 0:
             batch: list[Trial] = []
-            for number in islice(numbers, min(left, pool.size())):
+            for number in islice(numbers, min(remaining, pool.size())):
                 trial = study.ask(dict[str, BaseDistribution](space))
                 trial.set_user_attr(NUMBER, number)
                 batch.append(trial)
             _run_trials(request, study, batch, pool)
-            left -= len(batch)
-            done = trials - left
+            remaining -= len(batch)
+            done = trials - remaining
             passed_s = time.monotonic() - start_s
-            left_s = passed_s / done * left
-            print_line(
-                f"{done} of {trials} trials, {format_duration(passed_s)} passed, about {format_duration(left_s)} left"
-            )
+            remaining_s = passed_s / done * remaining
+            passed = format_duration(passed_s)
+            print_line(f"{done} of {trials} trials, {passed} passed, about {format_duration(remaining_s)} left")
 
 
 def _search_command(request: SearchRequest, space: Mapping[str, Span], cases_at_ends: Sequence[Case]) -> SearchCommand:

@@ -69,17 +69,29 @@ def _quartiles_of(name: str, *, of_crossed: bool = False) -> PointOf:
 
 
 def _draw_figure(axis: str, rows: Sequence[ResultRow], controllers: Sequence[str], point_of: PointOf) -> Figure | None:
-    """Draw a point for each row, over its setting, or over the number that is varied; None without any point."""
+    """Draw a number of the results, with one point for each row and one color for each controller.
+
+    Args:
+        axis: Title of the vertical axis.
+        rows: Rows of the table of results.
+        controllers: The controllers, in the order of their colors.
+        point_of: Returns the value of a row with its interval, or None if the row has no value.
+
+    Returns:
+        The figure as Plotly has it; None if no row has a value. If a number is varied, it is the horizontal axis.
+        Otherwise the settings are.
+    """
     over_number = all(row.value is not None for row in rows)
     traces: list[Figure] = []
     for i, controller in enumerate(controllers):
-        offset = CONTROLLER_SPREAD * ((i + 0.5) / len(controllers) - 0.5)
         points: list[tuple[ResultRow, Point]] = []
         for row in rows:
             point = point_of(row) if row.controller == controller else None
             if point is not None:
                 points.append((row, point))
         if points:
+            # Controllers are drawn side by side, so that they do not hide each other.
+            offset = CONTROLLER_SPREAD * ((i + 0.5) / len(controllers) - 0.5)
             traces.append(_draw_trace(controller, i, points, over_number=over_number, offset=offset))
     if not traces:
         return None
@@ -101,19 +113,36 @@ def _draw_figure(axis: str, rows: Sequence[ResultRow], controllers: Sequence[str
 def _draw_trace(
     controller: str, index: int, points: Sequence[tuple[ResultRow, Point]], *, over_number: bool, offset: float
 ) -> Figure:
-    """Return the points of one controller. offset: of their x, so that controllers do not hide each other."""
+    """Return the points of one controller as a Plotly trace with error bars.
+
+    Args:
+        controller: Name of the controller.
+        index: Index of its color.
+        points: Rows with their values: middle, lower end and upper end of the interval.
+        over_number: Whether x is the number that is varied. Otherwise it is the number of the row.
+        offset: Added to the number of the row, so that controllers do not hide each other.
+    """
+    x: list[float | None] = []
+    y: list[float] = []
+    error_up: list[float] = []
+    error_down: list[float] = []
+    for row, (middle, lower, upper) in points:
+        x.append(row.value if over_number else row.row + offset)
+        y.append(round(middle, 6))
+        error_up.append(round(upper - middle, 6))
+        error_down.append(round(middle - lower, 6))
     color = f"--joint-{index}"
     return {
         "type": "scatter",
         "mode": "lines+markers" if over_number else "markers",
         "name": controller,
-        "x": [row.value if over_number else row.row + offset for row, _ in points],
-        "y": [round(middle, 6) for _, (middle, _, _) in points],
+        "x": x,
+        "y": y,
         "error_y": {
             "type": "data",
             "symmetric": False,
-            "array": [round(upper - middle, 6) for _, (middle, _, upper) in points],
-            "arrayminus": [round(middle - lower, 6) for _, (middle, lower, _) in points],
+            "array": error_up,
+            "arrayminus": error_down,
             "thickness": 1.4,
         },
         "text": [row.setting for row, _ in points],

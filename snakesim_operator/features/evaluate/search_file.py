@@ -72,19 +72,28 @@ def hash_configurations(cases: Sequence[Case]) -> str:
 
 
 def open_study(path: Path, command: SearchCommand) -> Study:
-    """Open the search in a file, or begin one. Raises ConfigError for the file of another search, and for no file."""
+    """Open the search that a file holds, or begin a search in an empty or new file.
+
+    Args:
+        path: The SQLite file; its folder is made if it does not exist.
+        command: The search; it must be the same as the search in the file.
+
+    Raises:
+        ConfigError: The file holds another search, or is not usable.
+    """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         storage = _storage_in(path)
         summaries = optuna.get_all_study_summaries(storage)
-        used = [summary for summary in summaries if summary.n_trials or COMMAND in summary.user_attrs]
-        if not used:
+        begun = [summary for summary in summaries if summary.n_trials or COMMAND in summary.user_attrs]
+        if not begun:
             for summary in summaries:  # of a process that was killed before its first trial
                 optuna.delete_study(study_name=summary.study_name, storage=storage)
             return _begin_study(storage, command)
-        _check_same_search(path, used[0].user_attrs.get(COMMAND), command)
-        study = optuna.load_study(study_name=used[0].study_name, storage=storage)
+        stored = begun[0]
+        _check_same_search(path, stored.user_attrs.get(COMMAND), command)
+        study = optuna.load_study(study_name=stored.study_name, storage=storage)
     except STORAGE_ERRORS as error:
         message = getattr(error, "strerror", None) or str(error)
         reason = message.splitlines()[0][:200]
@@ -149,7 +158,12 @@ def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
 
 
 def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
-    """Yield what differs, in words of the command line."""
+    """Yield each difference between two searches, in words of the command line.
+
+    Args:
+        there: The search whose trials the file holds.
+        here: The search that this command asks for.
+    """
     if there.scenario != here.scenario:
         yield f"scenario: {there.scenario} there, {here.scenario} here"
     if there.rows != here.rows:
@@ -167,10 +181,11 @@ def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
         yield f"--seed: {there.seed} there, {here.seed} here"
     if there.code != here.code:
         yield "the installed SnakeSIM has changed since then"
-    same_command = msgspec.structs.replace(
+    # Other configurations follow from another command. They are a difference only if the command is the same.
+    command_with_same_files = msgspec.structs.replace(
         there, configurations=here.configurations, code=here.code, set_words=here.set_words
     )
-    if same_command == here and there.configurations != here.configurations:
+    if command_with_same_files == here and there.configurations != here.configurations:
         yield "the same command gives another configuration: the files of scenario, robot, scene or suite have changed"
 
 

@@ -145,9 +145,16 @@ def select_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list
 
 
 def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
-    """Return the rows of the table in order. Raises ConfigError.
+    """Return the rows of the table of results, each with the values that it sets in the scenario.
 
-    Each named row is combined with each combination of the varied values.
+    Each named row of the suite is combined with each combination of the varied values.
+
+    Args:
+        suite: The suite.
+        source: Where it came from, for messages.
+
+    Raises:
+        ConfigError: A value is invalid, or two rows have the same name.
     """
     common = list(_flatten_overrides(suite.set, f"{source}: [set]"))
     common += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
@@ -155,21 +162,22 @@ def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
     labels = _short_names(list(varied))
     settings: list[SuiteSetting] = []
     for row in suite.row or [SuiteRow(name="")]:
-        where = f"{source}: row {row.name!r}" if row.name else source
-        of_row = list(_flatten_overrides(row.set, where))
-        of_row += [Override(key, None, where) for key in row.unset]
-        randomizations = _find_randomizations(suite, row.without, where)
+        place = f"{source}: row {row.name!r}" if row.name else source
+        row_overrides = list(_flatten_overrides(row.set, place))
+        row_overrides += [Override(key, None, place) for key in row.unset]
+        randomizations = _find_randomizations(suite, row.without, place)
         for combination in itertools.product(*varied.values()):
-            parts = [row.name] if row.name else []
-            of_combination: list[Override] = []
+            name_parts = [row.name] if row.name else []
+            varied_overrides: list[Override] = []
             for key, value in zip(varied, combination, strict=True):
-                parts.append(f"{labels[key]} {_short_text(value)}")
-                of_combination.append(Override(key, value, f"{source}: [vary]"))
-            name = ", ".join(parts) or "as it is"
-            number = None
+                name_parts.append(f"{labels[key]} {_short_text(value)}")
+                varied_overrides.append(Override(key, value, f"{source}: [vary]"))
+            name = ", ".join(name_parts) or "as it is"
+            number = None  # the place of the row on the horizontal axis, if a single number is varied
             if len(combination) == 1 and not row.name and _is_number(combination[0]):
                 number = combination[0]
-            settings.append(SuiteSetting(name, [*common, *of_row, *of_combination], number, randomizations))
+            overrides = [*common, *row_overrides, *varied_overrides]
+            settings.append(SuiteSetting(name, overrides, number, randomizations))
     _check_names_differ(settings, source)
     return settings
 

@@ -8,6 +8,7 @@ from snakesim_operator.playback.arguments import add_recording, add_span
 
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim recording plot`."""
     add_recording(parser)
     parser.add_argument(
         "signals", nargs="*", metavar="SIGNAL", help="a pair of axes each (default: angle_rad torque_nm)"
@@ -30,12 +31,13 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
+    """Run `snakesim recording plot`, and return its exit code."""
     from snakesim_operator.base import extras
 
     extras.require("report", "`snakesim recording plot`")
     from snakesim_operator.features.figures.inherited import import_matplotlib
 
-    import_matplotlib()
+    import_matplotlib()  # without the user's MPLBACKEND; must precede the import of `drawn`
     from snakesim_operator.features.figures.drawn import plot
 
     return plot(

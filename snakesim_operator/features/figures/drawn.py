@@ -118,19 +118,28 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def _plot_signals(axes: Axes, record: RunRecord, names: Sequence[str]) -> None:
-    """Plot signals of one unit into a pair of axes."""
+    """Plot signals over time into one pair of axes.
+
+    Args:
+        axes: The axes to plot into.
+        record: What was recorded of the run.
+        names: Names of signals with a common unit. A signal with several columns gets one line for each column.
+
+    Raises:
+        ConfigError: There is no such signal, or the units differ.
+    """
     columns = table(record)
-    known = {**arrays(record), **columns}
+    signals = {**arrays(record), **columns}
     for name in names:
-        _check_known(name, known, record)
+        _check_known(name, signals, record)
     unit = _find_common_unit(names, record)
-    if len(names) == 1 and known[names[0]].ndim > 1:
-        count = known[names[0]].shape[1]
+    if len(names) == 1 and signals[names[0]].ndim > 1:
+        count = signals[names[0]].shape[1]
         axes.set_prop_cycle(color=colormaps["turbo"](np.linspace(0.05, 0.95, count)))
     for name in names:
-        own_columns = [column for column in columns if column.startswith(f"{name}.")]
-        for column in (name, *own_columns):
-            values = known[column]
+        columns_of_signal = [column for column in columns if column.startswith(f"{name}.")]
+        for column in (name, *columns_of_signal):
+            values = signals[column]
             if values.ndim > 1:
                 continue  # its columns are drawn instead
             if column.startswith("target"):
@@ -138,7 +147,8 @@ def _plot_signals(axes: Axes, record: RunRecord, names: Sequence[str]) -> None:
             label = column if name == column else column.partition(".")[2]
             plot_over_time(axes, record, values, label)
     title = names[0] if len(names) == 1 else ""
-    axes.set_ylabel(title if unit == "1" else f"{title} [{unit}]".strip())
+    has_unit = unit != "1"
+    axes.set_ylabel(f"{title} [{unit}]".strip() if has_unit else title)
     _add_legend(axes)
 
 

@@ -30,16 +30,27 @@ ENVELOPE_BYTES = 4096  # key and encoding beside a payload
 
 
 def access_control(lab: Lab) -> dict[str, Any]:
-    """Return Zenoh's `access_control` section for the routers of a lab."""
+    """Return Zenoh's `access_control` section for the routers of a lab.
+
+    Everything that no rule allows is denied.
+
+    Args:
+        lab: The lab, which defines the identities: routers, robots and the machines with a role.
+
+    Returns:
+        The section as Zenoh's configuration file has it. Each identity is one subject, recognized by the common name
+        of its certificate, and has one policy, which lists its rules.
+    """
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     for identity in identities(lab):
         name = identity.common_name
-        own = _rules(identity, lab)
-        rules += own
+        identity_rules = _rules(identity, lab)
+        rule_ids = [rule["id"] for rule in identity_rules]
+        rules += identity_rules
         subjects.append({"id": name, "cert_common_names": [name]})
-        policies.append({"id": name, "rules": [rule["id"] for rule in own], "subjects": [name]})
+        policies.append({"id": name, "rules": rule_ids, "subjects": [name]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -50,64 +61,89 @@ def access_control(lab: Lab) -> dict[str, Any]:
 
 
 def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
-    """Return the rules of one identity. Keys with the same messages and flow share a rule."""
-    messages: dict[tuple[str, str], set[str]] = defaultdict(set)  # by key and flow
+    """Return the rules of Zenoh's access control for one identity.
+
+    All keys at which the same messages may pass in the same direction (flow) share one rule.
+    """
+    messages_at_key: dict[tuple[str, str], set[str]] = defaultdict(set)  # (key, flow) -> messages
     for flow, message, key in _permitted(identity, lab):
-        messages[key, flow].add(message)
-    together: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)
-    for (key, flow), named in messages.items():
-        together[flow, tuple(sorted(named))].append(key)
-    return [
-        {
+        messages_at_key[key, flow].add(message)
+
+    keys_of_rule: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)  # (flow, messages) -> keys
+    for (key, flow), messages in messages_at_key.items():
+        keys_of_rule[flow, tuple(sorted(messages))].append(key)
+
+    rules: list[dict[str, Any]] = []
+    for number, ((flow, rule_messages), rule_keys) in enumerate(sorted(keys_of_rule.items()), 1):
+        rule = {
             "id": f"{identity.common_name}/{number}",
             "permission": "allow",
             "flows": [flow],
-            "messages": list(named),
-            "key_exprs": sorted(places),
+            "messages": list(rule_messages),
+            "key_exprs": sorted(rule_keys),
         }
-        for number, ((flow, named), places) in enumerate(sorted(together.items()), 1)
-    ]
+        rules.append(rule)
+    return rules
 
 
 def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
-    """Yield everything that may pass between a router and an identity, with whole keys."""
-    if identity.role is None:  # another router, which has checked what it forwards
-        for flow in ("ingress", "egress"):
-            for message in EVERY_MESSAGE:
-                for key in (ANY, f"{ANY}/@adv/{ANY}"):
-                    yield Permission(flow, message, key)
+    """Yield every kind of message that may pass between a router and an identity.
+
+    Keys begin with the robot's namespace, unlike those of the table of roles.
+    """
+    if identity.role is None:
+        yield from _permitted_to_router()
         return
     for robot in identity.robots(lab):
         faults = lab.file.robots[robot].faults
-        within = ANY if identity.of == ALL else f"{robot}/{ANY}"
         for flow, message, key in list_permissions(identity.role, identity.services, faults=faults):
             yield Permission(flow, message, f"{robot}/{key}")
-            if key != ANY and message in SEARCHED:  # a query with a wildcard reaches every queryable
-                yield Permission(flow, message, f"{within if flow == 'ingress' else ANY}/{key}")
+            if key == ANY or message not in SEARCHED:
+                continue
+            # Tools search for robots with a wildcard instead of the namespace. A process of one robot may search only
+            # within its namespace, because a query with a wildcard reaches every queryable.
+            searches_one_robot = flow == "ingress" and identity.of != ALL
+            namespace = f"{robot}/{ANY}" if searches_one_robot else ANY
+            yield Permission(flow, message, f"{namespace}/{key}")
     if identity.role is Role.ADMINISTRATOR:
         yield Permission("ingress", "query", f"@/{ANY}")
         yield Permission("egress", "reply", f"@/{ANY}")
 
 
+def _permitted_to_router() -> Iterator[Permission]:
+    """Yield everything, because another router has already checked what it forwards."""
+    for flow in ("ingress", "egress"):
+        for message in EVERY_MESSAGE:
+            yield Permission(flow, message, ANY)
+            yield Permission(flow, message, f"{ANY}/@adv/{ANY}")
+
+
 def size_limits() -> list[dict[str, Any]]:
-    """Return Zenoh's `low_pass_filter`: the maximum size of a message, by key. Routers drop longer ones."""
-    images = [row.key for row in keys.SPACE if row.message in IMAGES]
-    queries = [row.key for row in keys.SPACE if row.kind == "query"]
-    small = [keys.JOINT_COMMAND, keys.INTENT, keys.DONE_ALL]
-    others = [row.key for row in keys.SPACE if row.message and row.key not in (*images, *queries, *small)]
-    latched = [f"{row.key}/@adv/{ANY}" for row in keys.SPACE if row.kind == "latched"]
+    """Return Zenoh's `low_pass_filter` section: the maximum size of a message in bytes, by key.
+
+    Routers drop longer messages. Every key of the key space belongs to one of four groups with a common maximum.
+    """
+    image_keys = [row.key for row in keys.SPACE if row.message in IMAGES]
+    query_keys = [row.key for row in keys.SPACE if row.kind == "query"]
+    command_keys = [keys.JOINT_COMMAND, keys.INTENT, keys.DONE_ALL]
+    grouped_keys = (*image_keys, *query_keys, *command_keys)
+    other_keys = [row.key for row in keys.SPACE if row.message and row.key not in grouped_keys]
+    # Zenoh transfers the stored values of latched keys below `@adv`.
+    stored_keys = [f"{row.key}/@adv/{ANY}" for row in keys.SPACE if row.kind == "latched"]
     return [
-        {
-            "id": name,
-            "flows": ["ingress"],
-            "messages": ["put", "delete", "query", "reply"],
-            "key_exprs": [f"{ANY}/{place}" for place in places],
-            "size_limit": max_bytes,
-        }
-        for name, places, max_bytes in (
-            ("images", images, MAX_IMAGE_BYTES),
-            ("requests", queries, REQUEST_BYTES),
-            ("commands", small, COMMAND_BYTES),
-            ("others", [*others, *latched], MAX_PAYLOAD_BYTES),
-        )
+        _size_limit("images", image_keys, MAX_IMAGE_BYTES),
+        _size_limit("requests", query_keys, REQUEST_BYTES),
+        _size_limit("commands", command_keys, COMMAND_BYTES),
+        _size_limit("others", [*other_keys, *stored_keys], MAX_PAYLOAD_BYTES),
     ]
+
+
+def _size_limit(name: str, limited_keys: list[str], max_bytes: int) -> dict[str, Any]:
+    """Return one entry of the `low_pass_filter` section, for keys in any namespace."""
+    return {
+        "id": name,
+        "flows": ["ingress"],
+        "messages": ["put", "delete", "query", "reply"],
+        "key_exprs": [f"{ANY}/{key}" for key in limited_keys],
+        "size_limit": max_bytes,
+    }

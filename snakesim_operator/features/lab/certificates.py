@@ -39,17 +39,27 @@ class Issuer:
 
 
 def make_authority(folder: Path, lab: Lab) -> Issuer:
-    """Return the authority in a folder; if there is none, create it. Its key is copied to no machine.
+    """Return the certificate authority in a folder, which is created if it does not exist.
+
+    The private key of the authority stays in this folder: it is copied to no machine.
 
     Raises:
         ConfigError: The files in the folder are damaged, or other users may read them.
     """
-    at_certificate = folder / f"{AUTHORITY}.pem"
-    at_key = folder / f"{AUTHORITY}.key"
-    if at_certificate.exists() or at_key.exists():
-        return _read_authority(at_certificate, at_key)
+    certificate_path = folder / f"{AUTHORITY}.pem"
+    key_path = folder / f"{AUTHORITY}.key"
+    if certificate_path.exists() or key_path.exists():
+        return _read_authority(certificate_path, key_path)
     _make_private(folder)
     key = ec.generate_private_key(ec.SECP256R1())
+    certificate = _sign_authority(key, lab)
+    _write(key_path, _encode_key(key), 0o600)
+    _write(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    return Issuer(certificate, key)
+
+
+def _sign_authority(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certificate:
+    """Return a certificate that the authority signs for itself. It may only sign certificates and revocation lists."""
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{lab.file.name} authority")])
     usage = x509.KeyUsage(
         digital_signature=False,
@@ -62,16 +72,13 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
         encipher_only=False,
         decipher_only=False,
     )
-    certificate = (
+    return (
         _builder(name, name, timedelta(days=lab.file.authority_days))
         .public_key(key.public_key())
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())
     )
-    _write(at_key, _encode_key(key), 0o600)
-    _write(at_certificate, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
-    return Issuer(certificate, key)
 
 
 def _make_private(folder: Path) -> None:
@@ -93,29 +100,30 @@ def _make_private(folder: Path) -> None:
             ) from None
 
 
-def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
+def _read_authority(certificate_path: Path, key_path: Path) -> Issuer:
     """Read the authority and check that certificate and key belong together. Raises ConfigError."""
-    warning = check_permissions(at_key)
+    warning = check_permissions(key_path)
     if warning:
         raise ConfigError(
             f"{warning}; as this is the lab's authority, anybody may have joined: better make a new one",
             code="certificate/invalid-authority",
         )
     try:
-        certificate = x509.load_pem_x509_certificate(read_bytes(at_certificate))
-        key = serialization.load_pem_private_key(read_bytes(at_key), None)
+        certificate = x509.load_pem_x509_certificate(read_bytes(certificate_path))
+        key = serialization.load_pem_private_key(read_bytes(key_path), None)
     except ValueError as error:
         raise ConfigError(
-            f"{at_certificate.parent}: not an authority of this command: {error}", code="certificate/invalid-authority"
+            f"{certificate_path.parent}: not an authority of this command: {error}",
+            code="certificate/invalid-authority",
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise ConfigError(
-            f"{at_key}: not the key of {at_certificate}; restore the one that belongs to it",
+            f"{key_path}: not the key of {certificate_path}; restore the one that belongs to it",
             code="certificate/invalid-authority",
         )
     if certificate.not_valid_after_utc < datetime.now(UTC):
         raise ConfigError(
-            f"{at_certificate}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; move the folder away, run "
+            f"{certificate_path}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; move the folder away, run "
             "`snakesim lab certs` again, and install the new files on every machine",
             code="certificate/expired",
         )
@@ -171,7 +179,7 @@ def write_certificates(
     Args:
         lab: The lab.
         folder: The output folder.
-        authority: The folder of the authority.
+        authority: The folder of the certificate authority.
         rotate: Renew all certificates. Otherwise those of another authority, for another address, or with less than
             RENEW_AT of their life left are renewed.
 
@@ -179,26 +187,26 @@ def write_certificates(
         Each identity with what was done ("made", "renewed" or "kept"), and the end of its certificate.
     """
     issuer = make_authority(authority, lab)
-    root = issuer.certificate.public_bytes(serialization.Encoding.PEM)
-    done: list[tuple[Identity, str, datetime]] = []
+    authority_pem = issuer.certificate.public_bytes(serialization.Encoding.PEM)
+    results: list[tuple[Identity, str, datetime]] = []
     for identity in identities(lab):
-        tls = folder / identity.machine / "tls"
-        tls.mkdir(parents=True, exist_ok=True)
-        path = tls / f"{identity.label}.pem"
+        tls_folder = folder / identity.machine / "tls"
+        tls_folder.mkdir(parents=True, exist_ok=True)
+        path = tls_folder / f"{identity.label}.pem"
         is_valid = _is_still_valid(path, issuer, identity, lab)
-        if not is_valid and not path.exists():
-            state = "made"
-        elif not is_valid or rotate:
+        if is_valid and not rotate:
+            state = "kept"
+        elif is_valid or path.exists():
             state = "renewed"
         else:
-            state = "kept"
+            state = "made"
         if state != "kept":
             certificate, key = issue(issuer, identity, lab)
             _write(path.with_suffix(".key"), key, 0o600)
             _write(path, certificate, 0o644)
-        _write(tls / f"{AUTHORITY}.pem", root, 0o644)
-        done.append((identity, state, read_certificate(path).not_valid_after_utc))
-    return done
+        _write(tls_folder / f"{AUTHORITY}.pem", authority_pem, 0o644)
+        results.append((identity, state, read_certificate(path).not_valid_after_utc))
+    return results
 
 
 def read_certificate(at: Path) -> x509.Certificate:

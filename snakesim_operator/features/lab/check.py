@@ -80,104 +80,124 @@ def check(lab: Lab, folder: Path, print_text: PrintLine = print_line, *, as_json
         The exit code: 0 if all matches the lab file, 1 otherwise.
     """
     if as_json:
-        found = Findings(discard_line)
-        exit_code = _check_all(lab, folder, found)
-        print_json({"ok": exit_code == 0, "results": found.results}, print_text)
+        findings = Findings(discard_line)
+        exit_code = _check_all(lab, folder, findings)
+        print_json({"ok": exit_code == 0, "results": findings.results}, print_text)
         return exit_code
     return _check_all(lab, folder, Findings(print_text))
 
 
-def _check_all(lab: Lab, folder: Path, found: Findings) -> int:
-    """Check everything. Returns the exit code."""
-    print_text = found.print_text
+def _check_all(lab: Lab, folder: Path, findings: Findings) -> int:
+    """Check certificates, then routers, then robots and roles, which are reached through the routers.
+
+    Args:
+        lab: The lab.
+        folder: The output folder of `lab certs`.
+        findings: Collects and prints the result of each check.
+
+    Returns:
+        The exit code: 0 if all matches the lab file, 1 otherwise.
+    """
+    print_text = findings.print_text
     print_text("certificates")
     for identity in identities(lab):
-        _check_certificate(identity, folder, found)
+        _check_certificate(identity, folder, findings)
     print_text("routers")
-    reached = [name for name in lab.file.routers if _check_router(name, lab, folder, found)]
-    if not reached:
-        found.results.append({"passed": False, "text": "no router can be reached"})
+    reachable_routers = [name for name in lab.file.routers if _check_router(name, lab, folder, findings)]
+    if not reachable_routers:
+        findings.results.append({"passed": False, "text": "no router can be reached"})
         print_text("no router can be reached, and so neither robots nor roles can be looked at")
         return 1
     for robot in lab.file.robots:
         print_text(f"robot {robot}")
-        _check_robot(robot, lab, folder, found)
+        _check_robot(robot, lab, folder, findings)
     print_text("roles: what each may request")
     for identity in identities(lab):
         if identity.role is not None:
-            _check_role(identity, identity.role, lab, folder, found)
-    if found.wrong:
-        print_text(f"{found.wrong} marked with ! need a look")
+            _check_role(identity, identity.role, lab, folder, findings)
+    if findings.wrong:
+        print_text(f"{findings.wrong} marked with ! need a look")
         return 1
     print_text("all is as it should be")
     return 0
 
 
-def _check_certificate(identity: Identity, folder: Path, found: Findings) -> None:
+def _check_certificate(identity: Identity, folder: Path, findings: Findings) -> None:
     """Check that the certificate of an identity is there and valid, and that only its owner can read its key."""
     path = _certificate_path(identity, folder)
     try:
         certificate = read_certificate(path)
     except ConfigError as error:
-        found.failed(f"{identity.common_name}: {error}")
+        findings.failed(f"{identity.common_name}: {error}")
         return
-    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", found)
+    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", findings)
     warning = check_permissions(path.with_suffix(".key"))
     if warning:
-        found.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
+        findings.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
 
 
-def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
+def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, findings: Findings) -> None:
     """Check that a certificate is valid for more than the part of its life at which it is renewed."""
     end = certificate.not_valid_after_utc
     life = end - certificate.not_valid_before_utc
     left = end - datetime.now(UTC)
     text = f"{name}: ends {end:%Y-%m-%d %H:%M} UTC, in {left.total_seconds() / 86400:.1f} days"
     if left > life * RENEW_AT:
-        found.passed(text)
+        findings.passed(text)
     else:
-        found.failed(f"{text}; {remedy}")
+        findings.failed(f"{text}; {remedy}")
 
 
-def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
-    """Check that a router accepts our clients, and which certificate it shows. Return False if it is not reached."""
+def _check_router(name: str, lab: Lab, folder: Path, findings: Findings) -> bool:
+    """Check that a router accepts a client of the lab, shows its newest certificate, and refuses other clients.
+
+    Args:
+        name: Name of the router in the lab file.
+        lab: The lab.
+        folder: The output folder of `lab certs`.
+        findings: Collects the results.
+
+    Returns:
+        Whether the router's port can be reached.
+    """
     endpoint = lab.endpoint(name)
-    identity = Identity(lab.file.routers[name].machine, None, name)
+    router = Identity(lab.file.routers[name].machine, None, name)
     try:
         _plain_connection(endpoint).close()
     except OSError as error:
-        found.failed(
-            f"{name}: nothing answers on {endpoint}: {error}; start it on {identity.machine}, or open the port"
+        findings.failed(
+            f"{name}: nothing answers on {endpoint}: {error}; start it on {router.machine}, or open the port"
         )
         return False
-    client = next((other for other in identities(lab) if other.role is not None), None)
-    if client is None:
+    clients = [identity for identity in identities(lab) if identity.role is not None]
+    if not clients:
         return True
+    client = clients[0]
     settings = _probe_settings(client, lab, folder, [endpoint])
     try:
         with open_probe(json.dumps(settings)) as probe:
-            found.passed(f"{name}: {endpoint}, round trip {1e3 * probe.round_trip_s():.2f} ms")
+            round_trip_ms = 1e3 * probe.round_trip_s()
+            findings.passed(f"{name}: {endpoint}, round trip {round_trip_ms:.2f} ms")
     except NotConnectedError as error:
-        found.failed(f"{name}: {endpoint} lets {client.common_name} not in: {error}")
+        findings.failed(f"{name}: {endpoint} lets {client.common_name} not in: {error}")
         return True
-    tls = settings["transport"]["link"]["tls"]
-    shown = _read_shown_certificate(endpoint, tls)
-    stored = read_certificate(_certificate_path(identity, folder))
+    shown = _read_shown_certificate(endpoint, settings["transport"]["link"]["tls"])
+    stored = read_certificate(_certificate_path(router, folder))
     if shown.serial_number != stored.serial_number:
-        _check_expiry(f"{name} shows an earlier certificate", shown, f"restart it on {identity.machine}", found)
-    _check_refuses_strangers(name, settings, found)
+        _check_expiry(f"{name} shows an earlier certificate", shown, f"restart it on {router.machine}", findings)
+    _check_refuses_strangers(name, settings, findings)
     return True
 
 
-def _check_refuses_strangers(name: str, settings: dict[str, Any], found: Findings) -> None:
+def _check_refuses_strangers(name: str, settings: dict[str, Any], findings: Findings) -> None:
     """Check that a router refuses a client without a certificate. settings: those of a client with one."""
     tls = settings["transport"]["link"]["tls"]
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
     try:
         with open_probe(json.dumps(settings)):
-            found.failed(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
+            findings.failed(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
     except NotConnectedError:
-        found.passed(f"{name}: refuses clients without a certificate")
+        findings.passed(f"{name}: refuses clients without a certificate")
 
 
 def _plain_connection(endpoint: str) -> socket.socket:
@@ -206,25 +226,33 @@ class _RobotState:
     clock_offsets_s: dict[str, float]  # by key: how far the publisher's clock is ahead of this computer's
 
 
-def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
-    """Check the processes of a robot: where they run, their versions and settings, and their clocks."""
+def _check_robot(robot: str, lab: Lab, folder: Path, findings: Findings) -> None:
+    """Check the processes of a robot: where they run, their versions and settings, and their clocks.
+
+    Args:
+        robot: Name of the robot in the lab file.
+        lab: The lab.
+        folder: The output folder of `lab certs`, with the certificate that the check connects with.
+        findings: Collects the results.
+    """
     involved = [identity for identity in identities(lab) if robot in identity.robots(lab)]
-    watcher = max(involved, key=lambda identity: list(Role).index(identity.role or Role.ROBOT))
+    roles = list(Role)
+    watcher = max(involved, key=lambda identity: roles.index(identity.role or Role.ROBOT))
     try:
         state = _observe_robot(watcher, robot, lab, folder)
     except NotConnectedError as error:
-        found.failed(f"cannot be looked at as {watcher.common_name}: {error}")
+        findings.failed(f"cannot be looked at as {watcher.common_name}: {error}")
         return
     if state.status is not None:
-        found.passed(f"{state.status.lifecycle} - {state.status.reason}")
-        check_what_moves(lab.file.robots[robot], state.description, found)
+        findings.passed(f"{state.status.lifecycle} - {state.status.reason}")
+        check_what_moves(lab.file.robots[robot], state.description, findings)
     host = next((process for process in state.processes if process.name == HOST), None)
     for name, machine in _expected_processes(robot, lab, involved).items():
         running = [process for process in state.processes if process.name == name]
         if not running or name not in state.live_services:
-            found.failed(f"{name}: not running; it belongs on {machine}")
+            findings.failed(f"{name}: not running; it belongs on {machine}")
         for process in running:
-            _check_process(process, host, state.clock_offsets_s, found)
+            _check_process(process, host, state.clock_offsets_s, findings)
 
 
 def _observe_robot(watcher: Identity, robot: str, lab: Lab, folder: Path) -> _RobotState:
@@ -253,64 +281,75 @@ def _expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[
     return expected
 
 
-def check_what_moves(robot: LabRobot, description: Description | None, found: Findings) -> None:
+def check_what_moves(robot: LabRobot, description: Description | None, findings: Findings) -> None:
     """Check that a robot is emulated if, and only if, the lab file names no bus for it.
 
     Args:
         robot: The robot's entry in the lab file.
         description: What its host publishes; None if it publishes none.
-        found: The findings, which are extended.
+        findings: The findings, which are extended.
     """
     words = describe_what_moves(description)
     if description is None:
-        found.failed(words)
+        findings.failed(words)
     elif is_to_be_real(robot) and description.emulated:
-        found.failed(f"{words}, but the lab file names its bus; render again, install, and restart the host")
+        findings.failed(f"{words}, but the lab file names its bus; render again, install, and restart the host")
     elif (robot.backend == SIMULATOR or robot.emulated) and not description.emulated:
-        found.failed(f"{words}, but by the lab file nothing real is to move; see which host runs")
+        findings.failed(f"{words}, but by the lab file nothing real is to move; see which host runs")
     else:
-        found.passed(words)
+        findings.passed(words)
 
 
-def _check_process(process: Process, host: Process | None, clock_offsets_s: dict[str, float], found: Findings) -> None:
+def _check_process(
+    process: Process, host: Process | None, clock_offsets_s: dict[str, float], findings: Findings
+) -> None:
     """Check version and settings of a process against those of the host, and its clock against ours."""
-    found.passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
+    findings.passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
     if host is not None:
         if process.version != host.version:
-            found.failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
+            findings.failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
         for difference in find_differences(process, host):
-            found.failed(f"{process.name}: {difference}")
+            findings.failed(f"{process.name}: {difference}")
     for key, writer in WRITERS.items():
         if writer != process.name or key not in clock_offsets_s:
             continue
         offset_s = clock_offsets_s[key]
         text = f"{process.name}: clock {offset_s:+.3f} s against this computer's"
         if abs(offset_s) < CLOCK_LIMIT_S:
-            found.passed(text)
+            findings.passed(text)
         else:
-            found.failed(text)
+            findings.failed(text)
 
 
-def _check_role(identity: Identity, role: Role, lab: Lab, folder: Path, found: Findings) -> None:
-    """Check that an identity can connect, and that the routers answer it according to the table of roles."""
+def _check_role(identity: Identity, role: Role, lab: Lab, folder: Path, findings: Findings) -> None:
+    """Check that an identity can connect, and that the routers forward exactly those queries that its role allows.
+
+    Args:
+        identity: The identity to connect as.
+        role: Its role.
+        lab: The lab.
+        folder: The output folder of `lab certs`, with the identity's certificate.
+        findings: Collects the results.
+    """
+    settings = json.dumps(_probe_settings(identity, lab, folder))
     try:
-        with open_probe(json.dumps(_probe_settings(identity, lab, folder))) as probe:
+        with open_probe(settings) as probe:
             round_trip_ms = 1e3 * probe.round_trip_s()
             for robot in lab.file.robots:
                 is_involved = robot in identity.robots(lab)
                 for line in TABLE:
                     if line.key not in ASKABLE:
                         continue
-                    granted = is_involved and "ask" in line.acts(role)
-                    answers = probe.answers(f"{robot}/{line.key}")
+                    may_ask = is_involved and "ask" in line.acts(role)
+                    has_answer = probe.answers(f"{robot}/{line.key}")
                     query = f"{identity.common_name}: {robot}/{line.key}"
-                    if answers > granted:
-                        found.failed(f"{query} answers, though the role may not ask; the router has other rules")
-                    elif answers < granted:
-                        found.failed(f"{query} does not answer, though the role may ask; no host, or other rules")
-            found.passed(f"{identity.common_name}: round trip {round_trip_ms:.2f} ms")
+                    if has_answer and not may_ask:
+                        findings.failed(f"{query} answers, though the role may not ask; the router has other rules")
+                    elif may_ask and not has_answer:
+                        findings.failed(f"{query} does not answer, though the role may ask; no host, or other rules")
+            findings.passed(f"{identity.common_name}: round trip {round_trip_ms:.2f} ms")
     except NotConnectedError as error:
-        found.failed(f"{identity.common_name}: not let in: {error}")
+        findings.failed(f"{identity.common_name}: not let in: {error}")
 
 
 @contextmanager

@@ -123,6 +123,15 @@ def load_lab(path: Path) -> Lab:
 
 
 def _check(file: LabFile, table: Table) -> None:
+    """Check that the entries of a lab file refer to existing machines, and do not contradict each other.
+
+    Args:
+        file: The decoded lab file.
+        table: The lab file as it was read, for error messages.
+
+    Raises:
+        ConfigError: An entry is missing, or refers to something that does not exist.
+    """
     if not file.routers:
         raise ConfigError(
             f"{table.source}: `routers` is empty; a lab has at least one, such as [routers.main]",
@@ -135,13 +144,7 @@ def _check(file: LabFile, table: Table) -> None:
                 f"{table.source}: `machines.{router.machine}.address` is missing; the router `{name}` listens there",
                 code="lab/invalid-file",
             )
-    listening = [(router.machine, router.port) for router in file.routers.values()]
-    for (name, router), place in zip(file.routers.items(), listening, strict=True):
-        if listening.count(place) > 1:
-            raise ConfigError(
-                f"{table.source}: `routers.{name}.port` = {router.port} has another router, too",
-                code="lab/invalid-file",
-            )
+    _check_ports_differ(file, table)
     for name, robot in file.robots.items():
         if name == ALL:
             raise ConfigError(
@@ -152,26 +155,47 @@ def _check(file: LabFile, table: Table) -> None:
     _check_roles(file, table)
 
 
+def _check_ports_differ(file: LabFile, table: Table) -> None:
+    """Raise ConfigError if two routers listen at the same port of a machine."""
+    ports = [(router.machine, router.port) for router in file.routers.values()]
+    for name, router in file.routers.items():
+        if ports.count((router.machine, router.port)) > 1:
+            raise ConfigError(
+                f"{table.source}: `routers.{name}.port` = {router.port} has another router, too",
+                code="lab/invalid-file",
+            )
+
+
 def _check_roles(file: LabFile, table: Table) -> None:
-    seen: set[tuple[str, str, str]] = set()
+    """Check the entries of `[[roles]]`, each of which grants a role on a robot to a machine.
+
+    Args:
+        file: The decoded lab file.
+        table: The lab file as it was read, for error messages.
+
+    Raises:
+        ConfigError: An entry refers to something that does not exist, is repeated, or is not allowed.
+    """
+    earlier_grants: set[tuple[str, str, str]] = set()  # (machine, role, robot)
     for i, grant in enumerate(file.roles):
-        at = f"roles.{i}"
-        _known(table, f"{at}.machine", grant.machine, file.machines)
-        _known(table, f"{at}.robot", grant.robot, [*file.robots, ALL])
+        place = f"roles.{i}"
+        _known(table, f"{place}.machine", grant.machine, file.machines)
+        _known(table, f"{place}.robot", grant.robot, [*file.robots, ALL])
         if grant.role == Role.GNC and grant.robot == ALL:
             raise ConfigError(
-                f"{table.source}: `{at}.robot` = 'all': a gnc commands one robot; name it", code="lab/invalid-file"
+                f"{table.source}: `{place}.robot` = 'all': a gnc commands one robot; name it", code="lab/invalid-file"
             )
-        if (entry := (grant.machine, grant.role, grant.robot)) in seen:
+        machine_role_robot = (grant.machine, grant.role, grant.robot)
+        if machine_role_robot in earlier_grants:
             raise ConfigError(
-                f"{table.source}: `{at}` grants {' '.join(entry)} a second time; leave one out", code="lab/invalid-file"
+                f"{table.source}: `{place}` grants {' '.join(machine_role_robot)} a second time; leave one out",
+                code="lab/invalid-file",
             )
-        seen.add(entry)
-        for service in grant.services:
-            if service == "hal":
-                raise ConfigError(
-                    f"{table.source}: `{at}.services` = 'hal': only the robot itself is that", code="lab/invalid-file"
-                )
+        earlier_grants.add(machine_role_robot)
+        if "hal" in grant.services:
+            raise ConfigError(
+                f"{table.source}: `{place}.services` = 'hal': only the robot itself is that", code="lab/invalid-file"
+            )
 
 
 def _known(table: Table, field: str, name: str, among: Sequence[str] | dict[str, Machine]) -> None:

@@ -39,34 +39,47 @@ class Program:
 
 
 def programs(lab: Lab, machine: str) -> Iterator[Program]:
-    """Yield all programs of one machine."""
+    """Yield all programs that a machine of the lab runs all the time.
+
+    Args:
+        lab: The lab.
+        machine: Name of the machine in the lab file.
+    """
     folder = lab.file.machines[machine].folder
     for identity in identities(lab):
         if identity.machine != machine:
             continue
-        file = f"{folder}/{identity.label}.json5"
-        if identity.role is None:
-            yield Program(identity, f"Zenoh router {identity.of}", ("start", "router", file))
-        elif identity.role is Role.ROBOT:
-            robot = lab.file.robots[identity.of]
-            out = ("--out", f"{STATE}/{identity.of}")
-            arguments = ("start", "host", *_scenario(robot), "--session", file, *out)
-            yield Program(
-                identity,
-                f"HAL host of {identity.of}",
-                arguments,
-                interfaces=tuple(interface.name for interface in can_interfaces(robot)),
-                devices=tuple(devices(robot)),
-            )
-        elif identity.role is Role.GNC:
-            robot = lab.file.robots[identity.of]
-            for service in identity.services:
-                arguments = ("start", "service", service, *_scenario(robot), "--session", file)
-                yield Program(identity, f"{service} of {identity.of}", arguments, service)
-        elif identity.role is Role.RECORDER:
-            for name in identity.robots(lab):
-                arguments = ("record", "--session", file, "--namespace", name)  # a file with the time in its name
-                yield Program(identity, f"recorder of {name}", arguments, of_robot=name)
+        session_file = f"{folder}/{identity.label}.json5"
+        match identity.role:
+            case None:
+                yield Program(identity, f"Zenoh router {identity.of}", ("start", "router", session_file))
+            case Role.ROBOT:
+                yield _host_program(identity, lab, session_file)
+            case Role.GNC:
+                scenario = _scenario(lab.file.robots[identity.of])
+                for service in identity.services:
+                    arguments = ("start", "service", service, *scenario, "--session", session_file)
+                    yield Program(identity, f"{service} of {identity.of}", arguments, service)
+            case Role.RECORDER:
+                for robot_name in identity.robots(lab):
+                    # Without `--out`, the recording gets a name with the time.
+                    arguments = ("record", "--session", session_file, "--namespace", robot_name)
+                    yield Program(identity, f"recorder of {robot_name}", arguments, of_robot=robot_name)
+            case _:
+                pass  # operators, viewers and administrators start their programs by hand
+
+
+def _host_program(identity: Identity, lab: Lab, session_file: str) -> Program:
+    """Return the program that runs the HAL host of a robot."""
+    robot = lab.file.robots[identity.of]
+    out = f"{STATE}/{identity.of}"
+    return Program(
+        identity,
+        f"HAL host of {identity.of}",
+        ("start", "host", *_scenario(robot), "--session", session_file, "--out", out),
+        interfaces=tuple(interface.name for interface in can_interfaces(robot)),
+        devices=tuple(devices(robot)),
+    )
 
 
 def _scenario(robot: LabRobot) -> tuple[str, ...]:

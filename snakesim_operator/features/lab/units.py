@@ -17,7 +17,16 @@ NEEDS_QUOTES = re.compile(r"[\s';]")
 
 
 def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
-    """Yield the files of a machine as (path, text). origin: a line that names their source."""
+    """Yield the service files of a machine: systemd units, and a Compose file with the same programs.
+
+    Args:
+        lab: The lab.
+        machine: Name of the machine in the lab file.
+        origin: A line that names the source of the files; it is written at their top.
+
+    Yields:
+        The path of a file relative to the machine's folder, and its text.
+    """
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         undefined=StrictUndefined,
@@ -26,25 +35,28 @@ def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]
         keep_trailing_newline=True,
         autoescape=False,
     )
-    entry = lab.file.machines[machine]
-    found = list(programs(lab, machine))
     variables = {
-        "machine": entry,
+        "machine": lab.file.machines[machine],
         "origin": origin,
         "state": STATE,
         "uid": CONTAINER_USER,
         "priority": SERVICE_PRIORITY,
     }
-    unit = templates.get_template("unit.j2")
-    for program in found:
-        text = unit.render(**variables, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
+    machine_programs = list(programs(lab, machine))
+    unit_template = templates.get_template("unit.j2")
+    for program in machine_programs:
+        command = _command_line(lab, program)
+        text = unit_template.render(**variables, program=program, command=command, addresses=_addresses(lab))
         yield f"systemd/{program.name}.service", text
+    can_template = templates.get_template("can.j2")
     for robot in lab.file.robots.values():
-        for interface in can_interfaces(robot) if robot.machine == machine else ():
-            text = templates.get_template("can.j2").render(**variables, interface=interface)
+        if robot.machine != machine:
+            continue
+        for interface in can_interfaces(robot):
+            text = can_template.render(**variables, interface=interface)
             yield f"systemd/snakesim-{interface.name}.service", text
-    if found:
-        commands = [(program, ["snakesim", *program.arguments]) for program in found]
+    if machine_programs:
+        commands = [(program, ["snakesim", *program.arguments]) for program in machine_programs]
         yield "compose.yaml", templates.get_template("compose.j2").render(**variables, programs=commands)
 
 
@@ -56,8 +68,8 @@ def _command_line(lab: Lab, program: Program) -> str:
 
 def _addresses(lab: Lab) -> list[str]:
     """Return the addresses of the routers, or none if one of them is a name."""
-    found = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
+    addresses = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
     try:
-        return sorted({str(ip_address(address)) for address in found})
+        return sorted({str(ip_address(address)) for address in addresses})
     except ValueError:
         return []

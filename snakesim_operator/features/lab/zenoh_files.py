@@ -13,14 +13,29 @@ LEASE_MS = 2000  # after which a silent link is closed
 
 
 def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
-    """Return the settings of a router: TLS on the machine's address, required certificates, and the access rules."""
-    earlier = list(lab.file.routers)[: list(lab.file.routers).index(identity.of)]
+    """Return the Zenoh configuration of a router.
+
+    The router listens with TLS on its machine's address, requires a certificate of every client, and enforces the
+    access rules. It connects to the routers before it in the lab file, so that each pair of routers has one connection.
+
+    Args:
+        identity: The router.
+        lab: The lab.
+    """
+    names = list(lab.file.routers)
+    earlier_routers = names[: names.index(identity.of)]
     folder = f"{lab.file.machines[identity.machine].folder}/tls"
-    tls = {**tls_files(identity, folder, "listen"), **tls_files(identity, folder, "connect"), "enable_mtls": True}
+    listen_files = tls_files(identity, folder, "listen")
+    connect_files = tls_files(identity, folder, "connect")
+    tls = {**listen_files, **connect_files, "enable_mtls": True}
     return {
         "mode": "router",
         "listen": {"endpoints": [lab.endpoint(identity.of)], "exit_on_failure": True},
-        "connect": {"endpoints": [lab.endpoint(name) for name in earlier], "timeout_ms": -1, "exit_on_failure": False},
+        "connect": {
+            "endpoints": [lab.endpoint(name) for name in earlier_routers],
+            "timeout_ms": -1,  # tries without end
+            "exit_on_failure": False,
+        },
         "scouting": ALONE,
         "timestamping": STAMPED,
         "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},

@@ -8,6 +8,7 @@ from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_import(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim robot import`."""
     parser.add_argument("file", type=Path, metavar="FILE.urdf", help="the URDF")
     add_out(parser, "robot file to write (default: NAME.toml)")
     parser.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")

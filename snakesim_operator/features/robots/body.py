@@ -29,11 +29,11 @@ MIN_MASS_KG = 0.001
 MOMENT_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
 
 
-def put_body(found: Imported, row: Row, order: ImportOptions, urdf: Element) -> list[Floats]:
+def put_body(imported: Imported, row: Row, order: ImportOptions, urdf: Element) -> list[Floats]:
     """Put chain, module and links into the values of a robot file.
 
     Args:
-        found: The import, whose values and report are extended.
+        imported: The import, whose values and report are extended.
         row: Bodies and joints of the URDF, tail to head.
         order: How to read the URDF.
         urdf: The root element of the URDF.
@@ -47,7 +47,7 @@ def put_body(found: Imported, row: Row, order: ImportOptions, urdf: Element) -> 
     body_from_root = _find_body_axes(row, order, urdf)
     scale = order.scale
     if scale != 1.0:
-        found.changes.add(
+        imported.changes.add(
             f"--scale {scale:g}: lengths times {scale:g}, inertias times {scale**2:g}; masses in kg, effort, damping "
             f"and friction in N·m stay as they are"
         )
@@ -59,24 +59,24 @@ def put_body(found: Imported, row: Row, order: ImportOptions, urdf: Element) -> 
     joints_x = on_line[:, 0]
     gap_m = float(np.mean(np.diff(joints_x)))
     _check_gap(row, joints_x, gap_m, urdf)
-    axes = [_read_axis(found, joint, body_from_root @ joint.axis) for joint in row.joints]
+    axes = [_read_axis(imported, joint, body_from_root @ joint.axis) for joint in row.joints]
     for joint, axis, offset_m in zip(row.joints, axes, on_line, strict=True):
-        _check_on_line(found, joint, axis, offset_m, gap_m)
+        _check_on_line(imported, joint, axis, offset_m, gap_m)
 
     # Outlines, from which the capsules follow.
     outlines = [_place_outline(body, body_from_root, line_b, scale) for body in row.bodies]
-    radius_m = _choose_radius(outlines, gap_m, found)
-    _report_shapes(found, row, radius_m, scale)
-    lengths = _measure_lengths(joints_x, outlines, radius_m, found, row)
+    radius_m = _choose_radius(outlines, gap_m, imported)
+    _report_shapes(imported, row, radius_m, scale)
+    lengths = _measure_lengths(joints_x, outlines, radius_m, imported, row)
 
     # Links.
     starts_x = [joints_x[0] - lengths[0], *joints_x]
     frames = [_link_from_root(body_from_root, np.array([x, *positions_b[0][1:]])) for x in starts_x]
     links: list[dict[str, Any]] = []
     for i, body in enumerate(row.bodies):
-        links.append(_convert_link(found, i, body, frames[i], lengths[i], radius_m, scale))
-    _put_links(found.table, links, axes, radius_m, urdf.source)
-    _put_names(found, row, axes, body_from_root)
+        links.append(_convert_link(imported, i, body, frames[i], lengths[i], radius_m, scale))
+    _put_links(imported.table, links, axes, radius_m, urdf.source)
+    _put_names(imported, row, axes, body_from_root)
     return frames
 
 
@@ -106,20 +106,20 @@ def _check_gap(row: Row, joints_x: Floats, gap_m: float, urdf: Element) -> None:
     )
 
 
-def _put_names(found: Imported, row: Row, axes: list[str], body_from_root: Floats) -> None:
+def _put_names(imported: Imported, row: Row, axes: list[str], body_from_root: Floats) -> None:
     """Report the new names of links and joints, and keep which joints turn the other way round."""
     for i, body in enumerate(row.bodies):
         if body.links != [f"link_{i}"]:
-            found.names.append(f"link_{i}: {', '.join(body.places)}")
+            imported.names.append(f"link_{i}: {', '.join(body.places)}")
     for i, (joint, axis) in enumerate(zip(row.joints, axes, strict=True)):
         name = f"joint_{i + 1}"
         axis_b = body_from_root @ joint.axis
         component = 2 if axis == "yaw" else 1
         negated = float(axis_b[component]) < 0
-        found.negated.append(negated)
+        imported.negated.append(negated)
         if joint.name != name or negated:
             note = ", its angle negated" if negated else ""
-            found.names.append(f"{name}: {joint.place()}, {axis}{note}")
+            imported.names.append(f"{name}: {joint.place()}, {axis}{note}")
 
 
 def _link_from_root(body_from_root: Floats, start_b: Floats) -> Floats:
@@ -130,7 +130,7 @@ def _link_from_root(body_from_root: Floats, start_b: Floats) -> Floats:
     return frame
 
 
-def _read_axis(found: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
+def _read_axis(imported: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
     """Return "yaw" or "pitch". A small tilt is removed and reported. Raises ConfigError for an oblique axis."""
     for name, component, letter in (("yaw", 2, "z"), ("pitch", 1, "y")):
         cosine = abs(float(axis_b[component]))
@@ -138,7 +138,7 @@ def _read_axis(found: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
             continue
         tilt_rad = float(np.linalg.norm(np.delete(axis_b, component)))
         if tilt_rad > MIN_TILT_RAD:
-            found.changes.add(
+            imported.changes.add(
                 f"<axis xyz>, tilted by {math.degrees(tilt_rad):.4f}°, became {letter}", joint.place("axis")
             )
         return name
@@ -148,11 +148,11 @@ def _read_axis(found: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
     )
 
 
-def _check_on_line(found: Imported, joint: UrdfJoint, axis: str, offset_m: Floats, gap_m: float) -> None:
+def _check_on_line(imported: Imported, joint: UrdfJoint, axis: str, offset_m: Floats, gap_m: float) -> None:
     """Report where a joint is moved onto the line of the others. Raises ConfigError when it is far beside it.
 
     Args:
-        found: The import, whose report is extended.
+        imported: The import, whose report is extended.
         joint: The joint.
         axis: "yaw" or "pitch".
         offset_m: (3,) position of the joint in the body frame; y and z count from the line.
@@ -172,11 +172,11 @@ def _check_on_line(found: Imported, joint: UrdfJoint, axis: str, offset_m: Float
             f"joints on a line, at zero angles"
         )
     if across_m > MIN_OFFSET_M:
-        found.changes.add(
+        imported.changes.add(
             f"<origin> moved by {across_m * 1e3:.3g} mm, onto the line of the other joints", joint.place("origin")
         )
     if along_axis_m > MIN_OFFSET_M:
-        found.changes.add(
+        imported.changes.add(
             f"<origin> moved by {along_axis_m * 1e3:.3g} mm along the joint's own axis, which changes no motion",
             joint.place("origin"),
         )
@@ -192,14 +192,14 @@ def _place_outline(body: Body, body_from_root: Floats, line_b: Floats, scale: fl
     return np.vstack(body.points) @ body_from_root.T * scale - line_b
 
 
-def _report_shapes(found: Imported, row: Row, radius_m: float, scale: float) -> None:
+def _report_shapes(imported: Imported, row: Row, radius_m: float, scale: float) -> None:
     """Report every shape that became a capsule, with its sizes."""
     for body in row.bodies:
         if _is_capsule(body, radius_m / scale):
             continue
         for shape in body.shapes:
             sizes = " ".join(f"{name}={value!r}" for name, value in shape.attributes.items())
-            found.changes.add(
+            imported.changes.add(
                 f"<{shape.tag} {sizes}> became a capsule of {radius_m * 1e3:.1f} mm, which encloses it",
                 f"line {shape.line}",
             )
@@ -212,25 +212,38 @@ def _is_capsule(body: Body, radius: float) -> bool:
     return all(math.isclose(shape.number("radius"), radius, rel_tol=1e-6) for shape in body.shapes)
 
 
-def _choose_radius(outlines: list[Floats | None], gap_m: float, found: Imported) -> float:
-    """Return the radius of all links in m: that of the widest one. Assumptions and changes are reported."""
-    radii = {f"link_{i}": _measure_radius(points) for i, points in enumerate(outlines) if points is not None}
-    if not radii:
+def _choose_radius(outlines: list[Floats | None], gap_m: float, imported: Imported) -> float:
+    """Return the radius of all links in m, which is that of the widest link.
+
+    Args:
+        outlines: For each link, (n, 3) points in m in the body frame; None if the link has no geometry.
+        gap_m: Mean distance between joints, from which a radius is assumed if no link has geometry.
+        imported: The import, whose report gets assumptions and changes.
+    """
+    radii_m: dict[str, float] = {}
+    missing: list[str] = []
+    for i, outline in enumerate(outlines):
+        if outline is None:
+            missing.append(f"link_{i}")
+        else:
+            radii_m[f"link_{i}"] = _measure_radius(outline)
+    if not radii_m:
         assumed_m = round(ASSUMED_RADIUS_RATIO * gap_m, LENGTH_DIGITS)
-        found.assumptions.add(
+        imported.assumptions.add(
             f"no link has geometry; its radius is taken as {ASSUMED_RADIUS_RATIO} of the joints' distance: "
             f"{assumed_m:.3g} m"
         )
         return assumed_m
-    widest_m = round(max(radii.values()), LENGTH_DIGITS)
-    missing = [f"link_{i}" for i, points in enumerate(outlines) if points is None]
+    widest_m = round(max(radii_m.values()), LENGTH_DIGITS)
+    widest_mm = f"{widest_m * 1e3:.1f} mm"
     if missing:
-        found.assumptions.add(f"{', '.join(missing)}: no geometry; the radius is the others', {widest_m * 1e3:.1f} mm")
-    narrower = [f"{name} ({radius * 1e3:.1f} mm)" for name, radius in radii.items() if radius < widest_m * 0.99]
+        imported.assumptions.add(f"{', '.join(missing)}: no geometry; the radius is the others', {widest_mm}")
+    narrower: list[str] = []
+    for name, radius_m in radii_m.items():
+        if radius_m < widest_m * 0.99:  # a difference of 1 % is not reported
+            narrower.append(f"{name} ({radius_m * 1e3:.1f} mm)")
     if narrower:
-        found.changes.add(
-            f"every link is a capsule of {widest_m * 1e3:.1f} mm, the widest; narrower: {', '.join(narrower)}"
-        )
+        imported.changes.add(f"every link is a capsule of {widest_mm}, the widest; narrower: {', '.join(narrower)}")
     return widest_m
 
 
@@ -240,29 +253,41 @@ def _measure_radius(points: Floats) -> float:
 
 
 def _measure_lengths(
-    joints_x: Floats, outlines: list[Floats | None], radius_m: float, found: Imported, row: Row
+    joints_x: Floats, outlines: list[Floats | None], radius_m: float, imported: Imported, row: Row
 ) -> list[float]:
-    """Return the length of every link in m, without the caps of its capsule. Raises ConfigError for a folded robot."""
-    gaps = [round(float(gap), LENGTH_DIGITS) for gap in np.diff(joints_x)]
-    if min(gaps) < 0:
+    """Return the length of every link in m, tail to head, without the caps of its capsule.
+
+    Args:
+        joints_x: (joints,) x of each joint in the body frame in m, tail to head.
+        outlines: For each link, (n, 3) points in m in the body frame; None if the link has no geometry.
+        radius_m: Radius of all links.
+        imported: The import, whose report is extended.
+        row: Bodies and joints of the URDF, tail to head.
+
+    Raises:
+        ConfigError: The robot is folded at zero angles.
+    """
+    gaps_m = [round(float(gap), LENGTH_DIGITS) for gap in np.diff(joints_x)]
+    if min(gaps_m) < 0:
         raise ConfigError(
             "the joints are not in order along the chain at zero angles: it is folded", code="urdf/invalid"
         )
-    for i, gap in enumerate(gaps):
-        if gap < MIN_LENGTH_M:
-            found.changes.add(
-                f"joint_{i + 1} and joint_{i + 2} are {gap * 1e3:.2f} mm apart; here {MIN_LENGTH_M * 1e3:g} mm",
+    inner_lengths_m: list[float] = []  # of the links between tail and head
+    for i, gap_m in enumerate(gaps_m):
+        if gap_m < MIN_LENGTH_M:
+            imported.changes.add(
+                f"joint_{i + 1} and joint_{i + 2} are {gap_m * 1e3:.2f} mm apart; here {MIN_LENGTH_M * 1e3:g} mm",
                 row.joints[i + 1].place("origin"),
             )
-    inner_m = [max(gap, MIN_LENGTH_M) for gap in gaps]
-    last = len(outlines) - 1
-    tail_m = _measure_end(found, 0, outlines[0], joints_x[0], -1, radius_m, inner_m)
-    head_m = _measure_end(found, last, outlines[last], joints_x[-1], 1, radius_m, inner_m)
-    return [tail_m, *inner_m, head_m]
+        inner_lengths_m.append(max(gap_m, MIN_LENGTH_M))
+    head = len(outlines) - 1
+    tail_m = _measure_end(imported, 0, outlines[0], joints_x[0], -1, radius_m, inner_lengths_m)
+    head_m = _measure_end(imported, head, outlines[head], joints_x[-1], 1, radius_m, inner_lengths_m)
+    return [tail_m, *inner_lengths_m, head_m]
 
 
 def _measure_end(
-    found: Imported,
+    imported: Imported,
     index: int,
     outline: Floats | None,
     joint_x: float,
@@ -273,7 +298,7 @@ def _measure_end(
     """Return the length in m of the tail or the head, from its joint to where its cap begins.
 
     Args:
-        found: The import, whose report is extended.
+        imported: The import, whose report is extended.
         index: Index of the link.
         outline: (n, 3) points of the link in the body frame; None if it has no geometry.
         joint_x: x of its joint in the body frame.
@@ -283,14 +308,14 @@ def _measure_end(
     """
     if outline is None:
         assumed_m = round(float(np.mean(inner_m)) / 2, LENGTH_DIGITS)
-        found.assumptions.add(
+        imported.assumptions.add(
             f"link_{index} has no geometry; its length is taken as half of the others': {assumed_m:g} m"
         )
         return assumed_m
     extent_m = float((outward * (outline[:, 0] - joint_x)).max())
     length_m = round(extent_m - radius_m, LENGTH_DIGITS)
     if length_m < MIN_LENGTH_M:
-        found.changes.add(
+        imported.changes.add(
             f"link_{index} ends {(length_m + radius_m) * 1e3:.1f} mm from its joint, less than its cap of "
             f"{radius_m * 1e3:.1f} mm; here {(MIN_LENGTH_M + radius_m) * 1e3:.1f} mm"
         )
@@ -299,12 +324,14 @@ def _measure_end(
 
 
 def _convert_link(
-    found: Imported, index: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
+    imported: Imported, index: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
 ) -> dict[str, Any]:
-    """Return an entry of [[links]], without the values that an evenly filled capsule has anyway.
+    """Return the entry of a link in [[links]] of the robot file.
+
+    Center of mass and inertia are left out if they are those of an evenly filled capsule, which are the defaults.
 
     Args:
-        found: The import, whose report is extended.
+        imported: The import, whose report is extended.
         index: Index of the link.
         body: Mass, center of mass and inertia, in the root's frame and the file's unit of length.
         frame: link_from_root, (4, 4) with lengths in m.
@@ -313,7 +340,7 @@ def _convert_link(
         scale: Meters per unit of length of the file.
     """
     if body.mass_kg < MIN_MASS_KG:
-        found.changes.add(
+        imported.changes.add(
             f"link_{index} has a mass of {body.mass_kg:g} kg; here {MIN_MASS_KG:g} kg, evenly in its capsule, and the "
             f"<origin> and <inertia> of its <inertial> do not count",
             *[mass.place for mass in body.masses],
@@ -321,23 +348,24 @@ def _convert_link(
         return {"length_m": length_m, "mass_kg": MIN_MASS_KG}
     rotation = frame[:3, :3]
     center_m = rotation @ body.center * scale + frame[:3, 3]
-    inertia = rotation @ body.inertia @ rotation.T * scale**2
+    inertia_kg_m2 = rotation @ body.inertia @ rotation.T * scale**2
     mass_kg = _round_value(body.mass_kg)
-    capsule = np.array(capsule_inertia(length_m, radius_m, mass_kg))
-    moments = _list_moments(inertia)
-    if not _is_possible_inertia(inertia):
-        found.changes.add(
+    capsule_moments = np.array(capsule_inertia(length_m, radius_m, mass_kg))
+    moments = _list_moments(inertia_kg_m2)
+    if not _is_possible_inertia(inertia_kg_m2):
+        imported.changes.add(
             f"link_{index} has an inertia that no body has, {_join_values(moments)} kg·m² (ixx, "
-            f"iyy, izz, ixy, ixz, iyz); here that of its capsule, {_join_values(capsule[:3])}",
+            f"iyy, izz, ixy, ixz, iyz); here that of its capsule, {_join_values(capsule_moments[:3])}",
             *[element.place for element in body.inertias],
         )
-        moments = capsule
+        moments = capsule_moments
 
     link: dict[str, Any] = {"length_m": length_m, "mass_kg": mass_kg}
-    is_even = np.allclose(moments, capsule, rtol=1e-6, atol=1e-6 * capsule.max())
+    is_even = np.allclose(moments, capsule_moments, rtol=1e-6, atol=1e-6 * capsule_moments.max())
     is_centered = np.allclose(center_m, [length_m / 2, 0, 0], atol=1e-8)
     if not (is_even and is_centered):
-        link["center_m"] = [round(float(value), LENGTH_DIGITS) + 0.0 for value in center_m]  # + 0.0: no -0.0
+        # Adding 0.0 turns -0.0 into 0.0.
+        link["center_m"] = [round(float(value), LENGTH_DIGITS) + 0.0 for value in center_m]
     if not is_even:
         link["inertia_kg_m2"] = [_round_value(float(moment)) for moment in moments]
     return link

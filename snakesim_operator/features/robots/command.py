@@ -23,7 +23,7 @@ HEADS = {
 
 
 def import_robot(file: Path, order: ImportOptions, out: Path | None, *, as_json: bool = False) -> int:
-    """Write a robot file from a URDF, and print what differs.
+    """Write a robot file from a URDF, and print how the two differ.
 
     Args:
         file: The URDF.
@@ -37,30 +37,32 @@ def import_robot(file: Path, order: ImportOptions, out: Path | None, *, as_json:
     Raises:
         ConfigError: The URDF cannot be imported, or the robot file exists already.
     """
-    found = import_urdf(file, order)
-    path = out or Path(f"{found.robot.name}.toml")
+    imported = import_urdf(file, order)
+    robot = imported.robot
+    path = out or Path(f"{robot.name}.toml")
     _check_new(path, ".toml", file)
     notes = [f"From {file.name}, by `snakesim robot import`."]
-    for key, lines in found.report.items():
+    for key, lines in imported.report.items():
         if lines:
             notes += ["", f"{HEADS[key]}:"]
             notes += [f"  {line}" for line in lines]
-    write_text(path, format_toml(found.table.values, [escape_invisible(note) for note in notes]))
+    comments = [escape_invisible(note) for note in notes]
+    write_text(path, format_toml(imported.table.values, comments))
     if as_json:
-        print_json({"file": str(path), **found.report})
+        print_json({"file": str(path), **imported.report})
         return 0
-    shown = _count_shown(notes)
-    for note in notes[1:shown]:
+    shown_count = _count_shown(notes)
+    for note in notes[1:shown_count]:
         print_line(note)
-    if shown < len(notes):
+    if shown_count < len(notes):
         print_line(f"  (their text is at the top of {path})")
-    robot = found.robot
     print_line("")
     print_line(
         f"{path}: {robot.chain.modules} joints ({', '.join(robot.chain.axes)}), {_whole_length_m(robot):.3f} m, "
         f"{sum(robot.link_masses_kg):.3f} kg"
     )
-    print_line(f"try it: snakesim run SCENARIO --set robot={path if path.is_absolute() else f'./{path}'}")
+    path_on_command_line = path if path.is_absolute() else f"./{path}"
+    print_line(f"try it: snakesim run SCENARIO --set robot={path_on_command_line}")
     return 0
 
 

@@ -74,15 +74,16 @@ def _joint_element(robot: RobotFile, number: int, from_rear_m: float) -> list[st
 
 
 def _link_element(number: int, link: Link, radius_m: float) -> list[str]:
-    """Return the lines of a link. Its capsule is written as a cylinder and two spheres."""
+    """Return the lines of a URDF <link> element. URDF has no capsule, so it is written as a cylinder and two spheres.
+
+    Args:
+        number: Number of the link, 0 at the tail.
+        link: Length, mass, center of mass and inertia.
+        radius_m: Radius of the capsule.
+    """
     center = " ".join(map(repr, link.center))
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     moments = " ".join(f'{name}="{value!r}"' for name, value in zip(names, link.inertia(radius_m), strict=True))
-    shapes = [
-        ([link.length_m / 2, 0.0, 0.0], math.pi / 2, f'<cylinder radius="{radius_m!r}" length="{link.length_m!r}"/>'),
-        ([0.0, 0.0, 0.0], 0.0, f'<sphere radius="{radius_m!r}"/>'),
-        ([link.length_m, 0.0, 0.0], 0.0, f'<sphere radius="{radius_m!r}"/>'),
-    ]
     lines = [
         f'  <link name="link_{number}">',
         "    <inertial>",
@@ -91,13 +92,35 @@ def _link_element(number: int, link: Link, radius_m: float) -> list[str]:
         f"      <inertia {moments}/>",
         "    </inertial>",
     ]
-    for tag, more in (("visual", '<material name="orange"/>'), ("collision", "")):
-        for (x, y, z), pitch, shape in shapes:
-            lines += [
-                f"    <{tag}>",
-                f'      <origin xyz="{x!r} {y!r} {z!r}" rpy="0 {pitch!r} 0"/>',
-                f"      <geometry>{shape}</geometry>",
-                *([f"      {more}"] if more else []),
-                f"    </{tag}>",
-            ]
+    lines += _shape_elements("visual", link.length_m, radius_m, ['      <material name="orange"/>'])
+    lines += _shape_elements("collision", link.length_m, radius_m, [])
     return [*lines, "  </link>"]
+
+
+def _shape_elements(tag: str, length_m: float, radius_m: float, more_lines: list[str]) -> list[str]:
+    """Return the lines of three elements, <visual> or <collision>, that together are a capsule along x.
+
+    Args:
+        tag: "visual" or "collision".
+        length_m: Length of the capsule without its caps.
+        radius_m: Radius of the capsule.
+        more_lines: Further lines of each element.
+    """
+    cylinder = f'<cylinder radius="{radius_m!r}" length="{length_m!r}"/>'
+    sphere = f'<sphere radius="{radius_m!r}"/>'
+    along_x_rad = math.pi / 2  # pitch of a cylinder, whose axis is z in URDF
+    shapes = [
+        (length_m / 2, along_x_rad, cylinder),
+        (0.0, 0.0, sphere),
+        (length_m, 0.0, sphere),
+    ]
+    lines: list[str] = []
+    for x_m, pitch_rad, shape in shapes:
+        lines += [
+            f"    <{tag}>",
+            f'      <origin xyz="{x_m!r} 0.0 0.0" rpy="0 {pitch_rad!r} 0"/>',
+            f"      <geometry>{shape}</geometry>",
+            *more_lines,
+            f"    </{tag}>",
+        ]
+    return lines

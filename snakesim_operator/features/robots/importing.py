@@ -55,24 +55,29 @@ def import_urdf(file: Path, order: ImportOptions) -> Imported:
     if urdf.tag != "robot":
         raise urdf.error("is no URDF; its outermost element is <robot>")
     urdf.read = True
-    own = urdf.first("snakesim") is not None
-    found = Imported(_exported_values(urdf) if own else _values_of_other(urdf, order))
-    row = read_row(found, urdf, file, tail=order.tail)
-    frames = put_body(found, row, order, urdf)
-    _put_name(found, urdf, file)
-    put_limits(found, row.joints, str(file), own=own)
-    if not own:
-        put_sensors(found, urdf, row, frames, order.scale)
-        _report_values_of_other(found, order)
-    _sort_sections(found.table)
-    robot = found.robot  # raises for numbers that no robot file may hold
-    if own:
+    is_exported = urdf.first("snakesim") is not None  # SnakeSIM exported it, with the values that URDF cannot hold
+    initial_values = _exported_values(urdf) if is_exported else _values_of_other(urdf, order)
+    imported = Imported(initial_values)
+
+    # Each step changes the values that are known so far, and reports what it changed.
+    row = read_row(imported, urdf, file, tail=order.tail)
+    frames = put_body(imported, row, order, urdf)
+    _put_name(imported, urdf, file)
+    put_limits(imported, row.joints, str(file), is_exported=is_exported)
+    if not is_exported:
+        put_sensors(imported, urdf, row, frames, order.scale)
+        _report_values_of_other(imported, order)
+    _sort_sections(imported.table)
+    robot = imported.robot  # raises for numbers that no robot file may hold
+
+    # Report what the URDF does not contain, and what it contains and was not read.
+    if is_exported:
         _mark_exported(urdf, robot)
     for absence in urdf.absences:
-        found.assumptions.add(absence.sentence, f"line {absence.element.line}")
-    report_unused(found.omissions, urdf)
-    _report_shipped_name(found)
-    return found
+        imported.assumptions.add(absence.sentence, f"line {absence.element.line}")
+    report_unused(imported.omissions, urdf)
+    _report_shipped_name(imported)
+    return imported
 
 
 def _sort_sections(table: Table) -> None:
@@ -81,20 +86,20 @@ def _sort_sections(table: Table) -> None:
     table.values = {name: table.values[name] for name in names}
 
 
-def _put_name(found: Imported, urdf: Element, file: Path) -> None:
+def _put_name(imported: Imported, urdf: Element, file: Path) -> None:
     """Put the name of the robot; without one, that of the file."""
     name = urdf.optional("name")
     if name is None:
-        found.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
+        imported.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
         name = file.stem
-    found.table.set_value("name", found.plain_name(name, "robot", urdf), str(file))
+    imported.table.set_value("name", imported.plain_name(name, "robot", urdf), str(file))
 
 
-def _report_shipped_name(found: Imported) -> None:
+def _report_shipped_name(imported: Imported) -> None:
     """Report a name that a shipped robot has too."""
-    name = found.table.values["name"]
+    name = imported.table.values["name"]
     if name in list_shipped("robots"):
-        found.omissions.add(
+        imported.omissions.add(
             f"a name of its own: it is {name}, as a shipped robot is; change it, because the network and a latched "
             f"stop tell robots apart by it"
         )
@@ -129,21 +134,23 @@ def _exported_values(urdf: Element) -> Table:
     return table
 
 
-def _report_values_of_other(found: Imported, order: ImportOptions) -> None:
+def _report_values_of_other(imported: Imported, order: ImportOptions) -> None:
     """Report every value that was taken from the robot of `--like`."""
-    for section, values in found.table.values.items():
+    for section, values in imported.table.values.items():
         if section in FROM_URDF:
             continue
         taken_values: list[str] = []
         for key, value in leaves(values, section):
-            is_from_urdf = found.table.origin_of(key) == found.table.origin_of("name")
+            is_from_urdf = imported.table.origin_of(key) == imported.table.origin_of("name")
             if not is_from_urdf and value not in ({}, []):
                 taken_values.append(f"{key.removeprefix(f'{section}.')} = {value}")
         if taken_values:
-            found.assumptions.add(f"[{section}] as of robot {order.like!r}: {', '.join(taken_values)}")
-    absent = [section for section in SECTIONS if section not in found.table.values and section not in OF_ANOTHER_ROBOT]
+            imported.assumptions.add(f"[{section}] as of robot {order.like!r}: {', '.join(taken_values)}")
+    absent = [
+        section for section in SECTIONS if section not in imported.table.values and section not in OF_ANOTHER_ROBOT
+    ]
     if absent:
-        found.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
+        imported.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
 
 
 def _mark_exported(urdf: Element, robot: RobotFile) -> None:

@@ -54,38 +54,52 @@ class AngleRange:
     upper_rad: float
 
 
-def put_limits(found: Imported, joints: list[UrdfJoint], source: str, *, own: bool) -> None:
-    """Put limits and friction into the values of a robot file.
+def put_limits(imported: Imported, joints: list[UrdfJoint], source: str, *, is_exported: bool) -> None:
+    """Put the angle limits, motor limits and friction of the joints into the values of a robot file.
+
+    A number that most joints share goes into the section for all joints; the others become exceptions.
 
     Args:
-        found: The import, whose values and report are extended.
-        joints: The joints, tail to head.
-        source: The file, for error messages.
-        own: Whether the values so far are those of the same robot, as it was exported. Then only differences are put.
+        imported: The import, whose values and report are extended.
+        joints: The joints of the URDF, tail to head.
+        source: Path of the URDF, for error messages.
+        is_exported: Whether SnakeSIM exported this URDF. The values so far are then those of the same robot, and only
+            what differs from them is put.
 
     Raises:
         ConfigError: A number is out of its range.
     """
-    ranges = [_read_range(found, joint, negated) for joint, negated in zip(joints, found.negated, strict=True)]
-    if not own:
-        _put_common_range(found, ranges, source)
-    built = decode(found.table, RobotFile).joint_table
-    columns = {number.key: _complete_column(found, number, joints, built, own=own) for number in NUMBERS}
-    if not own:
+    ranges = [_read_range(imported, joint, negated) for joint, negated in zip(joints, imported.negated, strict=True)]
+    if not is_exported:
+        _put_common_range(imported, ranges, source)
+    joints_so_far = decode(imported.table, RobotFile).joint_table
+    columns: dict[str, list[float]] = {}  # by the key of the robot file, one value for each joint
+    for number in NUMBERS:
+        columns[number.key] = _complete_column(imported, number, joints, joints_so_far, is_exported=is_exported)
+    if not is_exported:
         for number in NUMBERS:
-            [(common, _)] = Counter(columns[number.key]).most_common(1)
-            found.table.set_value(f"{number.section}.{number.key}", common, source)
-    _put_exceptions(found, joints, ranges, columns, source)
+            [(most_common, _)] = Counter(columns[number.key]).most_common(1)
+            imported.table.set_value(f"{number.section}.{number.key}", most_common, source)
+    _put_exceptions(imported, joints, ranges, columns, source)
 
 
-def _read_range(found: Imported, joint: UrdfJoint, negated: bool) -> AngleRange:
-    """Return the range of a joint, at most half a revolution to either side. Raises ConfigError.
+def _read_range(imported: Imported, joint: UrdfJoint, negated: bool) -> AngleRange:
+    """Return the range of a joint, which is cut to half a revolution to either side.
 
-    negated: whether the robot file's angle is minus the URDF's.
+    Args:
+        imported: The import, whose report is extended.
+        joint: The joint of the URDF.
+        negated: Whether the robot file's angle is minus the URDF's.
+
+    Returns:
+        The range in rad, with the sign of the robot file.
+
+    Raises:
+        ConfigError: The joint has no limits, or zero is not between them.
     """
     element = joint.element
     if element.attributes["type"] == "continuous":
-        found.changes.add(
+        imported.changes.add(
             f"continuous joints turn by {MAX_TURN_RAD} rad to either side here; where there are no end stops, give "
             f"`cable_turns`",
             joint.place(),
@@ -94,78 +108,95 @@ def _read_range(found: Imported, joint: UrdfJoint, negated: bool) -> AngleRange:
     limit = element.first("limit")
     if limit is None:
         raise element.error("is revolute and has no <limit>; add lower and upper, in rad")
-    lower = _read_limit_rad(found, joint, limit, "lower")
-    upper = _read_limit_rad(found, joint, limit, "upper")
-    if not lower < 0 < upper:
+    lower_rad = _read_limit_rad(imported, joint, limit, "lower")
+    upper_rad = _read_limit_rad(imported, joint, limit, "upper")
+    if not lower_rad < 0 < upper_rad:
         raise limit.error(
-            f"of joint {joint.name!r} is {lower:g} to {upper:g} rad; a joint must be able to turn to either side of "
-            f"zero: `lower` below 0, `upper` above 0"
+            f"of joint {joint.name!r} is {lower_rad:g} to {upper_rad:g} rad; a joint must be able to turn to either "
+            f"side of zero: `lower` below 0, `upper` above 0"
         )
     if negated:
-        return AngleRange(-upper, -lower)
-    return AngleRange(lower, upper)
+        return AngleRange(-upper_rad, -lower_rad)
+    return AngleRange(lower_rad, upper_rad)
 
 
-def _read_limit_rad(found: Imported, joint: UrdfJoint, limit: Element, attribute: str) -> float:
-    """Return one side of the range, cut to half a revolution. The cut is reported. Raises ConfigError."""
+def _read_limit_rad(imported: Imported, joint: UrdfJoint, limit: Element, attribute: str) -> float:
+    """Return one end of a joint's range in rad, cut to half a revolution.
+
+    Args:
+        imported: The import, whose report gets a line if the value is cut.
+        joint: The joint of the URDF.
+        limit: Its <limit> element.
+        attribute: "lower" or "upper".
+
+    Raises:
+        ConfigError: The value is so large that it is probably in degrees.
+    """
     limit_rad = limit.number(attribute, "0")
     if abs(limit_rad) > MAX_LIMIT_RAD:
-        radians = math.radians(limit_rad)
+        if_degrees_rad = math.radians(limit_rad)
         raise limit.error(
             f"of joint {joint.name!r} has `{attribute}` = {limit_rad:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at "
-            f"most. URDF has radians: if this is in degrees, write {radians:.5g}. A joint without end stops has "
+            f"most. URDF has radians: if this is in degrees, write {if_degrees_rad:.5g}. A joint without end stops has "
             f'type="continuous"'
         )
     if abs(limit_rad) <= MAX_TURN_RAD:
         return limit_rad
-    cut = MAX_TURN_RAD if limit_rad > 0 else -MAX_TURN_RAD
-    found.changes.add(
-        f"`{attribute}` = {limit_rad:g} rad became {cut:g} rad, half a turn, which is the most that a robot file has; "
-        f"if these are degrees, write radians",
+    cut_rad = MAX_TURN_RAD if limit_rad > 0 else -MAX_TURN_RAD
+    imported.changes.add(
+        f"`{attribute}` = {limit_rad:g} rad became {cut_rad:g} rad, half a turn, which is the most that a robot file "
+        f"has; if these are degrees, write radians",
         joint.place("limit"),
     )
-    return cut
+    return cut_rad
 
 
 def _complete_column(
-    found: Imported, number: JointNumber, joints: Sequence[UrdfJoint], built: Sequence[BuiltJoint], *, own: bool
+    imported: Imported,
+    number: JointNumber,
+    joints: Sequence[UrdfJoint],
+    joints_so_far: Sequence[BuiltJoint],
+    *,
+    is_exported: bool,
 ) -> list[float]:
-    """Return a number of every joint, tail to head. Where the file gives none, a value is assumed and reported.
+    """Return one number of every joint, tail to head. If the URDF has no value, one is assumed and reported.
 
     Args:
-        found: The import, whose report is extended.
-        number: Which number.
+        imported: The import, whose report is extended.
+        number: Which number, such as the torque limit.
         joints: The joints of the URDF.
-        built: The joints by the values so far: of the same robot if `own`, otherwise of the robot `--like`.
-        own: Whether the values so far are those of the same robot.
+        joints_so_far: The joints by the values so far: of the same robot if `is_exported`, otherwise of the robot
+            that the user named with `--like`.
+        is_exported: Whether SnakeSIM exported this URDF.
 
     Raises:
-        ConfigError: A joint has no motor, while others have one.
+        ConfigError: A limit is 0, which means that the joint has no motor, while other joints have one.
     """
-    values = [_read_number(found, number, joint) for joint in joints]
-    known = [value for value in values if value]
-    completed: list[float] = []
-    for joint, value, as_built in zip(joints, values, built, strict=True):
-        if value is not None and (value > 0 or not number.is_limit):
-            completed.append(value)
+    values = [_read_number(imported, number, joint) for joint in joints]
+    positive_values = [value for value in values if value]
+    column: list[float] = []
+    for joint, value, joint_so_far in zip(joints, values, joints_so_far, strict=True):
+        is_usable = value is not None and (value > 0 or not number.is_limit)
+        if value is not None and is_usable:
+            column.append(value)
             continue
-        if value is not None and known:
-            raise _motorless_error(number, joint, max(known))
-        assumed, origin = _assume(number, as_built, known, own=own)
-        given_text = "no value" if value is None else f"{value:g}"
-        found.assumptions.add(
-            f"<{number.tag} {number.attribute}> has {given_text}: {assumed:g} {number.unit}, {origin}",
+        if value is not None and positive_values:
+            raise _motorless_error(number, joint, max(positive_values))
+        assumed, origin = _assume(number, joint_so_far, positive_values, is_exported=is_exported)
+        value_text = "no value" if value is None else f"{value:g}"
+        imported.assumptions.add(
+            f"<{number.tag} {number.attribute}> has {value_text}: {assumed:g} {number.unit}, {origin}",
             joint.place(number.tag),
         )
-        completed.append(assumed)
-    return completed
+        column.append(assumed)
+    return column
 
 
-def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, own: bool) -> tuple[float, str]:
+def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, is_exported: bool) -> tuple[float, str]:
     """Return the value for a joint for which the file gives none, and the origin of this value."""
     section = built.limits if number.is_limit else built.motor
     default = getattr(section, number.key)
-    if own:
+    if is_exported:
         return default, f"from {number.section}.{number.key} of its <snakesim> element"
     if not number.is_limit:
         return 0.0, "the URDF default for a missing value"
@@ -183,7 +214,7 @@ def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exc
     )
 
 
-def _read_number(found: Imported, number: JointNumber, joint: UrdfJoint) -> float | None:
+def _read_number(imported: Imported, number: JointNumber, joint: UrdfJoint) -> float | None:
     """Return a number of a joint, or None if the file gives none. Raises ConfigError for one out of its range."""
     element = joint.element.first(number.tag)
     if element is None or number.attribute not in element.attributes:
@@ -196,16 +227,16 @@ def _read_number(found: Imported, number: JointNumber, joint: UrdfJoint) -> floa
             f"{number.maximum:g} {number.unit}. Is it in {number.other_unit}, or does it stand for no limit?"
         )
     if value > number.usual:
-        found.doubts.add(
+        imported.doubts.add(
             f"`{number.attribute}` = {value:g} {number.unit} is much for a snake robot; is it in {number.other_unit}?",
             joint.place(number.tag),
         )
     return value
 
 
-def _put_common_range(found: Imported, ranges: list[AngleRange], source: str) -> None:
+def _put_common_range(imported: Imported, ranges: list[AngleRange], source: str) -> None:
     """Put the most common range: `angle_rad`, and the other side if the range is not symmetric."""
-    table = found.table
+    table = imported.table
     common = Counter(ranges).most_common(1)[0][0]
     limits = table.values.get("limits", {})
     for side in ("angle_min_rad", "angle_max_rad"):
@@ -218,30 +249,35 @@ def _put_common_range(found: Imported, ranges: list[AngleRange], source: str) ->
 
 
 def _put_exceptions(
-    found: Imported, joints: list[UrdfJoint], ranges: list[AngleRange], columns: dict[str, list[float]], source: str
+    imported: Imported,
+    joints: list[UrdfJoint],
+    ranges: list[AngleRange],
+    columns: dict[str, list[float]],
+    source: str,
 ) -> None:
-    """Put what differs in one joint from the sections for all joints.
+    """Put the numbers in which a joint differs from the sections for all joints into a section of its own.
 
     Args:
-        found: The import, whose values and report are extended.
+        imported: The import, whose values and report are extended.
         joints: The joints of the URDF, tail to head.
-        ranges: Their ranges.
+        ranges: Their angle ranges.
         columns: Their other numbers, by the key of the robot file.
-        source: The file, for error messages.
+        source: Path of the URDF, for error messages.
     """
-    differences: dict[str, list[str]] = {}
-    for i, built in enumerate(decode(found.table, RobotFile).joint_table):
-        compared = [
-            ("angle_min_rad", ranges[i].lower_rad, built.limits.lower_rad, "rad"),
-            ("angle_max_rad", ranges[i].upper_rad, built.limits.upper_rad, "rad"),
+    differences: dict[str, list[str]] = {}  # by key, one text for each joint that differs
+    for i, common in enumerate(decode(imported.table, RobotFile).joint_table):
+        compared = [  # key, value in the URDF, value in the sections, unit
+            ("angle_min_rad", ranges[i].lower_rad, common.limits.lower_rad, "rad"),
+            ("angle_max_rad", ranges[i].upper_rad, common.limits.upper_rad, "rad"),
         ]
         for number in NUMBERS:
-            section = built.limits if number.is_limit else built.motor
+            section = common.limits if number.is_limit else common.motor
             compared.append((number.key, columns[number.key][i], getattr(section, number.key), number.unit))
         for key, in_urdf, in_sections, unit in compared:
             if in_urdf == in_sections:
                 continue
-            found.table.set_value(f"joints.{built.name}.{key}", in_urdf, source)
-            differences.setdefault(key, []).append(f"{built.name} ({joints[i].name}) {in_urdf:g} {unit}")
-    for key, values in differences.items():
-        found.changes.add(f"{key} differs from that of the others: {', '.join(values)}")
+            imported.table.set_value(f"joints.{common.name}.{key}", in_urdf, source)
+            text = f"{common.name} ({joints[i].name}) {in_urdf:g} {unit}"
+            differences.setdefault(key, []).append(text)
+    for key, texts in differences.items():
+        imported.changes.add(f"{key} differs from that of the others: {', '.join(texts)}")

@@ -26,23 +26,31 @@ def _is_look(part: Unused) -> bool:
 
 
 def _report(omissions: Notes, unused: list[Unused]) -> None:
-    """Add a note for each kind of element, then one for each kind of value, with their lines in the file."""
-    elements: dict[str, list[int]] = {}
-    values: dict[str, dict[str, list[int]]] = {}
+    """Add a note for each kind of unused element, then one for each kind of unused value, with their line numbers.
+
+    Args:
+        omissions: The notes, which are extended.
+        unused: Elements, attributes and texts that the import did not read.
+    """
+    element_lines: dict[str, list[int]] = {}  # by path of the element
+    value_lines: dict[str, dict[str, list[int]]] = {}  # by path of the attribute or text, then by its value
     for part in unused:
         if part.outermost and part.path != part.outermost:
-            lines = elements.setdefault(part.outermost, [])
+            lines = element_lines.setdefault(part.outermost, [])
             if part.outermost_line not in lines:
                 lines.append(part.outermost_line)
         if part.value is None:
-            elements.setdefault(part.path, []).append(part.line)
+            element_lines.setdefault(part.path, []).append(part.line)
         else:
-            values.setdefault(part.path, {}).setdefault(part.value, []).append(part.line)
-    for path, lines in elements.items():
+            lines_of_values = value_lines.setdefault(part.path, {})
+            lines_of_values.setdefault(part.value, []).append(part.line)
+    for path, lines in element_lines.items():
         omissions.add(f"{shorten(path)} left out: {_join_lines(lines)}")
-    for path, found in values.items():
-        shown = [f"{shorten(value, MAX_VALUE)!r} ({_join_lines(lines)})" for value, lines in found.items()]
-        omissions.add(f"{shorten(path)} left out: {', '.join(shown)}")
+    for path, lines_of_values in value_lines.items():
+        texts: list[str] = []
+        for value, lines in lines_of_values.items():
+            texts.append(f"{shorten(value, MAX_VALUE)!r} ({_join_lines(lines)})")
+        omissions.add(f"{shorten(path)} left out: {', '.join(texts)}")
 
 
 def _join_lines(lines: list[int]) -> str:

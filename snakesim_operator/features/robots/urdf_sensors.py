@@ -26,11 +26,11 @@ POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms
 DEFAULT_RATE_HZ = {"imu": 100.0, "contacts": 100.0, "depth": 20.0, "range": 20.0}  # as in snakesim_hal.model.sensors
 
 
-def put_sensors(found: Imported, urdf: Element, row: Row, frames: list[Floats], scale: float) -> None:
+def put_sensors(imported: Imported, urdf: Element, row: Row, frames: list[Floats], scale: float) -> None:
     """Put the sensors of a URDF into the values of a robot file.
 
     Args:
-        found: The import, whose values and report are extended.
+        imported: The import, whose values and report are extended.
         urdf: The root element of the URDF.
         row: Bodies and joints of the URDF, tail to head.
         frames: link_from_root, (4, 4) with lengths in m, of every link.
@@ -46,21 +46,21 @@ def put_sensors(found: Imported, urdf: Element, row: Row, frames: list[Floats], 
             kind = sensor.attributes.get("type", "")
             if kind in ON_EVERY_LINK:
                 gazebo.optional("reference")
-                _put_on_every_link(found, sensor, ON_EVERY_LINK[kind], reference)
+                _put_on_every_link(imported, sensor, ON_EVERY_LINK[kind], reference)
             elif kind in (*DEPTH_TYPES, *RANGE_TYPES) and reference in link_indices:
                 gazebo.optional("reference")
                 link = link_indices[reference]
                 root_from_reference = _scale_lengths(row.bodies[link].frames[reference], scale)
                 link_from_reference = frames[link] @ root_from_reference
-                _put_on_one_link(found, sensor, link, link_from_reference, scale)
+                _put_on_one_link(imported, sensor, link, link_from_reference, scale)
             else:
                 sensor.read = False
-                _report_other_sensor(found, gazebo, sensor, kind, reference)
+                _report_other_sensor(imported, gazebo, sensor, kind, reference)
 
 
-def _report_other_sensor(found: Imported, gazebo: Element, sensor: Element, kind: str, reference: str) -> None:
+def _report_other_sensor(imported: Imported, gazebo: Element, sensor: Element, kind: str, reference: str) -> None:
     known = ", ".join((*ON_EVERY_LINK, *DEPTH_TYPES, *RANGE_TYPES))
-    found.omissions.add(
+    imported.omissions.add(
         f"a sensor whose `type` is {shorten(kind)!r}, in an element whose `reference` is "
         f"{shorten(reference)!r}, left out: a robot file has {known}, on a link",
         f"line {sensor.line}",
@@ -68,40 +68,40 @@ def _report_other_sensor(found: Imported, gazebo: Element, sensor: Element, kind
     )
 
 
-def _put_on_every_link(found: Imported, sensor: Element, section: str, reference: str) -> None:
+def _put_on_every_link(imported: Imported, sensor: Element, section: str, reference: str) -> None:
     """Put an IMU or a contact sensor."""
     sensor.optional("type")
     name = sensor.optional("name") or ""
-    found.changes.add(
+    imported.changes.add(
         f"sensor {shorten(name)!r} of link {shorten(reference)!r}: in a robot file [sensors.{section}] is on "
         "every link, "
         f"and has no name",
         sensor.place,
     )
-    rate = _read_rate(found, sensor, section)
-    existing = found.table.values.get("sensors", {}).get(section) or {}
-    found.table.set_value(f"sensors.{section}", existing | rate, sensor.source)
+    rate = _read_rate(imported, sensor, section)
+    existing = imported.table.values.get("sensors", {}).get(section) or {}
+    imported.table.set_value(f"sensors.{section}", existing | rate, sensor.source)
 
 
-def _put_on_one_link(found: Imported, sensor: Element, link: int, link_from_reference: Floats, scale: float) -> None:
+def _put_on_one_link(imported: Imported, sensor: Element, link: int, link_from_reference: Floats, scale: float) -> None:
     """Put a camera or a lidar at its place on a link."""
     kind = sensor.get("type")
     section = "depth" if kind in DEPTH_TYPES else "range"
     name = sensor.get("name", "sensor")
-    values: dict[str, Any] = _read_rate(found, sensor, section)
-    values["name"] = found.plain_name(name, "sensor", sensor)
+    values: dict[str, Any] = _read_rate(imported, sensor, section)
+    values["name"] = imported.plain_name(name, "sensor", sensor)
     values["link"] = link
     reference_from_sensor = _scale_lengths(_read_pose(sensor), scale)
-    values |= _convert_pose(found, link_from_reference @ reference_from_sensor, sensor)
+    values |= _convert_pose(imported, link_from_reference @ reference_from_sensor, sensor)
     if section == "depth":
-        values |= _read_camera(found, sensor)
+        values |= _read_camera(imported, sensor)
     else:
-        values |= _read_lidar(found, sensor, values["yaw_rad"])
-    existing = found.table.values.get("sensors", {}).get(section, [])
-    found.table.set_value(f"sensors.{section}", [*existing, values], sensor.source)
+        values |= _read_lidar(imported, sensor, values["yaw_rad"])
+    existing = imported.table.values.get("sensors", {}).get(section, [])
+    imported.table.set_value(f"sensors.{section}", [*existing, values], sensor.source)
 
 
-def _read_rate(found: Imported, sensor: Element, section: str) -> dict[str, Any]:
+def _read_rate(imported: Imported, sensor: Element, section: str) -> dict[str, Any]:
     """Return `rate_hz` of a sensor; nothing if the file gives none or 0. Then the robot file's rate is reported."""
     element = sensor.first("update_rate")
     rate_hz = 0.0 if element is None else element.text_numbers(1)[0]
@@ -109,13 +109,13 @@ def _read_rate(found: Imported, sensor: Element, section: str) -> dict[str, Any]
         raise sensor.error(f"has <update_rate> {rate_hz:g} Hz; expected a number above 0")
     if rate_hz > 0:
         return {"rate_hz": rate_hz}
-    existing = found.table.values.get("sensors", {}).get(section)
+    existing = imported.table.values.get("sensors", {}).get(section)
     existing_hz = existing.get("rate_hz") if isinstance(existing, dict) else None
     assumed_hz = DEFAULT_RATE_HZ[section] if existing_hz is None else existing_hz
     if element is None:
-        found.assumptions.add(f"<sensor><update_rate> has no value: {assumed_hz:g} Hz", f"line {sensor.line}")
+        imported.assumptions.add(f"<sensor><update_rate> has no value: {assumed_hz:g} Hz", f"line {sensor.line}")
     else:
-        found.assumptions.add(f"<sensor><update_rate> has 0: {assumed_hz:g} Hz", f"line {element.line}")
+        imported.assumptions.add(f"<sensor><update_rate> has 0: {assumed_hz:g} Hz", f"line {element.line}")
     return {}
 
 
@@ -139,13 +139,13 @@ def _scale_lengths(frame: Floats, scale: float) -> Floats:
     return scaled
 
 
-def _convert_pose(found: Imported, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
+def _convert_pose(imported: Imported, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
     """Return a pose, (4, 4), as position, yaw and pitch. A roll is reported, because a robot file has none."""
     matrix = link_from_sensor[:3, :3]
     roll_rad = math.atan2(matrix[2, 1], matrix[2, 2])
     if abs(roll_rad) > MAX_ROLL_RAD:
         name = sensor.attributes.get("name", "")
-        found.omissions.add(
+        imported.omissions.add(
             f"sensor {shorten(name)!r} is rolled by {roll_rad:.2f} rad about its viewing direction; a robot "
             "file has no "
             f"roll",
@@ -162,7 +162,7 @@ def _convert_pose(found: Imported, link_from_sensor: Floats, sensor: Element) ->
     }
 
 
-def _read_camera(found: Imported, sensor: Element) -> dict[str, Any]:
+def _read_camera(imported: Imported, sensor: Element) -> dict[str, Any]:
     """Return color, field of view, size, range and noise of a depth camera."""
     values: dict[str, Any] = {"color": sensor.attributes["type"] == "rgbd_camera"}
     camera = sensor.first("camera")
@@ -177,11 +177,11 @@ def _read_camera(found: Imported, sensor: Element) -> dict[str, Any]:
         values["width"] = _read_whole_number(image, "width", 160)
         values["height"] = _read_whole_number(image, "height", 120)
     values |= _read_range(camera, "clip", "near", "far", "0.1 to 5 m")
-    values |= _read_noise(found, camera)
+    values |= _read_noise(imported, camera)
     return values
 
 
-def _read_lidar(found: Imported, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_lidar(imported: Imported, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
     """Return beams, field of view, range and noise of a lidar.
 
     A robot file's scan is symmetric about the viewing direction, so another scan also changes the sensor's yaw.
@@ -196,13 +196,13 @@ def _read_lidar(found: Imported, sensor: Element, mounted_yaw_rad: float) -> dic
     if horizontal is None:
         lidar.note_absent("<scan><horizontal>", "one beam")
     else:
-        values |= _read_scan(found, horizontal, mounted_yaw_rad)
+        values |= _read_scan(imported, horizontal, mounted_yaw_rad)
     values |= _read_range(lidar, "range", "min", "max", "0.02 to 5 m")
-    values |= _read_noise(found, lidar)
+    values |= _read_noise(imported, lidar)
     return values
 
 
-def _read_scan(found: Imported, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_scan(imported: Imported, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
     """Return beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric."""
     beams = _read_whole_number(horizontal, "samples", 1)
     first_rad = horizontal.text_number("min_angle", 0.0)
@@ -211,13 +211,13 @@ def _read_scan(found: Imported, horizontal: Element, mounted_yaw_rad: float) -> 
     values: dict[str, Any] = {"beams": beams, "fov_rad": last_rad - first_rad if beams > 1 else 0.0}
     if abs(middle_rad) > 1e-9:
         values["yaw_rad"] = round(mounted_yaw_rad + middle_rad, POSE_DIGITS)
-        found.changes.add(
+        imported.changes.add(
             f"<min_angle> {first_rad:g} and <max_angle> {last_rad:g} rad are not symmetric: the sensor is turned "
             f"by {middle_rad:g} rad",
             f"line {horizontal.line}",
         )
     if beams == 1 and last_rad != first_rad:
-        found.changes.add(
+        imported.changes.add(
             f"<samples> 1 from {first_rad:g} to {last_rad:g} rad: one beam in the middle", f"line {horizontal.line}"
         )
     return values
@@ -240,7 +240,7 @@ def _read_range(owner: Element, tag: str, min_tag: str, max_tag: str, default: s
     return {"range_min_m": element.text_number(min_tag, 0.1), "range_max_m": element.text_number(max_tag, 5.0)}
 
 
-def _read_noise(found: Imported, element: Element) -> dict[str, Any]:
+def _read_noise(imported: Imported, element: Element) -> dict[str, Any]:
     """Return the standard deviation of a sensor's noise in m."""
     noise = element.first("noise")
     if noise is None:
@@ -257,7 +257,7 @@ def _read_noise(found: Imported, element: Element) -> dict[str, Any]:
         kind = (type_attribute or "").strip()
         line = noise.line
     if kind != "gaussian":
-        found.changes.add(f"<noise><type> {shorten(kind)!r} became gaussian, the one that there is", f"line {line}")
+        imported.changes.add(f"<noise><type> {shorten(kind)!r} became gaussian, the one that there is", f"line {line}")
     return {"noise_m": noise.text_number("stddev", 0.0)}
 
 

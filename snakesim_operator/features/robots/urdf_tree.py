@@ -112,11 +112,11 @@ class _Tree:
     connections: list[_Connection] = field(default_factory=list[_Connection])
 
 
-def read_row(found: Imported, urdf: Element, file: Path, *, tail: str | None) -> Row:
+def read_row(imported: Imported, urdf: Element, file: Path, *, tail: str | None) -> Row:
     """Read bodies and joints, and order them from tail to head.
 
     Args:
-        found: The import, whose report is extended.
+        imported: The import, whose report is extended.
         urdf: The root element of the URDF.
         file: Path of the URDF, from which its mesh files are looked for.
         tail: A link at the tail; None takes the root link.
@@ -126,7 +126,7 @@ def read_row(found: Imported, urdf: Element, file: Path, *, tail: str | None) ->
     """
     links = _elements_by_name(urdf, "link")
     joints = _elements_by_name(urdf, "joint")
-    tree = _walk_tree(found, urdf, links, joints)
+    tree = _walk_tree(imported, urdf, links, joints)
     bodies: dict[str, Body] = {}
     for name, element in links.items():
         frame = tree.frames[name]
@@ -134,8 +134,8 @@ def read_row(found: Imported, urdf: Element, file: Path, *, tail: str | None) ->
         body.links.append(name)
         body.places.append(element.place)
         body.frames[name] = frame
-        _add_mass(found, body, element, frame)
-        _add_shapes(found, body, element, frame, file)
+        _add_mass(imported, body, element, frame)
+        _add_shapes(imported, body, element, frame, file)
     return _order_bodies(bodies, tree, tail, urdf)
 
 
@@ -183,9 +183,19 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return about_z @ about_y @ about_x
 
 
-def _walk_tree(found: Imported, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
-    """Follow the joints from the root link to every other link. Raises ConfigError for what is no tree."""
-    parent_of: dict[str, str] = {}
+def _walk_tree(imported: Imported, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
+    """Follow the joints from the root link to every other link, and return the frames and joints on the way.
+
+    Args:
+        imported: The import, whose report is extended.
+        urdf: The root element of the URDF.
+        links: <link> elements by name.
+        joints: <joint> elements by name.
+
+    Raises:
+        ConfigError: The links are no tree, or a joint has a type that no snake has.
+    """
+    parent_of: dict[str, str] = {}  # child link -> parent link
     joints_below: dict[str, list[tuple[str, Element]]] = {}  # parent link -> child links with their joints
     for joint in joints.values():
         parent = _read_end(joint, "parent", links)
@@ -196,16 +206,17 @@ def _walk_tree(found: Imported, urdf: Element, links: dict[str, Element], joints
         joints_below.setdefault(parent, []).append((child, joint))
     root = _find_root(urdf, links, parent_of)
     tree = _Tree(frames={root: np.eye(4)}, body_of={root: root})
-    waiting = [root]
-    while waiting:
-        parent = waiting.pop()
-        for child, element in joints_below.get(parent, []):
-            alone_at_root = parent == root and len(joints_below[parent]) == 1
-            _add_joint(found, tree, element, parent, child, alone_at_root=alone_at_root)
-            waiting.append(child)
-    if len(tree.frames) != len(links):
-        circle = sorted(links.keys() - tree.frames.keys())
-        raise urdf.error(f"has joints in a circle: {', '.join(circle[:8])}")
+    unvisited = [root]
+    while unvisited:
+        parent = unvisited.pop()
+        children = joints_below.get(parent, [])
+        alone_at_root = parent == root and len(children) == 1
+        for child, element in children:
+            _add_joint(imported, tree, element, parent, child, alone_at_root=alone_at_root)
+            unvisited.append(child)
+    unreached = sorted(links.keys() - tree.frames.keys())
+    if unreached:
+        raise urdf.error(f"has joints in a circle: {', '.join(unreached[:8])}")
     return tree
 
 
@@ -227,11 +238,13 @@ def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
     return name
 
 
-def _add_joint(found: Imported, tree: _Tree, element: Element, parent: str, child: str, *, alone_at_root: bool) -> None:
+def _add_joint(
+    imported: Imported, tree: _Tree, element: Element, parent: str, child: str, *, alone_at_root: bool
+) -> None:
     """Place the link behind a joint, and keep the joint if it turns. Raises ConfigError for one that slides."""
     kind = element.get("type")
     if kind in ("floating", "planar") and alone_at_root:
-        found.omissions.add(
+        imported.omissions.add(
             f"joint {shorten(element.get('name'))!r} ({kind}) left out: the base is always free to move", element.place
         )
         tree.frames[child] = np.eye(4)
@@ -241,26 +254,26 @@ def _add_joint(found: Imported, tree: _Tree, element: Element, parent: str, chil
     tree.frames[child] = frame
     if kind in ROTARY:
         tree.body_of[child] = child
-        tree.connections.append(_Connection(parent, child, _read_joint(found, element, frame)))
+        tree.connections.append(_Connection(parent, child, _read_joint(imported, element, frame)))
     elif kind == "fixed":
         tree.body_of[child] = tree.body_of[parent]
-        found.changes.add("fixed joints: the links on both sides became one", element.place)
+        imported.changes.add("fixed joints: the links on both sides became one", element.place)
     else:
         raise element.error(f"has the type {shorten(kind)!r}; a snake's joints are revolute, continuous or fixed")
 
 
-def _read_joint(found: Imported, element: Element, frame: Floats) -> UrdfJoint:
+def _read_joint(imported: Imported, element: Element, frame: Floats) -> UrdfJoint:
     """Read a rotary joint. Raises ConfigError for one that mimics another, and for an axis without direction.
 
     frame: root_from_joint, (4, 4).
     """
     if element.first("mimic") is not None:
         raise element.error("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
-    axis = _read_axis(found, element)
+    axis = _read_axis(imported, element)
     return UrdfJoint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis)
 
 
-def _read_axis(found: Imported, joint: Element) -> Floats:
+def _read_axis(imported: Imported, joint: Element) -> Floats:
     """Return the axis of a joint in the joint's frame, (3,), as a vector of length 1."""
     axis_element = joint.first("axis")
     if axis_element is None:
@@ -274,18 +287,18 @@ def _read_axis(found: Imported, joint: Element) -> Floats:
             f"a vector of length 1"
         )
     if abs(length - 1.0) > 1e-3:
-        found.changes.add(
+        imported.changes.add(
             f"<axis xyz> {axis_element.get('xyz')!r} has the length {length:.4g}; only its direction counts",
             f"{shorten(joint.get('name'))} (line {axis_element.line})",
         )
     return axis / length
 
 
-def _add_mass(found: Imported, body: Body, link: Element, frame: Floats) -> None:
+def _add_mass(imported: Imported, body: Body, link: Element, frame: Floats) -> None:
     """Add mass and inertia of a link to its body. Raises ConfigError for a mass that is negative or too large."""
     inertial = link.first("inertial")
     if inertial is None:
-        found.assumptions.add("<link> without <inertial>: 0 kg", link.place)
+        imported.assumptions.add("<link> without <inertial>: 0 kg", link.place)
         return
     mass = inertial.first("mass")
     moments = inertial.first("inertia")
@@ -312,25 +325,35 @@ def _read_moment(moments: Element, name: str) -> float:
     return value
 
 
-def _add_shapes(found: Imported, body: Body, link: Element, frame: Floats, file: Path) -> None:
-    """Add the outline of a link to its body: that of <collision>, or else that of <visual>."""
+def _add_shapes(imported: Imported, body: Body, link: Element, frame: Floats, file: Path) -> None:
+    """Add the outline of a link to its body: that of <collision> or, without one, that of <visual>.
+
+    Args:
+        imported: The import, whose report is extended.
+        body: The body, whose points and shapes are extended.
+        link: The <link> element.
+        frame: root_from_link, (4, 4), in the file's unit of length.
+        file: Path of the URDF, from which its mesh files are looked for.
+    """
     collisions = link.all("collision")
     visuals = [child for child in link.children if child.tag == "visual"]
     if collisions:
         _mark_repeated(visuals, collisions)
     elif visuals:
-        link.all("visual")
-        found.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
+        link.all("visual")  # marks them as read
+        imported.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
     for element in collisions or visuals:
         geometry = element.first("geometry")
         if geometry is None or not geometry.children:
             raise element.error("has no shape in <geometry>")
         shape = geometry.children[0]
         shape.read = True
-        points = sample_outline(read_shape(shape), shape, file, found.omissions)
+        points = sample_outline(read_shape(shape), shape, file, imported.omissions)
         root_from_shape = frame @ transform(element)
         if points is not None:
-            body.points.append(points @ root_from_shape[:3, :3].T + root_from_shape[:3, 3])
+            rotation = root_from_shape[:3, :3]
+            position = root_from_shape[:3, 3]
+            body.points.append(points @ rotation.T + position)
             body.shapes.append(shape)
 
 
@@ -357,7 +380,17 @@ def _have_same_shape(visual: Element, collision: Element) -> bool:
 
 
 def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> Row:
-    """Order the bodies from the tail on. Raises ConfigError for what is no chain."""
+    """Return bodies and joints in their order from tail to head.
+
+    Args:
+        bodies: By the name of their first link. A body is all links that fixed joints connect.
+        tree: Which joints connect which bodies.
+        tail: A link of the body at the tail; None takes the body of the root link.
+        urdf: The root element of the URDF, for error messages.
+
+    Raises:
+        ConfigError: The bodies are no chain, or the tail is not at one of its ends.
+    """
     if tail is not None and tail not in tree.body_of:
         raise ConfigError(
             f"--tail {shorten(tail)}: there is no such link; there are {', '.join(list(tree.body_of)[:8])}",
@@ -376,15 +409,26 @@ def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: 
         raise urdf.error(
             f"has the link {shorten(tail or first)!r} amid the chain; choose which end is the tail: {choices}"
         )
-    order = [first]
+    return _follow_chain(bodies, neighbors, first)
+
+
+def _follow_chain(bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first: str) -> Row:
+    """Return bodies and joints in their order from one end of a chain.
+
+    Args:
+        bodies: By name.
+        neighbors: For each body, the names of its one or two neighbors with the joints between them.
+        first: Name of the body at the end to begin with.
+    """
+    names = [first]
     joints: list[UrdfJoint] = []
     while True:
-        passed = order[-2:]
-        ahead = [(name, joint) for name, joint in neighbors[order[-1]] if name not in passed]
+        visited = names[-2:]
+        ahead = [(name, joint) for name, joint in neighbors[names[-1]] if name not in visited]
         if not ahead:
-            return Row([bodies[name] for name in order], joints)
+            return Row([bodies[name] for name in names], joints)
         name, joint = ahead[0]
-        order.append(name)
+        names.append(name)
         joints.append(joint)
 
 

@@ -162,7 +162,11 @@ def _find_type(value: Any) -> int:
 
 
 def _encode_value(value: Any) -> Any:
-    """Return a value as rcl_interfaces/ParameterValue. A value without a type in ROS becomes a text of JSON."""
+    """Return the value of a controller parameter as an rcl_interfaces/ParameterValue.
+
+    The message has one field for each type, and the number of the type whose field is valid. A value whose type ROS
+    does not have becomes a text of JSON.
+    """
     kind = _find_type(value)
     fields: dict[int, Any] = {BOOL: False, INTEGER: 0, DOUBLE: 0.0, STRING: "", DOUBLES: [], STRINGS: []}
     if kind == STRING:
@@ -171,6 +175,9 @@ def _encode_value(value: Any) -> Any:
         fields[STRINGS] = [format_value(element) for element in value]
     elif kind != NOT_SET:
         fields[kind] = value
+    no_bytes = np.array([], dtype=np.uint8)
+    no_booleans = np.array([], dtype=np.bool_)
+    no_integers = np.array([], dtype=np.int64)
     return make_message(
         "rcl_interfaces/msg/ParameterValue",
         kind,
@@ -178,9 +185,9 @@ def _encode_value(value: Any) -> Any:
         fields[INTEGER],
         fields[DOUBLE],
         fields[STRING],
-        np.array([], dtype=np.uint8),  # byte array
-        np.array([], dtype=np.bool_),
-        np.array([], dtype=np.int64),
+        no_bytes,
+        no_booleans,
+        no_integers,
         np.array(fields[DOUBLES], dtype=np.float64),
         fields[STRINGS],
     )

@@ -84,6 +84,7 @@ def make_obstacle_markers(world: World) -> list[Marker]:
 
 
 def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
+    """Return a marker with the shape of an obstacle. Its color shows contact, and its opacity the confidence."""
     diameter_m = 2 * obstacle.radius_m
     match obstacle.shape:
         case "cylinder":
@@ -98,9 +99,7 @@ def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
             size_m = (2 * half_x_m, 2 * half_y_m, 2 * half_z_m)
     half_yaw_rad = obstacle.yaw_rad / 2
     orientation_wxyz = (float(np.cos(half_yaw_rad)), 0.0, 0.0, float(np.sin(half_yaw_rad)))
-    color = SEEN_COLOR
-    if obstacle.touched:
-        color = TOUCHED_COLOR
+    color = TOUCHED_COLOR if obstacle.touched else SEEN_COLOR
     red, green, blue, _ = color
     opacity = MIN_OPACITY + OPACITY_RANGE * obstacle.confidence
     rgba = (red, green, blue, opacity)

@@ -106,21 +106,27 @@ class Teleop:
         self._stopping: Future[str] | None = None
 
     def run(self) -> int:
-        """Run the loop. Returns 0 when the operator ended it, 1 when the terminal or the joystick is gone."""
+        """Read the operator's input and send intents, once every PERIOD_S, until there is a reason to end.
+
+        Returns:
+            0 if the operator ended it, 1 if the terminal or the joystick is gone.
+        """
         on_stop_signal(lambda: self._end("interrupted"))
         signal.signal(signal.SIGHUP, lambda *_: self._end("the terminal was closed"))
         lines_on_screen = 0
-        period = 0
+        cycle = 0
         while not self._end_reason:
-            began_s = time.monotonic()
+            cycle_start_s = time.monotonic()
             self._read_operator()
             self._read_robot()
             if not self._end_reason:
                 self._send_intent()
-            if period % SHOWN_EVERY == 0 and sys.stdout.isatty():
+            is_screen_due = cycle % SHOWN_EVERY == 0
+            if is_screen_due and sys.stdout.isatty():
                 lines_on_screen = overwrite_lines(self._screen_lines(), lines_on_screen)
-            period += 1
-            time.sleep(max(PERIOD_S - (time.monotonic() - began_s), 0.0))
+            cycle += 1
+            elapsed_s = time.monotonic() - cycle_start_s
+            time.sleep(max(PERIOD_S - elapsed_s, 0.0))
         self._finish()
         with contextlib.suppress(OSError):  # the terminal may be gone
             print_line(f"teleop ended: {self._end_reason}; {self._link.namespace} gets no more requests")

@@ -68,7 +68,16 @@ class Joystick:
         self.moved_s = -math.inf  # monotonic time at which the kernel received the newest event
 
     def read_events(self, wait_s: float) -> bool:
-        """Read events, and wait for them up to a time. Returns whether a button was pressed."""
+        """Read all events that have arrived, and update the position of the stick.
+
+        If the joystick is unplugged, `lost` becomes true and the stick counts as released.
+
+        Args:
+            wait_s: Maximum time to wait for the first event.
+
+        Returns:
+            Whether a button was pressed.
+        """
         ready, _, _ = select.select([self.handle], [], [], wait_s)
         if not ready:
             return False
@@ -82,19 +91,19 @@ class Joystick:
             self.lost = True
             self._release()
             return False
-        whole_bytes = len(data) // EVENT.size * EVENT.size
-        pressed = False
-        for seconds, microseconds, kind, code, value in EVENT.iter_unpack(data[:whole_bytes]):
+        event_count = len(data) // EVENT.size  # an incomplete event at the end is dropped
+        button_pressed = False
+        for seconds, microseconds, kind, code, value in EVENT.iter_unpack(data[: event_count * EVENT.size]):
             self.moved_s = seconds + 1e-6 * microseconds
             if kind == EV_ABS and code == ABS_X:
                 self.right = self._x.normalize(value)
             elif kind == EV_ABS and code == ABS_Y:
                 self.forward = -self._y.normalize(value)  # away from the operator is negative
             elif kind == EV_SYN and code == SYN_DROPPED:
-                self._release()  # until the stick is moved again
+                self._release()  # the kernel lost events; the stick counts again once it is moved
             elif kind == EV_KEY and code in BUTTONS and value == 1:
-                pressed = True
-        return pressed
+                button_pressed = True
+        return button_pressed
 
     def _release(self) -> None:
         """Count the stick as released."""

@@ -55,8 +55,6 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
 FORKS = {
-    "benchmarks/environments.py",
-    "snakesim/environments/vector.py",
     "snakesim_operator/run/guarded_process.py",
 }  # copies of a process, which import nothing
 

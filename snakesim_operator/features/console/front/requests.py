@@ -46,29 +46,39 @@ async def read_head(reader: asyncio.StreamReader, limit_s: float) -> bytes:
 
 
 def check_head(head: bytes, token: str) -> FrontRequest | BadRequest:
-    """Check origin and token of a request.
+    """Check origin and token of an HTTP request, and remove the token from its path.
 
     Pages of other origins do not know the token. They are refused by their origin all the same, so that a token which
     became known, from a picture of a screen for example, does not help them.
+
+    Args:
+        head: The request line and the headers, with the empty line behind them.
+        token: The token of this console, which is the first part of the path.
+
+    Returns:
+        The request for the page server, or why it is refused.
     """
-    first_line, _, header_lines = head.removesuffix(END_OF_HEAD).partition(b"\r\n")
-    parts = first_line.decode("latin-1").split(" ")
+    head_lines = head.removesuffix(END_OF_HEAD)
+    request_line, _, header_lines = head_lines.partition(b"\r\n")
+    parts = request_line.decode("latin-1").split(" ")
     if len(parts) != 3:
         return BadRequest(400, "no HTTP", "the first line of the request is not one of HTTP")
-    refusal = explain_head_refusal(head.removesuffix(END_OF_HEAD))
+    refusal = explain_head_refusal(head_lines)
     if refusal is not None:
         return BadRequest(403, "another origin", refusal)
     method, target, version = parts
-    _, _, after_slash = target.partition("/")
-    end_of_token = min((after_slash + "/").index("/"), (after_slash + "?").index("?"))
-    given_token = after_slash[:end_of_token]
-    if not secrets.compare_digest(given_token.encode(), token.encode()):
+    _, _, token_and_rest = target.partition("/")
+    # The token ends at a slash, at a question mark, or at the end.
+    token_length = min((token_and_rest + "/").index("/"), (token_and_rest + "?").index("?"))
+    requested_token = token_and_rest[:token_length]
+    if not secrets.compare_digest(requested_token.encode(), token.encode()):
         return BadRequest(403, "wrong token", WRONG_TOKEN)
-    rest = after_slash[end_of_token:]
-    stripped_target = rest if rest.startswith("/") else f"/{rest}"
+    rest = token_and_rest[token_length:]
+    target_without_token = rest if rest.startswith("/") else f"/{rest}"
+    new_request_line = f"{method} {target_without_token} {version}".encode("latin-1")
     return FrontRequest(
         method=method,
         path=rest.partition("?")[0],
-        head=b"\r\n".join((f"{method} {stripped_target} {version}".encode("latin-1"), header_lines)) + END_OF_HEAD,
+        head=b"\r\n".join((new_request_line, header_lines)) + END_OF_HEAD,
         is_websocket=b"\r\nupgrade:" in head.lower(),
     )

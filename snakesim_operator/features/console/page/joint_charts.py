@@ -158,15 +158,24 @@ def _fixed_scale(limits: Floats) -> dict[str, Any]:
 def add_history_chart(
     gui: viser.GuiApi, names: Sequence[str], title: str, scale: dict[str, Any] | None = None, **options: Any
 ) -> viser.GuiUplotHandle:
-    """Add a chart over time with an empty line for each name. scale: of the values; None adapts it to them."""
+    """Add a chart over time in seconds, with an empty line for each name.
+
+    Args:
+        gui: The page.
+        names: Names of the lines, in the order of their colors.
+        title: Title of the chart.
+        scale: Scale of the values as uPlot has it; None adapts it to the values.
+        **options: Further options of `add_uplot`.
+    """
     colors = joint_colors(len(names), dark=True).values()
     lines = [chart_line(name, color) for name, color in zip(names, colors, strict=True)]
+    no_times = np.zeros(1)
     no_values = [np.full(1, np.nan)] * len(names)
     scales: dict[str, Any] = {"x": {"time": False}}
     if scale is not None:
         scales["y"] = scale
     return gui.add_uplot(
-        (np.zeros(1), *no_values),
+        (no_times, *no_values),
         ({"label": "s"}, *lines),
         title=title,
         height=CHART_HEIGHT_PX,

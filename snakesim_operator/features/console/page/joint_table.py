@@ -22,15 +22,15 @@ def commissioning_html(
     """Return the table of joints as HTML.
 
     Args:
-        snapshot: The robot now.
+        snapshot: The newest snapshot of the robot.
         config: Configuration with which the host was started; None: not known.
         moved_ranges: The range in which each joint was moved by hand so far, tail to head; empty: not measured.
     """
     rows: list[str] = []
     for joint_index in range(len(snapshot.robot.joints)):
-        built = None if config is None else config.robot.joint_table[joint_index]
+        configured_joint = None if config is None else config.robot.joint_table[joint_index]
         moved_range = moved_ranges[joint_index] if moved_ranges else None
-        rows.append(_row_html(snapshot, joint_index, built, moved_range))
+        rows.append(_row_html(snapshot, joint_index, configured_joint, moved_range))
     head = "".join(f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS)
     return (
         f"<div style='padding:0 .6em .4em;font-size:.85em'>{_check_html(snapshot, config)}"
@@ -58,24 +58,32 @@ def _check_html(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     return f"<div>{escape_text(text)}</div>"
 
 
-def _row_html(snapshot: RobotSnapshot, joint_index: int, built: Joint | None, moved_range: AngleRange | None) -> str:
-    """Return two rows for a joint: its numbers, and its drive below them."""
-    described = snapshot.robot.joints[joint_index]
-    numbers = (
-        _format_angle(snapshot, joint_index),
-        f"{described.angle_min_rad:+.2f} to {described.angle_max_rad:+.2f}",
-        "?" if built is None else f"{built.drive.sign:+d}",
-        "?" if built is None else f"{built.drive.zero_rad:+.4f}",
-    )
-    cells = "".join(f"<td style='padding-right:.8em'>{number}</td>" for number in numbers)
-    name = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{escape_text(described.name)}</td>"
-    drive = escape_text(_describe_drive(described, built))
+def _row_html(
+    snapshot: RobotSnapshot, joint_index: int, configured_joint: Joint | None, moved_range: AngleRange | None
+) -> str:
+    """Return two rows of the table for a joint: its numbers, and its drive below them.
+
+    Args:
+        snapshot: The newest snapshot of the robot.
+        joint_index: Index of the joint, from the tail.
+        configured_joint: The joint in the configuration of the run; None if it is not known.
+        moved_range: The range in rad in which it was moved by hand so far; None if it was not measured.
+    """
+    described_joint = snapshot.robot.joints[joint_index]
+    sign = "?" if configured_joint is None else f"{configured_joint.drive.sign:+d}"
+    zero = "?" if configured_joint is None else f"{configured_joint.drive.zero_rad:+.4f}"
+    limits = f"{described_joint.angle_min_rad:+.2f} to {described_joint.angle_max_rad:+.2f}"
+    texts = (_format_angle(snapshot, joint_index), limits, sign, zero)
+    cells = "".join(f"<td style='padding-right:.8em'>{text}</td>" for text in texts)
+    joint_name = escape_text(described_joint.name)
+    name_cell = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{joint_name}</td>"
+    drive = escape_text(_describe_drive(described_joint, configured_joint))
     moved = ""
     if moved_range is not None:
         lower_rad, upper_rad = moved_range
         moved = f"<div>moved from {lower_rad:+.3f} to {upper_rad:+.3f} rad</div>"
-    below = f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{moved}</td>"
-    return f"<tr>{name}{cells}</tr><tr>{below}</tr>"
+    drive_cells = f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{moved}</td>"
+    return f"<tr>{name_cell}{cells}</tr><tr>{drive_cells}</tr>"
 
 
 def _format_angle(snapshot: RobotSnapshot, joint_index: int) -> str:

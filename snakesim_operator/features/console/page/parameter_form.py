@@ -52,14 +52,21 @@ def _make_field(parameter: Parameter) -> InputField | None:
 
 
 def _make_number_field(parameter: Parameter, value: float) -> InputField:
-    """Return the input for a number: up to four times its value, as far as the parameter's bounds allow."""
-    reach = 4.0 * abs(value) or 1.0
-    low = -reach
+    """Return the input field for a number.
+
+    It allows numbers up to four times the present value in both directions, as far as the parameter's bounds allow.
+
+    Args:
+        parameter: Name, unit and bounds of the parameter.
+        value: Its present value. An integer gets steps of 1.
+    """
+    span = 4.0 * abs(value) or 1.0
+    low = -span
     if parameter.minimum is not None:
-        low = max(parameter.minimum, -reach)
-    high = reach
+        low = max(parameter.minimum, -span)
+    high = span
     if parameter.maximum is not None:
-        high = min(parameter.maximum, reach)
+        high = min(parameter.maximum, span)
     step = 1.0
     if not isinstance(value, int):
         # The power of ten that divides the range into 100 to 1000 steps.

@@ -185,7 +185,10 @@ class ViewerControls:
     # --- what the viewer sees --------------------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Show and enable the controls that this viewer may use now."""
+        """Show and enable the controls that this viewer may use at present.
+
+        Only the viewer in control may operate the robot. Controls of the simulator need a simulated robot.
+        """
         in_control = self._is_in_control()
         snapshot = self._get_snapshot()
         self._show_take_control()

@@ -117,9 +117,13 @@ class Drawing(ForceArrows):
 
 
 def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing | None:
-    """Compute what is drawn of a snapshot.
+    """Compute the positions of everything that is drawn of a snapshot.
 
-    Without a pose the tail end lies at the origin.
+    If the pose of the robot is unknown, its tail is drawn at the origin.
+
+    Args:
+        snapshot: What is known of the robot at one time.
+        surroundings: The true surroundings of the robot; None if they are unknown.
 
     Returns:
         The drawing, or None while the joint angles are unknown.
@@ -128,24 +132,26 @@ def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing 
     body = snapshot.body or snapshot.joints
     if body is None:
         return None
-    at_origin = (0.0, 0.0, robot.links[0].radius_m), AT_ORIGIN_WXYZ
-    position_w, wxyz = snapshot.base or at_origin
+    pose_at_origin = (0.0, 0.0, robot.links[0].radius_m), AT_ORIGIN_WXYZ
+    position_w, orientation_wxyz = snapshot.base or pose_at_origin
+    base_rotation = rotation_from_quaternion(orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
-    lengths = [link.length_m for link in robot.links]
-    origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), body.angle_rad, axes, lengths)
-    middles = origins + rotations[:, :, 0] * (np.array(lengths)[:, None] / 2)
-    center_w = middles.mean(axis=0)
+    lengths_m = [link.length_m for link in robot.links]
+    origins_w, rotations = link_frames(position_w, base_rotation, body.angle_rad, axes, lengths_m)
+    middles_w = origins_w + rotations[:, :, 0] * (np.array(lengths_m)[:, None] / 2)
+    center_w = middles_w.mean(axis=0)
     path_w = _no_points()
     obstacles_ahead = frozenset[str]()
     if snapshot.trajectory is not None:
         path_w = _lay_on_ground(np.array(snapshot.trajectory.path_w), surroundings)
         obstacles_ahead = frozenset(snapshot.trajectory.push_points)
+    cameras = [_camera_frustum(key, image, origins_w, rotations) for key, image in snapshot.images.items()]
     return Drawing(
         # The snake.
         center_w=center_w,
-        links_w=middles,
+        links_w=middles_w,
         links_wxyz=quaternions_from_rotations(rotations),
-        hinges_w=origins[1:],
+        hinges_w=origins_w[1:],
         hinges_wxyz=quaternions_from_rotations(_hinge_rotations(rotations[:-1], axes)),
         failed_joints=_find_failed_joints(snapshot),
         propulsion_joint=find_propulsion_joint(snapshot),
@@ -154,7 +160,7 @@ def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing 
         perceived=_list_perceived(snapshot.world),
         pushed_obstacles=_find_pushed_obstacles(snapshot),
         obstacles_ahead=obstacles_ahead,
-        cameras=tuple(_camera_frustum(key, image, origins, rotations) for key, image in snapshot.images.items()),
+        cameras=tuple(cameras),
         # Contacts and forces.
         **_contact_arrows(snapshot, center_w),
         **_desired_force_arrows(snapshot),

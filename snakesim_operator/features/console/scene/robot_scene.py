@@ -131,11 +131,11 @@ class RobotScene:
         )
 
     def _add_heightfield(self, along_m: Floats, heights_m: Floats) -> float:
-        """Add uneven ground as one mesh, and return its lowest height in m.
+        """Add uneven ground as one mesh of triangles, and return its lowest height in m.
 
         Args:
-            along_m: (n,) coordinates of the samples along both edges.
-            heights_m: (n, n) heights, row by row along y.
+            along_m: (n,) coordinates of the samples, the same along x and along y.
+            heights_m: (n, n) heights; a row has one y.
         """
         step = max(1, math.ceil(len(along_m) / MAX_HEIGHTFIELD_ROWS))
         along_m = along_m[::step]
@@ -143,8 +143,10 @@ class RobotScene:
         n = len(along_m)
         x, y = np.meshgrid(along_m, along_m)
         vertices = np.column_stack([x.ravel(), y.ravel(), heights_m.ravel() - HEIGHTFIELD_DROP_M])
-        # Each cell is two triangles; `corner` is the vertex of the cell with the smallest x and y.
-        corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)[None, :]).ravel()
+        # Each cell of the grid is two triangles. `corner` is the index of the cell's vertex with the smallest x and y.
+        row = np.arange(n - 1)[:, None]
+        column = np.arange(n - 1)[None, :]
+        corner = (row * n + column).ravel()
         lower = np.stack([corner, corner + 1, corner + n], axis=1)
         upper = np.stack([corner + 1, corner + n + 1, corner + n], axis=1)
         self._scene.add_mesh_simple(

@@ -188,10 +188,12 @@ class Admission:
     def check_message(self, viewer: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
         """Check a message of a browser, and handle it if its control has a handler.
 
+        A message is dropped if it cannot be decoded, if its control does not allow it, or if it is too old.
+
         Args:
             viewer: The viewer that sent it; None while viser has not numbered the viewer.
             data: The message as it was received.
-            age: The questions to the page that sent it.
+            age: Measures how old the messages of this page are.
 
         Returns:
             The message that viser may read, encoded anew; None if viser gets nothing.
@@ -254,7 +256,11 @@ def format_age(age_s: float) -> str:
 
 
 def _make_value_check(handle: Any, hold_hz: float) -> Callable[[ControlMessage], bool]:
-    """Return a function that reports whether a message is what this control is for.
+    """Return a function that reports whether a message is valid for a control of the page.
+
+    Args:
+        handle: The control, as viser has it; its type, options and bounds decide which values are valid.
+        hold_hz: Rate at which the page may repeat that a button is held; 0 if it may not.
 
     Raises:
         TypeError: It is not known which values this kind of control takes.
