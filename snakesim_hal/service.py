@@ -99,7 +99,7 @@ class ServiceLoop:
 
         Args:
             service_type: class of the service.
-            config: of the run.
+            config: configuration of the run.
             session: connection to the network.
             goes_on: called after each attempt that found no robot; returns whether to try again.
 
@@ -163,9 +163,13 @@ class ServiceLoop:
                 self._client.publish(key, message)
 
     def _act(self, clock: Clock) -> None:
-        """Publish the outputs for a tick, and report it done.
+        """Let the service act on a clock: publish its outputs for the tick, and report the tick done.
 
-        Until the robot is armed, the host sends the same tick again and again, and each time it is answered again.
+        Until the robot is armed, the host sends the same tick again and again, and each time it is answered again. A
+        paused clock is no tick, and has no outputs.
+
+        Args:
+            clock: clock of a tick that is due, or of a paused simulator.
         """
         if clock.paused:
             self._faults.answer_requests()

@@ -26,8 +26,8 @@ class RecentAdvance:
         smoothed_w = center_w
         if recent and time_s - recent[-1][0] <= WINDOW_S:
             last_s, last_w = recent[-1]
-            keep = math.exp(-(time_s - last_s) / SMOOTHING_S)
-            smoothed_w = _blend(center_w, last_w, keep)
+            last_gain = math.exp(-(time_s - last_s) / SMOOTHING_S)
+            smoothed_w = _blend(center_w, last_w, last_gain)
         else:
             recent.clear()  # the last center is too old to be compared with this one
         recent.append((time_s, smoothed_w))

@@ -74,6 +74,7 @@ class HandOver:
             return
         released = self._torque_joint
         if released is not None and torque_joint != released:
+            # The released joint's target is offset so that its drive produces the measured torque at once.
             load_nm = joints.torque_nm[released] + self._kd[released] * joints.velocity_rad_s[released]
             target_rad = joints.angle_rad[released] + load_nm / self._kp[released]
             self._offset_rad[released] = target_rad - reference_rad[released]

@@ -96,18 +96,18 @@ class MeasuredContacts:
         """
         if not self._samples:
             return None
-        weight = 1.0 / len(self._samples)
+        sample_weight = 1.0 / len(self._samples)
         length = math.hypot(*direction_w)
         # A contact is identified by its link and obstacle.
         along_n: dict[tuple[int, str | None], float] = {}
         size_n: dict[tuple[int, str | None], float] = {}
         for _, contacts in self._samples:
             for contact in contacts:
-                pair = (contact.link, contact.obstacle)
+                contact_id = (contact.link, contact.obstacle)
                 force_w = contact.force_w
                 forward_n = (force_w[0] * direction_w[0] + force_w[1] * direction_w[1]) / length
-                along_n[pair] = along_n.get(pair, 0.0) + weight * forward_n
-                size_n[pair] = size_n.get(pair, 0.0) + weight * math.hypot(*force_w)
+                along_n[contact_id] = along_n.get(contact_id, 0.0) + sample_weight * forward_n
+                size_n[contact_id] = size_n.get(contact_id, 0.0) + sample_weight * math.hypot(*force_w)
         return NetContactForce(
             strongest_n=max(size_n.values(), default=0.0),
             ahead_n=math.fsum(force_n for force_n in along_n.values() if force_n > 0.0),
@@ -147,11 +147,11 @@ def explain_standstill(
         forces = f"push it on with {net_force.ahead_n:.0f} N and hold it back with {net_force.back_n:.0f} N"
         return True, f"jammed: {pushing}; obstacles {forces}, {net_force.blocking_obstacle} most"
     without_contact = [name for name in push_points if name not in net_force.touched]
-    note = ""
+    no_contact = ""
     if without_contact:
-        note = f" (no contact at {', '.join(without_contact)})"
+        no_contact = f" (no contact at {', '.join(without_contact)})"
     net_n = max(net_force.ahead_n - net_force.back_n, 0.0)
     return (
         False,
-        f"{pushing}; contacts push it on with {net_n:.1f} N{note}, too little against the friction of the ground",
+        f"{pushing}; contacts push it on with {net_n:.1f} N{no_contact}, too little against the friction of the ground",
     )

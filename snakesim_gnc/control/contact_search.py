@@ -41,7 +41,7 @@ class ContactSearch:
 
         Args:
             robot: description of the robot.
-            after_s: how long a body stands until a search begins; 0: it never begins.
+            after_s: how long the body is stationary until a search begins; 0: it never begins.
             for_s: duration of a search.
         """
         # Waves.
@@ -69,13 +69,19 @@ class ContactSearch:
     def decide(
         self, observation: Observation, center_w: Floats, *, desired_m_s: float, near: bool
     ) -> LateralUndulation | None:
-        """Return the wave by which to move at this tick; None: follow the path.
+        """Decide whether the body searches for contacts at this tick, and by which wave it moves.
+
+        A search begins when the body has been stationary, and ends after its time. If a wave makes no progress, the
+        other kind of wave takes over.
 
         Args:
             observation: inputs of this tick.
             center_w: (2,) m, center of the body.
             desired_m_s: desired speed along the path.
-            near: obstacles are within reach of the body.
+            near: whether obstacles are within reach of the body.
+
+        Returns:
+            The wave to move by, or None to follow the path.
         """
         last_wave = self._wave
         if last_wave is None:

@@ -102,9 +102,19 @@ class AgeLimits:
 def _sensor_limits_s(
     config: RunConfig, robot: Description, guidance_cycle_s: float, guidance_latency_s: float
 ) -> dict[str, float]:
-    """Return the maximum age of each sensor's sample in a world model, by key.
+    """Return the maximum age of the pose, contact and depth samples that a world model is made from.
 
-    A sample waits for the next cycle of guidance, and the world model is published after guidance's latency.
+    A sample waits for the next cycle of guidance, and the world model is published after guidance's latency. Limits in
+    the configuration override these defaults.
+
+    Args:
+        config: configuration of the run.
+        robot: description of the robot, with its sensors.
+        guidance_cycle_s: period of guidance.
+        guidance_latency_s: time from a cycle of guidance to the publication of its world model.
+
+    Returns:
+        The maximum age in s by key; DEPTH stands for all depth sensors.
     """
     max_age = config.max_age
     configured_s = {keys.POSE: max_age.pose_s, keys.CONTACTS: max_age.contacts_s}

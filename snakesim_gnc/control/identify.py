@@ -76,7 +76,13 @@ class Identify(Controller[IdentifyParameters]):
         self._last_rad: list[float] = []  # targets of the tick before
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return the next targets, within the limits of every joint."""
+        """Return position targets that swing and shake every joint about its start angle, within its limits.
+
+        The measured response serves system identification. Amplitudes fade in, and the speed is limited.
+
+        Args:
+            observation: the inputs of this tick.
+        """
         if not self._start_rad:
             self._start_rad = list(observation.joints.angle_rad)
         swing_rad = self.parameters.swing_rad * self._fade_in(observation.time_s)

@@ -60,7 +60,11 @@ class JointCheck(Controller[JointCheckParameters]):
         self._offset_rad = 0.0  # between its target and its start angle
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return the next target of the joint under test; all others hold."""
+        """Return position targets that move the joint under test out and back, while all others hold.
+
+        Args:
+            observation: the inputs of this tick.
+        """
         if not self._start_rad:
             self._start_rad = list(observation.joints.angle_rad)
             self._sides = self._plan_sides(self._joint)

@@ -86,7 +86,14 @@ class LiveParameters:
         return self._change_count != count_before
 
     def _answer_request(self, question: Query) -> Answer:
-        """Put the parameters of a request in force if the controller accepts them."""
+        """Put the parameters of a request in force if the controller accepts them.
+
+        Args:
+            question: the encoded request.
+
+        Returns:
+            The answer; a refusal has its reason as text and as a code.
+        """
         try:
             request = self._decoder.decode(question.payload, question.encoding)
         except WireError as error:

@@ -178,7 +178,15 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._search = ContactSearch(robot, after_s=parameters.search_after_s, for_s=parameters.search_s)
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return torques, or angles of the body further along the path, as far as the desired speed needs it."""
+        """Return the joint setpoints that move the body along the path at the desired speed.
+
+        The joints follow angles of the body further along the path, plus the torques of a push against obstacles. While
+        the body can be soft, it commands torques instead of angles. If the body stays stationary, a contact-search gait
+        moves it.
+
+        Args:
+            observation: the inputs of this tick.
+        """
         located = self._progress.update(observation)
         if isinstance(located, str):
             self._holding = True
@@ -198,8 +206,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         if scale < 0:
             look_ahead_m = abs(look_ahead_m)  # a negative scale always pushes backward
         look_ahead_m = scale * look_ahead_m
-        theta = self._angles_on_path(located, located.tail_s_m)
-        theta_prime = (self._angles_on_path(located, located.tail_s_m + SLOPE_STEP_M) - theta) / SLOPE_STEP_M
+        theta = self._angles_on_path(located, located.tail_s_m)  # joint angles, rad
+        theta_ahead = self._angles_on_path(located, located.tail_s_m + SLOPE_STEP_M)
+        theta_prime = (theta_ahead - theta) / SLOPE_STEP_M  # derivative by the arc length, rad/m
         push_torques_nm = scale * self._update_push_torques(observation, located, theta_prime)
         if self._can_be_soft(observation.time_s) and not lift_rad.any():
             return self._command_torques(observation, located, theta, theta_prime, push_torques_nm)
@@ -235,9 +244,17 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _command_torques(
         self, observation: Observation, located: Located, theta: Floats, theta_prime: Floats, push_torques_nm: Floats
     ) -> ControllerCommand:
-        """Command tau_push + tau_shape in torque mode.
+        """Command the torques tau_push + tau_shape to the joints that bend.
 
-        tau_shape = k (theta - q) + d (theta' v - q'), less its component along theta'. All arrays are (n_joints,).
+        tau_shape = k (theta - q) + d (theta' v - q') holds the shape of the body. Its component along theta', which
+        would move the body along the path, is removed.
+
+        Args:
+            observation: the inputs of this tick, with the joint angles q and velocities q'.
+            located: position of the body on the path, and its speed v.
+            theta: (n_joints,) joint angles of the body on the path, rad.
+            theta_prime: (n_joints,) their derivatives by the arc length, rad/m.
+            push_torques_nm: (n_joints,) tau_push.
         """
         k = self.parameters.shape_nm_per_rad
         d = self.parameters.shape_nm_s_per_rad
@@ -254,8 +271,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._holding = False
         for i in self._bends:
             limit_nm = setpoints.torque_limit_nm[i]
+            torque_nm = float(shape_nm[i] + push_torques_nm[i])
             setpoints.mode[i] = Mode.TORQUE
-            setpoints.target[i] = min(max(float(shape_nm[i] + push_torques_nm[i]), -limit_nm), limit_nm)
+            setpoints.target[i] = min(max(torque_nm, -limit_nm), limit_nm)
         return ControllerCommand(setpoints, self._make_telemetry(observation, located, 0.0, theta))
 
     def _command_positions(
@@ -312,7 +330,19 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._look_ahead_integral_m = min(self._look_ahead_integral_m, self.parameters.fresh_look_ahead_m)
 
     def _update_push_torques(self, observation: Observation, located: Located, theta_prime: Floats) -> Floats:
-        """Return tau_push: the joint torques, (n_joints,), of the force F = lag_kp integral e dt + speed_kp e."""
+        """Return the filtered joint torques tau_push of a force F along the path that controls the speed.
+
+        F = lag_kp * integral of e dt + speed_kp * e, with the speed error e. F is limited to `max_push_n` and to what
+        the contacts and the torque limits allow.
+
+        Args:
+            observation: the inputs of this tick.
+            located: position and speed of the body on the path.
+            theta_prime: (n_joints,) derivatives of the joint angles by the arc length, rad/m.
+
+        Returns:
+            (n_joints,) torques in N·m.
+        """
         parameters = self.parameters
         desired_m_s = located.trajectory.speed_m_s
         if desired_m_s <= 0.0 or parameters.max_push_n == 0.0:
@@ -321,24 +351,30 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             self._snapshot = None
             return np.zeros(len(self.robot.joints))
         error_m_s = desired_m_s - located.speed_m_s
-        gain = 1.0
+        integral_gain = 1.0
         if abs(located.speed_m_s) < CREEP_SPEED_M_S:
-            gain = CREEP_GAIN
-        self._push_integral_n += gain * parameters.lag_kp_n_per_m * error_m_s * observation.period_s
+            integral_gain = CREEP_GAIN
+        self._push_integral_n += integral_gain * parameters.lag_kp_n_per_m * error_m_s * observation.period_s
         self._push_integral_n = min(max(self._push_integral_n, 0.0), parameters.max_push_n)
         force_n = self._push_integral_n + parameters.speed_kp_n_s_per_m * error_m_s
         force_n = min(max(force_n, 0.0), parameters.max_push_n)
         if located.fresh:
             self._update_contacts(observation.time_s, located, theta_prime)
-        # Anti-windup: a body that cannot push does not store force for later.
+        # Anti-windup: the integral stays within the force that the contacts allow.
         self._push_integral_n = min(self._push_integral_n, self._max_force_n)
         self._force_n = min(force_n, self._max_force_n)
-        keep = np.exp(-observation.period_s / parameters.torque_filter_s)
-        self._torques_nm = keep * self._torques_nm + (1 - keep) * self._force_n * self._unit_torques_nm
+        last_gain = np.exp(-observation.period_s / parameters.torque_filter_s)  # of a low-pass filter
+        self._torques_nm = last_gain * self._torques_nm + (1 - last_gain) * self._force_n * self._unit_torques_nm
         return np.clip(self._torques_nm, -parameters.max_torque_nm, parameters.max_torque_nm)
 
     def _update_contacts(self, time_s: float, located: Located, theta_prime: Floats) -> None:
-        """Find the contacts of a new world model, the push that they allow, and its largest force."""
+        """Find the contacts of a new world model, the push that they allow, and the maximum force of that push.
+
+        Args:
+            time_s: time of this tick.
+            located: position of the body, with the new world model.
+            theta_prime: (n_joints,) derivatives of the joint angles by the arc length, rad/m.
+        """
         parameters = self.parameters
         obstacles = located.world.obstacles
         nodes_w = self._predict_nodes(located)
@@ -362,8 +398,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._unit_torques_nm = np.zeros(len(self.robot.joints))
         self._max_force_n = 0.0
         max_lambda = float(push.lambdas.max(initial=0.0))
-        # Without any lambda there is no push: a body bent into a U has hardly any drag, and needs none.
-        if push.rest < MAX_UNBALANCED and max_lambda > 0.0:
+        is_balanced = push.rest < MAX_UNBALANCED
+        # All contact forces (lambdas) may be 0: a body bent into a U has hardly any drag, and needs no push.
+        if is_balanced and max_lambda > 0.0:
             self._unit_torques_nm[self._bends] = push.torques_nm
             max_unit_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
             self._max_force_n = min(parameters.max_torque_nm / max_unit_nm, parameters.max_contact_n / max_lambda)
@@ -390,7 +427,14 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _make_telemetry(
         self, observation: Observation, located: Located, look_ahead_n: float, reference: Floats
     ) -> Telemetry:
-        """Report the push, and why the body is stationary, if it is; look_ahead_n: force of the look-ahead."""
+        """Report the push, and why the body is stationary, if it is.
+
+        Args:
+            observation: the inputs of this tick.
+            located: position and speed of the body on the path.
+            look_ahead_n: force along the path that the look-ahead causes.
+            reference: (n_joints,) reference angles, rad.
+        """
         if abs(located.speed_m_s) > STANDSTILL_SPEED_M_S:
             self._moved_at_s = observation.time_s
         stands_still = observation.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None

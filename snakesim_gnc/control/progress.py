@@ -109,7 +109,17 @@ class PathProgress:
         )
 
     def _measure(self, body: BodyOnPath, world: World, observation: Observation, *, is_new_path: bool) -> int:
-        """Localize the body if the path or the pose is new. Return the time of the newest pose in ns."""
+        """Localize the body on the path if the path or the pose is new.
+
+        Args:
+            body: the body on the path.
+            world: the newest world model, with the pose.
+            observation: the inputs of this tick.
+            is_new_path: whether the path differs from that of the last tick.
+
+        Returns:
+            Time of the newest pose in ns.
+        """
         last_ns = self._measured_ns
         pose_ns = pose_time_ns(world)
         measured_ns = pose_ns

@@ -84,20 +84,23 @@ class PushFilter:
         self._rest = 0.0
 
     def update(self, time_s: float, push: UnitPush, obstacles: Sequence[str]) -> UnitPush:
-        """Return the filtered push.
+        """Filter a push by a low-pass filter of first order, contact by contact.
 
         Args:
             time_s: time of the push.
             push: the new, unfiltered push.
-            obstacles: (k,) names of the obstacles of its contacts.
+            obstacles: (k,) names of the obstacles of its contacts; they identify contacts from push to push.
+
+        Returns:
+            The filtered push, with the same k contacts.
         """
-        keep = float(np.exp((self._time_s - time_s) / self._filter_s))
-        gain = 1.0 - keep
+        last_gain = float(np.exp((self._time_s - time_s) / self._filter_s))
+        new_gain = 1.0 - last_gain
         lambdas: list[float] = []
         for name, new_lambda in zip(obstacles, push.lambdas, strict=True):
-            lambdas.append(gain * new_lambda + keep * self._lambdas.get(name, 0.0))
-        torques_nm = gain * push.torques_nm + keep * self._torques_nm
-        rest = gain * push.rest + keep * self._rest
+            lambdas.append(new_gain * new_lambda + last_gain * self._lambdas.get(name, 0.0))
+        torques_nm = new_gain * push.torques_nm + last_gain * self._torques_nm
+        rest = new_gain * push.rest + last_gain * self._rest
         self._time_s = time_s
         self._lambdas = dict(zip(obstacles, lambdas, strict=True))
         self._torques_nm = torques_nm
@@ -118,15 +121,22 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     samples, nearest_w, distances_m = nearest_on_chain(nodes_w.T, outlines)
     near = np.flatnonzero(distances_m - radius_m < reach_m)
     center_w = nearest_w[near]  # (k, 2) on the center line
-    link, share = np.divmod(samples[near], len(LINK_FRACTIONS))
-    run_w = np.diff(nodes_w, axis=1).T  # (n_links, 2)
-    lengths_m = np.hypot(*run_w.T)
+    link, fraction_index = np.divmod(samples[near], len(LINK_FRACTIONS))
+
+    # Normal, tangent and arc length of each contact.
+    link_vectors_w = np.diff(nodes_w, axis=1).T  # (n_links, 2)
+    lengths_m = np.hypot(*link_vectors_w.T)
     distance_m, normal = outlines.distance_and_normal(center_w, near)
-    tangent = (run_w / lengths_m[:, None])[link]
+    tangent = (link_vectors_w / lengths_m[:, None])[link]
     link_start_m = np.concatenate(([0.0], np.cumsum(lengths_m)[:-1]))
-    body_s_m = link_start_m[link] + LINK_FRACTIONS[share] * lengths_m[link]
+    body_s_m = link_start_m[link] + LINK_FRACTIONS[fraction_index] * lengths_m[link]
+
+    # Sliding friction acts on the body against its motion along the tangent.
     direction = normal - friction * tangent
-    beside = np.flatnonzero(np.abs(np.einsum("ij,ij->i", normal, tangent)) < MAX_NORMAL_ALONG_BODY)
+
+    # An obstacle in front of the head or behind the tail, whose normal is along the body, cannot be pushed sideways.
+    normal_along_body = np.abs(np.einsum("ij,ij->i", normal, tangent))
+    beside = np.flatnonzero(normal_along_body < MAX_NORMAL_ALONG_BODY)
     return Touches(
         obstacle=near[beside],
         places_w=(center_w - radius_m * normal)[beside],

@@ -186,24 +186,32 @@ class Control(Service):
         return _state_messages(state)
 
     def _read_fresh_plan(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
-        """Return the newest world model and trajectory, None for what is missing or too old, and why it is too old."""
+        """Read the newest world model and trajectory, and reject them if they are too old.
+
+        Args:
+            clock: of the current tick.
+
+        Returns:
+            The world model and the trajectory, each None if it is missing or too old, and why inputs are too old;
+            empty if none is.
+        """
         world = self._client.read(self._world)
         trajectory = self._client.read(self._trajectory)
-        late: list[str] = []
+        late_reasons: list[str] = []
         if world is not None:
             why_late = self._age_limits.check_world(world, clock.timestamp_ns)
             if why_late:
-                late.append(why_late)
+                late_reasons.append(why_late)
                 world = None
         if trajectory is not None:
             why_late = self._age_limits.check_trajectory(trajectory, clock.timestamp_ns)
             if why_late:
-                late.append(why_late)
+                late_reasons.append(why_late)
                 trajectory = None
-        self._log_late_streams(clock, late, "the controller holds")
+        self._log_late_streams(clock, late_reasons, "the controller holds")
         if world is not None:
             self._reports.add_world(world)
-        return world, trajectory, "; ".join(late)
+        return world, trajectory, "; ".join(late_reasons)
 
     def _read_sensor_samples(self, clock: Clock) -> SensorSamples | None:
         """Return the newest sensor samples, and which are too old; None for a controller that requests none."""

@@ -26,13 +26,18 @@ class Standstill:
         self._centers = deque[tuple[float, Floats]]()
 
     def update(self, time_s: float, period_s: float, center_w: Floats, max_distance_m: float) -> bool:
-        """Add the center of this tick, and return whether the body is stationary; call it in every tick.
+        """Add the center of the body at this tick, and decide whether the body is stationary.
+
+        Call it in every tick. The centers are low-pass filtered.
 
         Args:
             time_s: time of the tick.
             period_s: time since the last tick.
             center_w: (2,) m, center of the body.
             max_distance_m: a body whose center moved less than this within the whole window is stationary.
+
+        Returns:
+            Whether the body is stationary; False until the window is filled once.
         """
         if self._window_s == 0.0:
             return False

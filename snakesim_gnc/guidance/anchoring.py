@@ -52,32 +52,36 @@ class Anchors:
         self._ratios = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK  # of each link's length
 
     def hold(self, localizer: Localizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust) -> None:
-        """Correct the localizer's base.
+        """Correct an estimated base pose by the known obstacles near the body.
+
+        For each obstacle, the gap between its outline and the skin counts as a measurement of zero if a contact pushes
+        the body away from the obstacle, or if the gap is negative.
 
         Args:
-            localizer: it is changed.
-            angles_rad: (joints,) at the localizer's last move.
-            contacts: at that time.
-            trust: standard deviations of the gaps.
+            localizer: has the estimate of the base pose, which is changed.
+            angles_rad: (n_joints,) joint angles at the time of the estimate.
+            contacts: contacts of the links at that time.
+            trust: standard deviations of such measurements.
         """
         if not len(self._outlines):
             return
         body = localizer.history.compute_frames(localizer.base, angles_rad)
         axis_w = self._sample_axis_w(body)
         gaps_m = self._outlines.distance_m(axis_w) - np.repeat(self._radii_m, POINTS_PER_LINK)[:, None]
-        nearest_point = gaps_m.argmin(axis=0)  # of each obstacle
-        smallest_gap_m = gaps_m.min(axis=0)
-        near = np.flatnonzero((smallest_gap_m < MAX_GAP_M) & (smallest_gap_m > -MAX_DEPTH_M))
-        _, normals_w = self._outlines.distance_and_normal(axis_w[nearest_point[near]], near)
+        nearest_points = gaps_m.argmin(axis=0)  # index of the body point nearest to each obstacle
+        min_gaps_m = gaps_m.min(axis=0)
+        near = np.flatnonzero((min_gaps_m < MAX_GAP_M) & (min_gaps_m > -MAX_DEPTH_M))
+        _, normals_w = self._outlines.distance_and_normal(axis_w[nearest_points[near]], near)
 
         rows: list[Floats] = []
         measured_gaps_m: list[float] = []
         sds_m: list[float] = []
         for obstacle, normal_w in zip(near.tolist(), normals_w, strict=True):
-            point = int(nearest_point[obstacle])
+            point = int(nearest_points[obstacle])
             gap_m = float(gaps_m[point, obstacle])
             is_sunk = gap_m < 0.0
-            if not is_sunk and self._pushing_force_n(body, contacts, point, normal_w) <= MIN_FORCE_N:
+            is_pushed = self._pushing_force_n(body, contacts, point, normal_w) > MIN_FORCE_N
+            if not is_sunk and not is_pushed:
                 continue
             measured_gaps_m.append(gap_m)
             sds_m.append(trust.sunk_m if is_sunk else trust.contact_m)

@@ -105,7 +105,12 @@ class BodyHistory:
             self._entries[i] = (Base(planar_w, base.z_m, base.tilt), angles_rad)
 
     def _interpolate(self, timestamp_ns: int) -> tuple[Base, Floats] | None:
-        """Return base pose and joint angles at a time, between the entries before and after it."""
+        """Interpolate the base pose and the joint angles at a time between two entries of the history.
+
+        Returns:
+            The base pose and the angles (n_joints,) in rad, or None if the time is before the first entry or more than
+            MAX_AHEAD_NS after the last one.
+        """
         timestamps_ns = self._timestamps_ns
         if not timestamps_ns:
             return None

@@ -71,12 +71,16 @@ Faces = list[Floats]  # places of the four faces along their axes
 def fit_boxes(points: Floats, weight: Floats, outward: Floats) -> Boxes:
     """Fit a box to the points of each obstacle.
 
-    The heading is searched in three rounds: coarse, fine, and by a parabola through the fine ones.
+    The heading of a box is searched in three rounds: among coarse candidates, among fine candidates around the best
+    coarse one, and by a parabola through the misfits of the fine ones.
 
     Args:
-        points: (b, p, 2) in the world.
+        points: (b, p, 2) the p points of each of the b obstacles in the world, m.
         weight: (b, p) information in 1 / m²; 0 for padding.
         outward: (b, p, 2) unit vectors from the surface towards the sensor.
+
+    Returns:
+        One box for each obstacle.
     """
     weight = soften_weights(weight)
     rows = np.arange(len(points))
@@ -104,9 +108,17 @@ def _rotate(vectors: Floats, yaw: Floats) -> tuple[Floats, Floats]:
 
 
 def _fit_faces(points: _Points, weight: Floats) -> tuple[Faces, Floats]:
-    """Return the places of the faces, and the misfit of each heading, each (b, h).
+    """Fit the four faces of a box to the points of each obstacle, for every candidate heading.
 
-    Each face is the weighted mean of its points, with Huber weights. A face without points is far away.
+    A face is at the weighted mean of its points. The points are assigned to faces and get Huber weights again in
+    every iteration.
+
+    Args:
+        points: the points in the coordinates of h candidate headings of each of the b obstacles.
+        weight: (b, p) information of the points in 1 / m².
+
+    Returns:
+        The places of the four faces, (b, h) each in m, and the misfit (b, h). A face without points is far away.
     """
     weight = weight[:, None]
     faces = _extreme_faces(points, weight)
@@ -117,10 +129,11 @@ def _fit_faces(points: _Points, weight: Floats) -> tuple[Faces, Floats]:
         for axis in (0, 1):
             is_this_axis = is_first_axis if axis == 0 else ~is_first_axis
             for face, direction in ((2 * axis, LOW), (2 * axis + 1, HIGH)):
-                face_weight = trusted * (is_this_axis & (direction * points.outward[axis] > 0))
-                total = face_weight.sum(axis=2)
-                mean_m = (face_weight * points.place_m[axis]).sum(axis=2) / np.maximum(total, 1e-12)
-                faces[face] = np.where(total > 0, mean_m, faces[face])
+                is_on_face = is_this_axis & (direction * points.outward[axis] > 0)
+                face_weight = trusted * is_on_face
+                total_weight = face_weight.sum(axis=2)
+                mean_m = (face_weight * points.place_m[axis]).sum(axis=2) / np.maximum(total_weight, 1e-12)
+                faces[face] = np.where(total_weight > 0, mean_m, faces[face])
     error_m, _ = _assign_faces(points, faces)
     misfit = np.minimum(weight * error_m * error_m, OUTLIER_SD**2).sum(axis=2)
     return faces, misfit
@@ -166,19 +179,21 @@ def _interpolate_minimum_rad(misfit: Floats, best: NDArray[np.intp]) -> Floats:
 
 
 def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces, misfit: Floats) -> Boxes:
-    """Return boxes from the faces that were seen, closed where none was seen.
+    """Return boxes from the faces that the sensor saw, with assumed faces where it saw none.
 
     Args:
-        points: in the heading of each obstacle, h = 1.
-        weight: (b, p).
-        yaw_rad: (b,).
-        faces: (b, 1) each.
-        misfit: (b,).
+        points: the points of b obstacles, each in the coordinates of its one fitted heading.
+        weight: (b, p) information of the points in 1 / m².
+        yaw_rad: (b,) fitted headings.
+        faces: places of the four faces, (b, 1) each.
+        misfit: (b,) of the fit.
     """
     extents = _measure_extents(points, weight, faces)
-    longest_m = np.maximum(extents.high_m[0] - extents.low_m[0], extents.high_m[1] - extents.low_m[1])
-    depth_m = np.where(longest_m > WALL_M, WALL_THICKNESS_M, DEPTH_M)
-    center_m = np.empty((len(yaw_rad), 2))  # along and across yaw
+    extent_x_m = extents.high_m[0] - extents.low_m[0]
+    extent_y_m = extents.high_m[1] - extents.low_m[1]
+    longest_m = np.maximum(extent_x_m, extent_y_m)
+    depth_m = np.where(longest_m > WALL_M, WALL_THICKNESS_M, DEPTH_M)  # of a box of which one face was seen
+    center_m = np.empty((len(yaw_rad), 2))  # along the heading and across it
     half_m = np.empty((len(yaw_rad), 2))
     sd_m = np.empty((len(yaw_rad), 2))
     for axis in (0, 1):
@@ -211,7 +226,13 @@ class _Extents:
 
 
 def _measure_extents(points: _Points, weight: Floats, faces: Faces) -> _Extents:
-    """Find out which faces were seen, and where the points end along each axis."""
+    """Find the faces that the sensor saw, and the range of the points along both axes of each box.
+
+    Args:
+        points: the points of b obstacles, each in the coordinates of its one fitted heading.
+        weight: (b, p) information of the points in 1 / m²; 0 for padding.
+        faces: places of the four faces, (b, 1) each.
+    """
     extents = _Extents([], [], [], [])
     _, is_first_axis = _assign_faces(points, faces)
     is_point = weight > 0
@@ -231,10 +252,19 @@ def _measure_extents(points: _Points, weight: Floats, faces: Faces) -> _Extents:
 
 
 def _close_axis(axis: int, extents: _Extents, faces: Faces, depth_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return where the boxes begin and end along an axis, and the standard deviation of half their size, (b,) each.
+    """Find the two ends of b boxes along one axis.
 
-    An end is the face there if it was seen. If a face of the other axis was seen, it is where the points of that face
-    end. Otherwise it is at a guessed depth behind the opposite face.
+    An end is the face there if the sensor saw it. Otherwise, if it saw a face of the other axis, the end is where the
+    points of that face end. Otherwise it is at an assumed depth behind the opposite face.
+
+    Args:
+        axis: 0 along the heading, 1 across it.
+        extents: range of the points, and which faces were seen.
+        faces: places of the four faces, (b, 1) each in m: low and high of axis 0, low and high of axis 1.
+        depth_m: (b,) assumed depths.
+
+    Returns:
+        The lower end, the upper end, and the standard deviation of half the size, (b,) each in m.
     """
     low_face = 2 * axis
     high_face = 2 * axis + 1
@@ -244,13 +274,13 @@ def _close_axis(axis: int, extents: _Extents, faces: Faces, depth_m: Floats) -> 
     has_other = extents.is_seen[other_low_face] | extents.is_seen[other_low_face + 1]
     low_m = extents.low_m[axis]
     high_m = extents.high_m[axis]
-    guess_m = np.maximum(depth_m, high_m - low_m)
+    assumed_size_m = np.maximum(depth_m, high_m - low_m)
     low_face_m = faces[low_face][:, 0]
     high_face_m = faces[high_face][:, 0]
 
-    bottom_m = np.where(has_other | ~has_high, low_m, high_face_m - guess_m)
+    bottom_m = np.where(has_other | ~has_high, low_m, high_face_m - assumed_size_m)
     bottom_m = np.where(has_low, low_face_m, bottom_m)
-    top_m = np.where(has_other | ~has_low, high_m, low_face_m + guess_m)
+    top_m = np.where(has_other | ~has_low, high_m, low_face_m + assumed_size_m)
     top_m = np.where(has_high, high_face_m, top_m)
 
     open_sd_m = np.where(has_other, END_SD_M, DEPTH_SD_M)

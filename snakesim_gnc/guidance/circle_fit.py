@@ -40,11 +40,14 @@ def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: 
     measured normal of a touch, to which a is perpendicular, leads through the center.
 
     Args:
-        points: (b, p, 2) q, in the world.
+        points: (b, p, 2) the p points q of each of the b obstacles in the world, m.
         weight: (b, p) w, information in 1 / m²; 0 for padding.
         outward: (b, p, 2) unit vectors from the surface towards the sensor, or normals.
         normal_weight: (b, p) v, information of `outward` as a normal; 0 for points that were only seen.
-        began_w: (b, 2) centers of earlier fits; NaN without one.
+        began_w: (b, 2) centers of earlier fits, from which the iteration starts; NaN without one.
+
+    Returns:
+        One circle for each obstacle, with the covariance (3, 3) of x, y and radius, and the misfit.
     """
     weight = soften_weights(weight)
     center, radius = _first_guess(points, weight, outward, began_w)
@@ -53,14 +56,15 @@ def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: 
         offset = points - center[:, None]
         information, gradient = _linearize(offset, radius, weight, outward, normal_weight)
         step = -np.linalg.solve(information, gradient[..., None])[..., 0]
-        step *= np.minimum(1.0, MAX_STEP_M / np.maximum(np.abs(step).max(axis=1), 1e-9))[:, None]
+        longest_m = np.maximum(np.abs(step).max(axis=1), 1e-9)
+        step *= np.minimum(1.0, MAX_STEP_M / longest_m)[:, None]
         center = center + step[:, :2]
         radius = np.clip(radius + step[:, 2], MIN_RADIUS_M, MAX_RADIUS_M)
     offset = points - center[:, None]
     error_m = np.hypot(offset[..., 0], offset[..., 1]) - radius[:, None]
     misfit = np.minimum(weight * error_m * error_m, OUTLIER_SD**2).sum(axis=1)
     surplus_points = np.maximum((weight > 0).sum(axis=1) - 3, 1)
-    # If the points scatter more than their weights imply, the result is less certain by that.
+    # If the points scatter more than their weights imply, the covariance is larger by that ratio.
     excess = np.maximum(misfit / surplus_points, 1.0)
     return Circles(center, radius, np.linalg.inv(information) * excess[:, None, None], misfit)
 
@@ -82,9 +86,17 @@ def _first_guess(points: Floats, weight: Floats, outward: Floats, began_w: Float
 def _linearize(
     offset: Floats, radius: Floats, weight: Floats, outward: Floats, normal_weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Return information matrices (b, 3, 3) and gradients (b, 3) for steps of x, y and radius.
+    """Linearize the circle fit at the present circles, for a Gauss-Newton step of x, y and radius.
 
-    offset: (b, p, 2) points from the center; radius: (b,).
+    Args:
+        offset: (b, p, 2) points from the center of their circle, m.
+        radius: (b,) radii, m.
+        weight: (b, p) information of the points in 1 / m².
+        outward: (b, p, 2) unit vectors from the surface towards the sensor, or normals.
+        normal_weight: (b, p) information of `outward` as a normal; 0 for points that were only seen.
+
+    Returns:
+        Information matrices (b, 3, 3) and gradients (b, 3).
     """
     distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)
     error = distance - radius[:, None]
@@ -94,7 +106,7 @@ def _linearize(
     information = np.einsum("bp,bpi,bpj->bij", trusted, rows, rows)
     gradient = np.einsum("bp,bpi->bi", trusted * error, rows)
 
-    # Measured normals lead through the center.
+    # The line through a point along its measured normal leads through the center.
     across = np.stack([outward[..., 1], -outward[..., 0], np.zeros_like(distance)], axis=-1)
     miss = np.einsum("bpk,bpk->bp", across[..., :2], -offset)
     information += np.einsum("bp,bpi,bpj->bij", normal_weight, across, across)

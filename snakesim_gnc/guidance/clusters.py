@@ -23,7 +23,14 @@ MIN_CHORD_M = 1e-6
 
 
 def find_clusters(scan: Scan) -> list[Indices]:
-    """Return the bins of each cluster, in order of azimuth."""
+    """Divide a scan into clusters of bins that show one surface.
+
+    A cluster ends at a missing stretch of bins, at a gap that is too wide for a surface seen at a grazing angle, and at
+    a corner.
+
+    Returns:
+        The indices of the bins of each cluster, in order of azimuth.
+    """
     hits = np.flatnonzero(np.isfinite(scan.range_m))
     if len(hits) == 0:
         return []
@@ -35,10 +42,12 @@ def find_clusters(scan: Scan) -> list[Indices]:
     nearer_m = np.minimum(ranges_m[:-1], ranges_m[1:])
     allowed_m = bin_steps * nearer_m * scan.step_rad / math.sin(GRAZING_RAD)
     noise_m = NOISE_SD * np.maximum(scan.sd_m[hits[1:]], scan.sd_m[hits[:-1]])
-    is_jump = (bin_steps > MAX_MISSED_BINS + 1) | (gaps_m > np.maximum(allowed_m, MIN_JUMP_M) + noise_m)
+    has_missed_bins = bin_steps > MAX_MISSED_BINS + 1
+    is_wide_gap = gaps_m > np.maximum(allowed_m, MIN_JUMP_M) + noise_m
+    is_break = has_missed_bins | is_wide_gap
     clusters: list[Indices] = []
-    for run in np.split(hits, np.flatnonzero(is_jump) + 1):
-        clusters += _split_at_corners(run, scan)
+    for surface_bins in np.split(hits, np.flatnonzero(is_break) + 1):
+        clusters += _split_at_corners(surface_bins, scan)
     return clusters
 
 

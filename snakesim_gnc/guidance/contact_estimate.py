@@ -79,13 +79,16 @@ def estimate_pushes(
     imu: Imu,
     pose: Pose | None,
 ) -> list[EstimatedPush]:
-    """Estimate the pushes of obstacles on the links.
+    """Estimate the forces of obstacles on the links from joint torques and accelerations.
+
+    The equations of motion give the generalized force that inertia and joint torques leave unexplained. Friction and
+    the fewest possible pushes from a fixed list of places are fitted to it.
 
     Args:
-        robot: the description.
-        angles_rad: of all joints, tail to head, at the time of `imu`; likewise the next two.
-        velocities_rad_s: of all joints.
-        torques_nm: of all joints.
+        robot: the description of the robot.
+        angles_rad: (n_joints,) angles, tail to head, at the time of `imu`.
+        velocities_rad_s: (n_joints,) velocities at the same time.
+        torques_nm: (n_joints,) torques at the same time.
         imu: angular velocities and specific forces of some links, or of none.
         pose: velocity of the base; None if the links are assumed to slide forward along themselves.
 
@@ -103,12 +106,15 @@ def estimate_pushes(
     right_side[:joint_count] -= np.where(is_yaw, torques_nm, 0.0)
     right_side[:joint_count] *= is_yaw
 
-    # Covariance of the right sides: of torques, of accelerations, and of how the links share the friction.
+    # Covariance of the right side: of torques, of accelerations, and of how the links share the friction.
     friction, friction_sd = compute_friction(chain, spins_rad_s, pose)
     inertia_sd = inertia[:, :-1] @ motion_sd
-    covariance = np.diag(np.append(np.full(joint_count, TORQUE_SD_NM**2), np.full(3, TOTAL_VARIANCE)))
+    torque_variances = np.full(joint_count, TORQUE_SD_NM**2)
+    total_variances = np.full(3, TOTAL_VARIANCE)  # of the total force (x, y) and moment
+    covariance = np.diag(np.append(torque_variances, total_variances))
     covariance += inertia_sd @ inertia_sd.T + friction_sd @ friction_sd.T
 
+    # Whitening scales the equations to uncorrelated noise of standard deviation 1.
     pushes = _list_unit_pushes(chain)
     columns = np.column_stack([friction, *(push.effect for push in pushes)])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -117,9 +123,12 @@ def estimate_pushes(
 
 
 def _list_unit_pushes(chain: ChainDynamics) -> list[_UnitPush]:
-    """Return every push that is considered: on both sides of both ends of each link, and on the tip of the head."""
+    """Return a push of 1 N at every place that is considered, with its effect on the equations of motion.
+
+    The places are on both sides of both ends of each link, and on the tip of the head.
+    """
     last_link = len(chain.rear_b) - 1
-    places: list[tuple[int, int, float]] = []  # link, side, end: 0 rear, 1 front
+    places: list[tuple[int, int, float]] = []  # link, side, and end: 0.0 rear, 1.0 front
     for link in range(last_link + 1):
         for side in (LEFT, RIGHT):
             places += [(link, side, 0.0), (link, side, 1.0)]
@@ -127,7 +136,7 @@ def _list_unit_pushes(chain: ChainDynamics) -> list[_UnitPush]:
 
     links = np.array([link for link, _, _ in places])
     ends = np.array([end for _, _, end in places])
-    outward_l = np.array([[1.0, 0.0, 0.0] if side == HEAD_TIP else [0.0, side, 0.0] for _, side, _ in places])
+    outward_l = np.array([_outward_normal_l(side) for _, side, _ in places])
     along_m = ends * chain.lengths_m[links]
     skin_l = along_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
     base_from_link = chain.frames[links]
@@ -140,18 +149,28 @@ def _list_unit_pushes(chain: ChainDynamics) -> list[_UnitPush]:
     ]
 
 
+def _outward_normal_l(side: int) -> list[float]:
+    """Return the outward normal of the skin on one side of a link, in the frame of the link."""
+    if side == HEAD_TIP:
+        return [1.0, 0.0, 0.0]
+    return [0.0, side, 0.0]
+
+
 def _merge_pushes(
     chain: ChainDynamics, pushes: Sequence[_UnitPush], amounts_n: Floats, covariance: Floats
 ) -> list[EstimatedPush]:
-    """Merge neighboring unit pushes on one side into one push, and return the significant ones, sorted.
+    """Merge neighboring unit pushes on one side into one push, and leave out the insignificant results.
 
     Args:
         chain: the links.
         pushes: the p unit pushes.
-        amounts_n: (p,) force of each unit push.
-        covariance: (p, p) of the forces.
+        amounts_n: (p,) force of each unit push; 0 where there is none.
+        covariance: (p, p) covariance of the forces in N².
+
+    Returns:
+        The pushes whose force is at least MIN_SIGNIFICANCE times its standard deviation, sorted.
     """
-    starts_m = np.append(0.0, np.cumsum(chain.lengths_m))  # of the links, along the body
+    starts_m = np.append(0.0, np.cumsum(chain.lengths_m))  # arc length at which each link begins
     max_gap_m = MAX_MERGE_RATIO * chain.lengths_m.max()
     merged: list[EstimatedPush] = []
     for side in (LEFT, RIGHT, HEAD_TIP):

@@ -51,11 +51,11 @@ class WorldModel:
         """Compute the world model from the newest samples.
 
         Args:
-            tick: of the clock.
-            now_ns: of the clock; with it the confidence in an old pose is lowered.
-            joints: the joint state, whose timestamp the world model gets.
-            contacts: in the frames of the links; None: there is no contact sensor.
-            pose: of the base, from its sensor.
+            tick: tick of the clock.
+            now_ns: robot time of the clock. The confidence decreases with the age of the pose.
+            joints: the newest joint state; the world model gets its timestamp.
+            contacts: contacts in the frames of the links; None: there is no contact sensor.
+            pose: pose of the base from its sensor.
         """
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
         origins_w, rotations = link_frames(pose.position_w, rotation, joints.angle_rad, self._axes, self._lengths_m)
@@ -121,9 +121,9 @@ def transform_contact(
     """Return a contact of a link, transformed into the world.
 
     Args:
-        contact: in the frame of its link.
-        origins_w: (n, 3) of all links.
-        rotations: (n, 3, 3) world_from_link.
+        contact: the contact, in the frame of its link.
+        origins_w: (n, 3) rear ends of all n links in the world, m.
+        rotations: (n, 3, 3) world_from_link of all links.
         rear_s_m: (n,) arc length along the body of each link's rear.
         find_name: returns the name of the obstacle at a position (3,) in the world.
     """

@@ -87,12 +87,15 @@ class DepthScanner:
         self._cells = math.ceil(STRETCH_M * math.asinh(MAX_RANGE_M / STRETCH_M) / CELL_M) + 1
 
     def scan(self, depth_m: Singles, timestamp_ns: int, position_w: Floats, rotation: Floats, plane: Floats) -> Scan:
-        """Return the scan of an image.
+        """Convert a depth image into a scan of the upright surfaces around the robot.
+
+        The ground plane is fitted first. Pixels on it show free space, and pixels in a band of heights above it show
+        obstacles.
 
         Args:
             depth_m: (height * width,) distances along the camera's x axis; 0 where nothing was seen.
-            timestamp_ns: of the image.
-            position_w: (3,) of the camera.
+            timestamp_ns: time of the image.
+            position_w: (3,) position of the camera in the world, m.
             rotation: (3, 3) world_from_camera.
             plane: (3,) first guess of the ground: z = a + b x + c y in the world, with x and y from the camera.
         """
@@ -134,9 +137,14 @@ class DepthScanner:
     def _make_scan(
         self, timestamp_ns: int, origin_w: Floats, first_rad: float, free_m: Floats, pixels: _Pixels
     ) -> Scan:
-        """Return the scan of the nearest upright surface in each bin, the mean of its pixels.
+        """Return the scan whose points are the mean of the pixels of the nearest upright surface in each bin.
 
-        free_m: (n,) range up to which each bin shows ground.
+        Args:
+            timestamp_ns: time of the image.
+            origin_w: (2,) position of the camera in the world, m.
+            first_rad: azimuth of the first bin's right edge in the world.
+            free_m: (n_bins,) range up to which each bin shows ground; it applies to bins without a surface.
+            pixels: the pixels that may show an obstacle.
         """
         bin_count = len(free_m)
         bins = pixels.bins
@@ -145,6 +153,7 @@ class DepthScanner:
         width_m = SPREAD_SD * spread_m + CELL_RATIO * CELL_M
         count = np.zeros(bin_count)
         on_surface = np.zeros(len(bins), dtype=bool)
+        # Alternately select the pixels near the range of their bin, and set that range to their mean.
         for _ in range(RANGE_ITERATIONS):
             with np.errstate(invalid="ignore"):
                 on_surface = np.abs(pixels.ranges_m - range_m[bins]) < width_m[bins]
@@ -153,9 +162,9 @@ class DepthScanner:
             range_m = total_m / np.where(count > 0, count, np.nan)
 
         has_surface = count > 0
-        x = np.bincount(bins[on_surface], pixels.points[on_surface, 0], bin_count)
-        y = np.bincount(bins[on_surface], pixels.points[on_surface, 1], bin_count)
-        mean_xy = np.stack([x, y], axis=1) / np.where(has_surface, count, np.nan)[:, None]
+        total_x = np.bincount(bins[on_surface], pixels.points[on_surface, 0], bin_count)
+        total_y = np.bincount(bins[on_surface], pixels.points[on_surface, 1], bin_count)
+        mean_xy = np.stack([total_x, total_y], axis=1) / np.where(has_surface, count, np.nan)[:, None]
         top_m = np.full(bin_count, -np.inf)
         np.maximum.at(top_m, bins[on_surface], pixels.heights_m[on_surface])
         return Scan(

@@ -49,11 +49,14 @@ def fit_plane_under(bottoms_w: Floats, at_w: Floats) -> Floats:
 
 
 def refine_plane(plane: Floats, points: Floats) -> Floats:
-    """Fit the plane to seen points near it, by iterated reweighting (Tukey).
+    """Fit the ground plane to the points near it, by iteratively reweighted least squares with Tukey weights.
+
+    The width of the weights decreases from iteration to iteration. Above the plane it is narrower than below, because
+    obstacles stand on the ground. A prior draws the result towards the first guess.
 
     Args:
-        plane: (3,) first guess.
-        points: (n, 3).
+        plane: (3,) first guess of (a, b, c) in z = a + b x + c y.
+        points: (n, 3) points x, y, z, m.
 
     Returns:
         The fitted plane, or the first guess if too few points are near it or the fit is too steep.
@@ -64,11 +67,11 @@ def refine_plane(plane: Floats, points: Floats) -> Floats:
     for width_m in WIDTHS_M:
         above_m = z - rows @ plane
         limit_m = np.where(above_m > 0, ABOVE_RATIO * width_m, width_m)
-        weights = np.clip(1.0 - np.square(above_m / limit_m), 0.0, None) ** 2
-        if np.count_nonzero(weights) < MIN_POINTS:
+        tukey_weights = np.clip(1.0 - np.square(above_m / limit_m), 0.0, None) ** 2
+        if np.count_nonzero(tukey_weights) < MIN_POINTS:
             return first_guess
-        right_side = rows.T @ (z * weights) + SEEN_PRIOR @ first_guess
-        plane = np.linalg.solve(rows.T @ (rows * weights[:, None]) + SEEN_PRIOR, right_side)
+        right_side = rows.T @ (z * tukey_weights) + SEEN_PRIOR @ first_guess
+        plane = np.linalg.solve(rows.T @ (rows * tukey_weights[:, None]) + SEEN_PRIOR, right_side)
     if np.abs(plane[1:]).max() < MAX_SLOPE:
         return plane
     return first_guess

@@ -86,18 +86,23 @@ class Localizer:
         self.history.add(joints.timestamp_ns, self.base, joints.angle_rad)
 
     def add_pose(self, pose: Pose) -> None:
-        """Correct the base by a sample of the pose sensor."""
+        """Correct the estimated base pose by a sample of the pose sensor.
+
+        The first sample replaces the estimate. A later one that is implausibly far from the estimate is rejected and
+        counted in `refused`. If samples have been rejected for JUMP_S, the robot was probably moved: the sample then
+        replaces the estimate, and `carried_m` is the distance. Repeated and outdated samples change nothing.
+        """
         self.carried_m = 0.0
         is_first = self.pose_timestamp_ns is None
         if self.pose_timestamp_ns is not None and pose.timestamp_ns <= self.pose_timestamp_ns:
             return
-        then = self.history.base_at(pose.timestamp_ns)
-        if then is None:
+        estimate_then = self.history.base_at(pose.timestamp_ns)
+        if estimate_then is None:
             return
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
         yaw_rad = yaw_from_rotation(rotation)
         measured_w = np.array([*pose.position_w[:2], yaw_rad])
-        jump = measured_w - then.planar_w
+        jump = measured_w - estimate_then.planar_w
         if is_first:
             self.covariance = FIRST_COVARIANCE.copy()
         elif not self._is_plausible(jump):
@@ -110,19 +115,20 @@ class Localizer:
         self._refused_since_ns = None
         self.pose_timestamp_ns = pose.timestamp_ns
         self.base = Base(self.base.planar_w, pose.position_w[2], rotation_about_z(-yaw_rad) @ rotation)
-        self.correct(then, measured_w, np.diag(self._pose_variance))
+        self.correct(estimate_then, measured_w, np.diag(self._pose_variance))
 
     def correct(self, then: Base, measured_w: Floats, spread: Floats, common_m2: float = 0.0) -> None:
-        """Correct the base by a measurement of x, y and heading at some time (Kalman update, Joseph form).
+        """Correct the base pose by a measurement of x, y and heading at some time (Kalman update, Joseph form).
 
-        With P the covariance and R the spread, the gain is K = P (P + R)^-1, and P becomes
-        (I - K) P (I - K)^T + K R K^T.
+        With P the covariance of the estimate, without the part that is common with the map, and R the covariance of
+        the measurement, the gain is K = P (P + R)^-1, and P becomes (I - K) P (I - K)^T + K R K^T.
 
         Args:
-            then: the estimate at that time.
-            measured_w: (3,) x, y, heading.
+            then: the estimate at the time of the measurement.
+            measured_w: (3,) measured x and y in m, and heading in rad.
             spread: (3, 3) covariance R of the measurement.
-            common_m2: variance of the position of what it was measured against. No number of measurements lowers it.
+            common_m2: variance in m² of the position of the obstacles against which the pose was measured. It is added
+                at the end, because no number of measurements lowers it.
         """
         mean_m2 = 0.5 * float(np.trace(self.covariance[:2, :2]))
         own_ratio = max(1.0 - common_m2 / max(mean_m2, 1e-12), MIN_OWN_RATIO)
@@ -130,9 +136,9 @@ class Localizer:
         error = measured_w - then.planar_w
         error[2] = wrap_angle(error[2])
         gain = own @ np.linalg.inv(own + spread)
-        rest = np.eye(3) - gain
+        remaining = np.eye(3) - gain
         common = np.diag([common_m2, common_m2, 0.0])
-        self.covariance = rest @ own @ rest.T + gain @ spread @ gain.T + common
+        self.covariance = remaining @ own @ remaining.T + gain @ spread @ gain.T + common
         self._shift(then.planar_w[:2], gain @ error)
 
     def correct_along(self, rows: Floats, errors_m: Floats, sds_m: Floats) -> None:
@@ -165,7 +171,11 @@ class Localizer:
         return float(error @ np.linalg.solve(spread, error)) < GATE
 
     def _apply_step(self, step: OdometryStep) -> None:
-        """Move the base by a step, and propagate the covariance: P becomes F P F^T + G Q G^T."""
+        """Move the base pose by a step of the odometry, and propagate its covariance.
+
+        With F and G the Jacobians of the new pose by the old pose and by the step, and Q the covariance of the step, P
+        becomes F P F^T + G Q G^T.
+        """
         x, y, yaw_rad = self.base.planar_w
         forward, left, turn_rad = step.motion
         cosine = math.cos(yaw_rad)
@@ -177,15 +187,17 @@ class Localizer:
                 wrap_angle(yaw_rad + turn_rad),
             ]
         )
-        by_pose = np.array(
+        jacobian_by_pose = np.array(
             [
                 [1.0, 0.0, -(sine * forward + cosine * left)],
                 [0.0, 1.0, cosine * forward - sine * left],
                 [0.0, 0.0, 1.0],
             ]
         )
-        by_step = rotation_about_z(yaw_rad)
-        self.covariance = by_pose @ self.covariance @ by_pose.T + by_step @ step.covariance @ by_step.T
+        jacobian_by_step = rotation_about_z(yaw_rad)
+        covariance_of_pose = jacobian_by_pose @ self.covariance @ jacobian_by_pose.T
+        covariance_of_step = jacobian_by_step @ step.covariance @ jacobian_by_step.T
+        self.covariance = covariance_of_pose + covariance_of_step
         self.base = Base(planar_w, self.base.z_m, self.base.tilt)
 
     def _level(self, imu: Imu) -> None:

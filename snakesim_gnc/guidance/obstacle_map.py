@@ -90,21 +90,30 @@ class ObstacleMap:
         ]
 
     def add_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
-        """Add the points of a scan. sd_m: standard deviation of the sensor's position relative to the map."""
+        """Add the points of a scan to the tracks that they belong to, and start new tracks for the others.
+
+        Tracks that the scan sees through lose confidence, and duplicate tracks are merged.
+
+        Args:
+            scan: the scan, with its points in the world.
+            sd_m: standard deviation of the sensor's position relative to the map.
+        """
         near = [track for track in self.tracks if _is_in_range(track, scan)]
         outlines = make_outlines(near)
-        parts_of: dict[int, list[Indices]] = {}  # bins of each track, by its number
-        seen: dict[int, Track] = {}
+        bins_by_track: dict[int, list[Indices]] = {}  # by the track's number
+        seen: dict[int, Track] = {}  # by the track's number
         adjacent: list[tuple[Track, Track]] = []  # tracks side by side in one cluster
         for cluster in find_clusters(scan):
             claims = self._divide_cluster(cluster, scan, near, outlines, sd_m)
             for track, bins in claims:
                 seen.setdefault(track.number, track)
-                parts_of.setdefault(track.number, []).append(bins)
-            adjacent += [(a, b) for (a, _), (b, _) in pairwise(claims) if a is not b]
+                bins_by_track.setdefault(track.number, []).append(bins)
+            for (track, _), (next_track, _) in pairwise(claims):
+                if track is not next_track:
+                    adjacent.append((track, next_track))
         self._doubt_what_is_seen_through(near, scan, set(seen))
         for track in seen.values():
-            self._add_points(track, scan, np.concatenate(parts_of[track.number]))
+            self._add_points(track, scan, np.concatenate(bins_by_track[track.number]))
         fit_shapes(list(seen.values()))
         self._merge_duplicates(list(seen.values()), adjacent)
         self._drop_disproved()
@@ -172,9 +181,19 @@ class ObstacleMap:
     def _divide_cluster(
         self, cluster: Indices, scan: Scan, near: Sequence[Track], outlines: Outlines, sd_m: float
     ) -> list[Claim]:
-        """Divide the bins of a cluster among tracks, in order of azimuth. New tracks are made as needed.
+        """Divide the bins of a cluster among tracks. New tracks are started as needed.
 
-        outlines: of the tracks that are near.
+        A track near enough to many of the points is an owner. Each point belongs to the nearest owner.
+
+        Args:
+            cluster: bins of the scan that show one surface.
+            scan: the scan.
+            near: tracks in the range of the scan.
+            outlines: outlines of these tracks.
+            sd_m: standard deviation of the sensor's position relative to the map.
+
+        Returns:
+            Tracks with their bins, in order of azimuth.
         """
         if not near:
             return self._claim_for_new_track(cluster, scan)
@@ -193,7 +212,7 @@ class ObstacleMap:
         if not owners:
             return self._claim_for_new_track(cluster, scan)
 
-        # Every point is assigned to the nearest owner, except for points well off a circle whose shape is sure.
+        # Every point is assigned to the nearest owner, except for points far from a circle whose shape is certain.
         owner = np.array(owners)[distance_m[:, owners].argmin(axis=1)]
         is_apart = np.zeros(len(cluster), dtype=bool)
         for index in owners:
@@ -251,7 +270,7 @@ class ObstacleMap:
         self.tracks = [track for track in self.tracks if track.number not in gone]
 
     def _find_overlaps(self, seen: Sequence[Track]) -> list[tuple[Track, Track]]:
-        """Return pairs of a seen track and another one that covers a good part of its surface."""
+        """Return pairs of a seen track and another track whose outline covers a large part of its surface."""
         if not seen:
             return []
         outlines = make_outlines(self.tracks)
@@ -270,7 +289,16 @@ class ObstacleMap:
         return pairs
 
     def _try_merge(self, old: Track, new: Track, *, overlaps: bool) -> bool:
-        """Merge a newer track into an older one, unless two shapes explain them better. Returns whether it did."""
+        """Merge a newer track into an older one, unless two shapes explain their points better than one.
+
+        Args:
+            old: the older track. After a merge it has the points of both.
+            new: the newer track, which is only read.
+            overlaps: whether the tracks overlap; then they are merged in any case.
+
+        Returns:
+            Whether the tracks were merged.
+        """
         both = Track(old.number, old.name)
         self._update_drift(old)
         self._update_drift(new)
@@ -331,16 +359,18 @@ def _carve_track(
         allowed_m: distance from the axis at which a surface may be.
     """
     surface = track.surface
-    cells = len(surface)
+    cell_count = len(surface)
     offset = surface.points_w[:, None] - axis_w
     distance_m = np.hypot(offset[..., 0], offset[..., 1])  # (cells, n)
     nearest = distance_m.argmin(axis=1)
-    is_left = (offset[np.arange(cells), nearest] * left[nearest]).sum(axis=1) > 0
+    is_left = (offset[np.arange(cell_count), nearest] * left[nearest]).sum(axis=1) > 0
     surface.keep(distance_m.min(axis=1) > allowed_m)
-    goes_through = OTHER_SIDE_RATIO < np.mean(is_left) < ONE_SIDE_RATIO
-    if len(surface) < cells or goes_through:
+    body_goes_through = OTHER_SIDE_RATIO < np.mean(is_left) < ONE_SIDE_RATIO
+    if len(surface) < cell_count or body_goes_through:
         track.add_evidence(MISS_LOG_ODDS)
         return
+
+    # The whole surface is beside the body, only its fitted outline is not: add surface points at the body's skin.
     sunk = np.flatnonzero(is_sunk)
     towards_surface = left[sunk] if is_left[0] else -left[sunk]
     skin_w = axis_w[sunk] + radius_m * towards_surface

@@ -72,13 +72,19 @@ class Odometry:
         self._before: _Shape | None = None
 
     def step(self, joints: JointState, tilt: Floats, contacts: Contacts | None, imu: Imu | None) -> OdometryStep | None:
-        """Return the step since the last call; None for the first call, and if no time has passed.
+        """Estimate the motion of the base since the last call by weighted least squares.
+
+        The equations say that the links slide along themselves and along the contacts, that the gyroscopes measure the
+        turn, and that the base hardly moves while the joints rest.
 
         Args:
             joints: the joint state after the step.
             tilt: (3, 3) level_from_base.
-            contacts: only if they are recent.
-            imu: only if it is recent.
+            contacts: contacts of the links; None if there are no recent ones.
+            imu: angular velocities; None if there are no recent ones.
+
+        Returns:
+            The step with its covariance; None at the first call, and if no time has passed.
         """
         origins, rotations = link_frames(np.zeros(3), tilt, joints.angle_rad, self._axes, self._lengths)
         now = _Shape(joints.timestamp_ns, origins, rotations)
@@ -97,7 +103,11 @@ class Odometry:
         equations = self._sliding_equations(before, now, joint_rad_s)
         if contacts is not None:
             at_contacts = _contact_equations(before, now, contacts.contacts)
-            equations = _Equations(*(np.concatenate(both) for both in zip(equations, at_contacts, strict=True)))
+            equations = _Equations(
+                rows=np.concatenate([equations.rows, at_contacts.rows]),
+                values=np.concatenate([equations.values, at_contacts.values]),
+                sds=np.concatenate([equations.sds, at_contacts.sds]),
+            )
         turn_rad, turn_sd_rad = _measure_turn(before, now, imu, period_s)
         still_sd_m = (STEP_SD_M_S + STEP_SD_M_PER_RAD * joint_rad_s) * period_s
         rows = np.vstack([equations.rows, np.eye(3)])
@@ -107,11 +117,14 @@ class Odometry:
         information = rows.T @ (rows / np.square(sds)[:, None])
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         motion: Floats = covariance @ (rows.T @ (values / np.square(sds)))
-        lasting: Floats = covariance * (SLIP_S / period_s)
+        # Slip lasts for about SLIP_S, so the errors of successive steps are alike and their variances add up faster.
+        step_covariance: Floats = covariance * (SLIP_S / period_s)
         if imu is not None:
             # The noise of gyroscopes is white, so the error of the turn does not last.
-            lasting[2, :] = lasting[:, 2] = [0.0, 0.0, turn_sd_rad**2]
-        return OdometryStep(motion, lasting)
+            turn_row = [0.0, 0.0, turn_sd_rad**2]
+            step_covariance[2, :] = turn_row
+            step_covariance[:, 2] = turn_row
+        return OdometryStep(motion, step_covariance)
 
     def _sliding_equations(self, before: _Shape, now: _Shape, joint_rad_s: float) -> _Equations:
         """Return equations that no link's middle moves sideways; the standard deviations are speeds."""

@@ -46,7 +46,13 @@ class PerceivedWorld:
     """Makes world models from sensor samples."""
 
     def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise) -> None:
-        """Begin at the start pose, with an empty map. pose_noise: of the pose sensor."""
+        """Begin at the start pose, with an empty map.
+
+        Args:
+            robot: description of the robot.
+            start: base pose at the start.
+            pose_noise: noise of the pose sensor.
+        """
         # The robot.
         lengths_m = np.array([link.length_m for link in robot.links])
         masses_kg = np.array([link.mass_kg for link in robot.links])
@@ -82,9 +88,10 @@ class PerceivedWorld:
             self.map.drift(self.localizer.carried_m**2)
 
     def add_contacts(self, contacts: Contacts) -> None:
-        """Store contacts, and map the obstacles that the body touches."""
+        """Store contacts, and add the touched places of upright surfaces to the map, at most every TOUCH_PERIOD_NS."""
         self._contacts = contacts
-        if self._touched_ns and contacts.timestamp_ns - self._touched_ns < TOUCH_PERIOD_NS:
+        has_touched = self._touched_ns != 0
+        if has_touched and contacts.timestamp_ns - self._touched_ns < TOUCH_PERIOD_NS:
             return
         body = self.localizer.history.body_at(contacts.timestamp_ns)
         if body is None:
@@ -118,7 +125,15 @@ class PerceivedWorld:
         self._map_scan(scan, body)
 
     def make_world(self, tick: int, now_ns: int) -> World | None:
-        """Return the world now; None before the first joint state. tick, now_ns: of the clock."""
+        """Return the world model at the newest joint state, after removing obstacles where the body is.
+
+        Args:
+            tick: tick of the clock.
+            now_ns: robot time of the clock.
+
+        Returns:
+            The world model, or None before the first joint state.
+        """
         joints = self._joints
         if joints is None:
             return None
@@ -129,6 +144,11 @@ class PerceivedWorld:
         self.map.carve_body(axis_w, self._radius_m, min(localizer.position_sd_m, MAX_CARVE_SD_M))
         self.map.forget(axis_w)
         middles_w = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
+        contacts_timestamp_ns = None
+        contacts_from = None
+        if self._contacts is not None:
+            contacts_timestamp_ns = self._contacts.timestamp_ns
+            contacts_from = "sensor"
         return World(
             tick=tick,
             timestamp_ns=joints.timestamp_ns,
@@ -138,13 +158,13 @@ class PerceivedWorld:
             contacts=self._transform_contacts(body),
             obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
             pose_timestamp_ns=localizer.pose_timestamp_ns,
-            contacts_timestamp_ns=None if self._contacts is None else self._contacts.timestamp_ns,
+            contacts_timestamp_ns=contacts_timestamp_ns,
             center_w=tuple((self._mass_ratios @ middles_w).tolist()),
             base_position_sd_m=min(localizer.position_sd_m, MAX_POSITION_SD_M),
             base_yaw_sd_rad=min(localizer.yaw_sd_rad, MAX_YAW_SD_RAD),
             depth_timestamp_ns=self.depth_timestamp_ns,
             pose_from="sensor" if self._trusts_pose(now_ns) else "dead_reckoning",
-            contacts_from=None if self._contacts is None else "sensor",
+            contacts_from=contacts_from,
         )
 
     def _transform_contacts(self, body: BodyFrames) -> list[WorldContact]:

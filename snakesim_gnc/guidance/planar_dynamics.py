@@ -99,24 +99,30 @@ def estimate_spins(chain: ChainDynamics, velocities_rad_s: Sequence[float], imu:
 
 
 def estimate_accelerations(chain: ChainDynamics, spins_rad_s: Floats, imu: Imu) -> tuple[Floats, Floats]:
-    """Estimate the motion: acceleration of the tail end (x, y), and angular acceleration of each link.
+    """Estimate the acceleration of the tail end (x, y) and the angular acceleration of each of the n + 1 links.
 
-    Linear least squares over all accelerometers with a prior: neighbors share a joint, so they correct each other.
+    Linear least squares over all accelerometers, with a prior: the motion of the links is coupled by the joints, so
+    that accelerometers correct one another. Without an IMU the result is the prior.
+
+    Args:
+        chain: lengths and frames of the links.
+        spins_rad_s: (n + 1,) angular velocities of the links.
+        imu: specific forces of some links, or of none.
 
     Returns:
-        The motion (n + 3,), and a root (n + 3, n + 3) of its covariance.
+        The motion (n + 3,), and a matrix root (n + 3, n + 3) of its covariance.
     """
     unknowns = len(spins_rad_s) + 2
     model = _acceleration_model(chain, spins_rad_s)[:, imu.link].reshape(2 * len(imu.link), unknowns + 1)
     jacobian = model[:, :-1]
     measured_l = np.reshape(imu.acceleration_m_s2, (-1, 3))
     measured = np.einsum("kij,kj->ki", chain.frames[imu.link], measured_l)[:, :2].T.ravel()
+    tail_sd_m_s2 = TAIL_PRIOR_WITHOUT_IMU_M_S2
+    spin_sd_rad_s2 = SPIN_PRIOR_WITHOUT_IMU_RAD_S2
     if imu.link:
-        prior_sd = np.append(np.full(2, TAIL_PRIOR_M_S2), np.full(len(spins_rad_s), SPIN_PRIOR_RAD_S2))
-    else:
-        prior_sd = np.append(
-            np.full(2, TAIL_PRIOR_WITHOUT_IMU_M_S2), np.full(len(spins_rad_s), SPIN_PRIOR_WITHOUT_IMU_RAD_S2)
-        )
+        tail_sd_m_s2 = TAIL_PRIOR_M_S2
+        spin_sd_rad_s2 = SPIN_PRIOR_RAD_S2
+    prior_sd = np.append(np.full(2, tail_sd_m_s2), np.full(len(spins_rad_s), spin_sd_rad_s2))
     precision = jacobian.T @ jacobian / ACCELERATION_SD_M_S2**2 + np.diag(prior_sd**-2.0)
     covariance = np.linalg.inv(precision)
     motion = covariance @ jacobian.T @ (measured - model[:, -1]) / ACCELERATION_SD_M_S2**2

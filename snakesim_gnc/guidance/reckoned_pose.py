@@ -28,20 +28,24 @@ class ReckonedPose:
         self._timestamp_ns = -1
 
     def move(self, joints: JointState, contacts: Contacts | None, *, estimated: bool) -> Pose:
-        """Return the pose at a joint state. A joint state that is not newer changes nothing.
+        """Update the dead-reckoned base pose by a joint state, and return it.
 
-        estimated: whether the contacts are estimated rather than measured.
+        The odometry moves the pose, and contacts with known obstacles correct it. A joint state that is not newer than
+        the last one, or not valid for every joint, changes nothing.
+
+        Args:
+            joints: the newest joint state.
+            contacts: contacts of the links; None if they are unknown.
+            estimated: whether the contacts are estimated rather than measured.
         """
         localizer = self._localizer
-        if joints.timestamp_ns > self._timestamp_ns and all(joints.valid):
+        is_new = joints.timestamp_ns > self._timestamp_ns
+        if is_new and all(joints.valid):
             self._timestamp_ns = joints.timestamp_ns
             localizer.move(joints, contacts, None)
-            self._anchors.hold(
-                localizer,
-                np.array(joints.angle_rad),
-                [] if contacts is None else contacts.contacts,
-                ESTIMATED if estimated else MEASURED,
-            )
+            contact_list = [] if contacts is None else contacts.contacts
+            trust = ESTIMATED if estimated else MEASURED
+            self._anchors.hold(localizer, np.array(joints.angle_rad), contact_list, trust)
         return Pose(
             tick=joints.tick,
             timestamp_ns=joints.timestamp_ns,

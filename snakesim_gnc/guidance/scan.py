@@ -88,18 +88,19 @@ class Scan:
 
 
 def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: float, noise: Noise) -> Scan:
-    """Return the scan of a range finder or lidar.
+    """Project the ranges of a range finder or lidar onto the ground, as a scan in the world.
 
-    Beams that end on the ground or above the body's band show only free space.
+    A beam that ends within the band of heights in which obstacles concern the body is a hit. Other beams show only free
+    space.
 
     Args:
-        ranges: the message.
-        position_w: (3,) of the sensor.
+        ranges: the message of the sensor; a range of None is unknown.
+        position_w: (3,) position of the sensor, m.
         rotation: (3, 3) world_from_sensor.
         ground_z_m: height of the ground in the world.
-        noise: of the ranges.
+        noise: noise of the ranges.
     """
-    measured_m = np.array([np.nan if r is None else r for r in ranges.range_m], dtype=np.float64)
+    measured_m = np.array([np.nan if value is None else value for value in ranges.range_m], dtype=np.float64)
     count = len(measured_m)
     step_rad = ranges.angle_step_rad or UNKNOWN_STEP_RAD
     angles_rad = ranges.angle_min_rad + step_rad * np.arange(count)
@@ -110,9 +111,9 @@ def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: 
         beams = beams[::-1]
         measured_m = measured_m[::-1]
     height_m = position_w[2] - ground_z_m + measured_m * beams[:, 2]
-    range_m = measured_m * np.hypot(beams[:, 0], beams[:, 1])  # on the ground
-    is_near = (range_m <= MAX_RANGE_M) & (measured_m < ranges.range_max_m)
-    is_hit = is_near & (height_m > BAND_M[0]) & (height_m < BAND_M[1])
+    range_m = measured_m * np.hypot(beams[:, 0], beams[:, 1])  # horizontal distance
+    is_in_range = (range_m <= MAX_RANGE_M) & (measured_m < ranges.range_max_m)
+    is_hit = is_in_range & (height_m > BAND_M[0]) & (height_m < BAND_M[1])
     points_w = position_w[:2] + measured_m[:, None] * beams[:, :2]
     return Scan(
         timestamp_ns=ranges.timestamp_ns,

@@ -81,16 +81,26 @@ def match_scan(scan: Scan, tracks: Sequence[Track], predicted_w: Floats) -> Pose
         return None
     information = INFORMATION_RATIO * residuals.information + np.eye(3)
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    map_m2 = float(np.average([landmarks[k].born_m2 for k in residuals.nearest], weights=residuals.weight))
+    landmark_variances_m2 = [landmarks[k].born_m2 for k in residuals.nearest]
+    map_m2 = float(np.average(landmark_variances_m2, weights=residuals.weight))
     return PoseMeasurement(predicted_w + correction, covariance, map_m2)
 
 
 def _compute_residuals(
     arms: Floats, sd_m: Floats, outlines: Outlines, landmark_sd_m: Floats, predicted_w: Floats, correction: Floats
 ) -> _Residuals:
-    """Compute distances e and their derivatives J after a correction (x, y, heading) of the predicted pose.
+    """Compute the distances e of scan points from the nearest outlines, and the terms of a Gauss-Newton step.
 
-    arms: (m, 2) points from the predicted base; sd_m: (m,) of the points; landmark_sd_m: of each outline.
+    With J the derivatives of e by the correction, and W the Huber weights, the information is J^T W J and the gradient
+    J^T W e. Points farther than GATE_M from every outline have no weight.
+
+    Args:
+        arms: (m, 2) scan points relative to the predicted base position, m.
+        sd_m: (m,) standard deviations of the points.
+        outlines: outlines of the landmarks.
+        landmark_sd_m: standard deviation of each landmark's position.
+        predicted_w: (3,) predicted x and y in m, and heading in rad.
+        correction: (3,) present correction of the predicted pose.
     """
     cosine = np.cos(correction[2])
     sine = np.sin(correction[2])
@@ -106,7 +116,8 @@ def _compute_residuals(
         moved_m = outlines.distance_m(points_w + PROBE_M * axis)[rows, nearest]
         slopes.append((moved_m - distance_m) / PROBE_M)
     slope = np.stack(slopes, axis=1)
-    jacobian = np.column_stack([slope, slope[:, 1] * turned[:, 0] - slope[:, 0] * turned[:, 1]])
+    slope_by_heading = slope[:, 1] * turned[:, 0] - slope[:, 0] * turned[:, 1]
+    jacobian = np.column_stack([slope, slope_by_heading])
 
     spread_m = np.hypot(np.hypot(sd_m, landmark_sd_m[nearest]), SENSOR_FLOOR_SD_M)
     is_inlier = np.abs(distance_m) < GATE_M

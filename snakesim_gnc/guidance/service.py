@@ -113,6 +113,13 @@ class _SurveyedSource:
             print_stderr("no contact sensors: contacts are estimated from the torques of the joints")
 
     def make_world(self, clock: Clock) -> World | None:
+        """Return the world model of surveyed obstacles, from the newest samples.
+
+        Contacts without a sensor are estimated, and a pose without a sensor is dead-reckoned; both are marked as such.
+
+        Returns:
+            The world model, or None if the joint state or the sensor's pose is missing.
+        """
         read = self._client.read
         joints = read(self._joints)
         pose = None
@@ -126,7 +133,8 @@ class _SurveyedSource:
         estimated = None
         if contacts is None:
             estimated = self._estimate_contacts(joints, pose)
-            contacts = None if estimated is None else estimated.contacts
+            if estimated is not None:
+                contacts = estimated.contacts
         if self._reckoned is not None:
             pose = self._reckoned.move(joints, contacts, estimated=estimated is not None)
         assert pose is not None
@@ -163,11 +171,11 @@ class _PerceivedSource:
         self._contacts = client.subscribe(keys.CONTACTS, Contacts) if robot.sensors.contacts else None
         self._imu = client.subscribe(keys.IMU, Imu) if robot.sensors.imu else None
         self._pose = client.subscribe(keys.POSE, Pose) if uses_pose else None
-        self._looks: list[tuple[Any, Noise]] = []  # subscription to a ranging sensor, and its noise
+        self._ranging_feeds: list[tuple[Any, Noise]] = []  # subscription to a ranging sensor, and its noise
         for key, sensor in robot.sensors.mounted():
             message_type = keys.find_message(key)
             if isinstance(sensor, DistanceSensor) and message_type is not None and message_type in get_args(Look):
-                self._looks.append((client.subscribe(key, message_type), _range_noise(sensor)))
+                self._ranging_feeds.append((client.subscribe(key, message_type), _range_noise(sensor)))
 
         self._model: PerceivedWorld | None = None
         self._used_ns: dict[str, int] = {}  # timestamp of the newest sample that was used, by key
@@ -177,6 +185,11 @@ class _PerceivedSource:
         self._used_ns.clear()
 
     def make_world(self, clock: Clock) -> World | None:
+        """Update the perceived world by the newest samples, and return the world model.
+
+        Returns:
+            The world model, or None before the robot is described or before the first joint state.
+        """
         read = self._client.read
         model = self._model
         joints = read(self._joints)
@@ -190,10 +203,10 @@ class _PerceivedSource:
             model.add_pose(pose)
         if contacts is not None and self._is_new(keys.CONTACTS, contacts.timestamp_ns):
             model.add_contacts(contacts)
-        for feed, noise in self._looks:
-            look = read(feed)
-            if look is not None and self._is_new(feed.key, look.timestamp_ns):
-                model.add_look(look, noise)
+        for feed, noise in self._ranging_feeds:
+            sample = read(feed)
+            if sample is not None and self._is_new(feed.key, sample.timestamp_ns):
+                model.add_look(sample, noise)
         return model.make_world(clock.tick, clock.timestamp_ns)
 
     def _is_new(self, key: str, timestamp_ns: int) -> bool:

@@ -71,22 +71,31 @@ def _drop_insignificant(
 
 
 def _solve_nonnegative(columns: Floats, right_side: Floats, amounts: Floats, active: list[int]) -> list[int]:
-    """Solve least squares over the active columns, without those that would become negative.
+    """Solve least squares over the active columns, and drop the columns whose amounts would become negative.
 
     From the present amounts it goes towards the solution until the first amount is zero, drops that column, and solves
-    again. Changes `amounts`; returns the columns that stay active.
+    again (inner loop of the active-set method of Lawson and Hanson).
+
+    Args:
+        columns: (m, k) matrix A.
+        right_side: (m,) b.
+        amounts: (k,) present amounts, which are replaced by the solution.
+        active: indices of the columns that may take part.
+
+    Returns:
+        Indices of the columns that stay active.
     """
     while active:
         solution = np.linalg.lstsq(columns[:, active], right_side, rcond=None)[0]
-        now = amounts[active]
+        present = amounts[active]
         is_negative = solution <= 0.0
         if not is_negative.any():
             amounts[:] = 0.0
             amounts[active] = solution
             return active
-        steps_to_zero = now[is_negative] / (now[is_negative] - solution[is_negative] + TINY)
+        steps_to_zero = present[is_negative] / (present[is_negative] - solution[is_negative] + TINY)
         step = float(np.min(steps_to_zero))
-        moved = now + step * (solution - now)
+        moved = present + step * (solution - present)
         is_dropped = is_negative & (moved <= ZERO_AMOUNT)
         if not is_dropped.any():
             is_dropped = is_negative

@@ -42,11 +42,13 @@ class Surface:
         return len(self.weight)
 
     def add(self, points_w: Floats, sd_m: Floats, outward_w: Floats, normal_weight: Floats | None = None) -> None:
-        """Add measured points.
+        """Add measured points, and merge them with the points in the same grid cell.
+
+        The cells become larger until there are no more than MAX_CELLS.
 
         Args:
-            points_w: (k, 2).
-            sd_m: (k,) standard deviations.
+            points_w: (k, 2) points in the world, m.
+            sd_m: (k,) their standard deviations.
             outward_w: (k, 2) unit vectors towards the sensor, or the normals of touches.
             normal_weight: (k,) information of `outward_w` as normals; None for points that were only seen.
         """
@@ -85,7 +87,17 @@ class Surface:
     def _fuse(
         self, points: Floats, weight: Floats, outward: Floats, normal: Floats, count: Floats, doubts: Floats
     ) -> None:
-        """Replace all cells by the weighted means of these points in each cell."""
+        """Replace all cells by points that are merged within each cell of the grid.
+
+        Args:
+            points: (k, 2) points in the world, m.
+            weight: (k,) information of the points in 1 / m².
+            outward: (k, 2) unit vectors out of the surface.
+            normal: (k,) information of `outward` as normals; 0 for points that were only seen.
+            count: (k,) number of measurements in each point.
+            doubts: (k,) number of scans that saw through each point.
+        """
+        # One integer identifies a grid cell: the cell number along x in the upper bits, along y in the lower ones.
         cell_numbers = np.floor(points / self.cell_m).astype(np.int64) @ np.array([1 << 31, 1])
         _, cell = np.unique(cell_numbers, return_inverse=True)
         total = np.bincount(cell, weight)

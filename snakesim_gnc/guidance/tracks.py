@@ -83,7 +83,12 @@ class Track:
         return self.log_odds * math.exp(-age_ns * 1e-9 / MEMORY_S)
 
     def to_obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
-        """Return the obstacle as a message."""
+        """Return the track as an obstacle of a world model.
+
+        Args:
+            now_ns: robot time; the confidence decreases with the time since the obstacle was last seen.
+            ground_z_m: height of the ground in the world.
+        """
         height_m = max(self.top_m, UNKNOWN_HEIGHT_M)
         x, y = self.center_w.tolist()
         yaw_rad = 0.0
@@ -131,7 +136,14 @@ class Track:
 
 
 def fit_shapes(tracks: Sequence[Track]) -> None:
-    """Fit the shapes of tracks to their surfaces, all at once."""
+    """Fit a circle or a box to the surface of each track, in one vectorized computation.
+
+    The shape with the lower cost is used: the misfit plus a penalty for each parameter (Bayesian information
+    criterion). A box is tried only for tracks with enough cells that a circle does not fit well.
+
+    Args:
+        tracks: the tracks, whose shapes are changed.
+    """
     if not tracks:
         return
     points, weight, outward, normal_weight = stack_surfaces([track.surface for track in tracks])

@@ -117,7 +117,15 @@ def describe_exception(error: BaseException, plugin: str = "") -> str:
 
 
 def _line_of_plugin(error: BaseException, package: str) -> tuple[str, int]:
-    """Return file and number of the newest line that the plugin's author has written, not NumPy's and not ours."""
+    """Return the file and the line of plugin code that was executing when an error was raised.
+
+    This is the innermost frame of the traceback that is not in SnakeSIM, in an installed package or in the standard
+    library. Otherwise it is the innermost frame of the package, or of all.
+
+    Args:
+        error: the error with its traceback.
+        package: top-level package of the plugin.
+    """
     import sysconfig  # as in `nearest`
     import traceback
 
@@ -127,8 +135,8 @@ def _line_of_plugin(error: BaseException, package: str) -> tuple[str, int]:
         module = str(frame.f_globals.get("__name__", ""))
         newest_first.insert(0, (module.partition(".")[0], frame.f_code.co_filename, line))
     for frame_package, file, line in newest_first:
-        installed = any(f"/{folder}/" in file for folder in INSTALLED_IN)
-        if frame_package not in OUR_PACKAGES and not installed and not file.startswith(standard):
+        is_installed = any(f"/{folder}/" in file for folder in INSTALLED_IN)
+        if frame_package not in OUR_PACKAGES and not is_installed and not file.startswith(standard):
             return file, line
     for frame_package, file, line in newest_first:
         if frame_package == package:

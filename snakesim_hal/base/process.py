@@ -122,13 +122,14 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def stop_signals_raise() -> Iterator[None]:
-    """Within, the first Ctrl-C, SIGTERM or closed terminal raises KeyboardInterrupt in the main thread.
+    """Raise KeyboardInterrupt in the main thread at the first Ctrl-C, SIGTERM or closed terminal in this context.
 
-    So `with` blocks end their workers and remove their files. A second signal ends the process at once.
+    `with` blocks can then end their workers and remove their files. A second signal ends the process at once.
     """
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        for number in replaced:  # SIGHUP comes twice of itself, from the kernel and from the shell
+        for number in replaced:
+            # A closed terminal sends SIGHUP twice, from the kernel and from the shell: the second one is ignored.
             signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
         raise KeyboardInterrupt
 

@@ -145,7 +145,7 @@ def corrupted(payload: bytes, rng: random.Random) -> bytes:
         case 4:
             _copy_burst(data, rng)
         case 5 if positions := _find_doubles(data):
-            begin = rng.choice(positions) + 1
+            begin = rng.choice(positions) + 1  # after the type byte of MessagePack
             data[begin : begin + FLOAT64_BYTES] = struct.pack(">d", rng.choice(NASTY_DOUBLES))
         case _:
             data = bytearray(rng.randbytes(rng.randint(0, 2 * len(data) + 1)))

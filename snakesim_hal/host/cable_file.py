@@ -48,13 +48,13 @@ class CableFile:
     """The file of one robot. `cables` counts the angles."""
 
     def __init__(self, folder: Path, joints: Sequence[Joint], robot: Description, now_s: float) -> None:
-        """Read the file, and count on from its angles.
+        """Read the stored angles of the joints with cables, and continue to count from them.
 
         Args:
-            folder: of the robot's state.
-            joints: of the robot file.
-            robot: its description, with the same joints in the same order.
-            now_s: Unix time.
+            folder: folder of the robot's state, with the cable file.
+            joints: the joints of the robot file.
+            robot: description of the robot, with the same joints in the same order.
+            now_s: wall time in s since the epoch.
         """
         self._path = folder / CABLES
         self._owners: dict[str, tuple[str, str]] = {}  # joint name -> drive, `cable_unwound`

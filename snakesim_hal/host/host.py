@@ -233,9 +233,10 @@ class Host:
             pass
 
     def iterate_ticks(self) -> Generator[None]:
-        """Tick until the run is over, like `run`.
+        """Run the control cycles of the host until the run is over, and close the host.
 
-        Yields in each tick after the clock is published, so that services can act in the same thread.
+        Yields:
+            Once a tick, after the clock is published, so that services can act in the same thread.
         """
         last: Samples | None = None
         self._state.clock.restart_deadlines()
@@ -248,12 +249,12 @@ class Host:
                     self._wait_while_paused()
                     continue
 
-                before = last
-                last = self._sample(before)
+                previous = last
+                last = self._sample(previous)
                 if last is None:
                     break
                 self._publish_samples(last)
-                if last is not before:
+                if last is not previous:
                     self._let_services_begin()
                     self._judge(last)
                 yield
@@ -337,7 +338,11 @@ class Host:
         self._cycle.observe(samples, now_ns)
 
     def _finish_tick(self, samples: Samples) -> None:
-        """Decide, record, drive the motors, let a control period pass, and look after everything else."""
+        """Finish a control cycle: decide on setpoints, record and send them, and wait for the next tick.
+
+        Args:
+            samples: the samples of this tick.
+        """
         state = self._state
         clock = state.clock
         command_tick = self._newest_command_tick()
@@ -359,9 +364,9 @@ class Host:
             self._cycle.advance()
         except BackendError as error:
             self._on_backend_failure(error)
-        took_ns = state.backend_time.record_write(started_ns)
+        write_ns = state.backend_time.record_write(started_ns)
         if self.authority.state == "armed":
-            self.statistics.times.write.add(took_ns / 1000)
+            self.statistics.times.write.add(write_ns / 1000)
 
         clock.tick += 1
         self._network_watch.note_problems()
@@ -435,21 +440,30 @@ class Host:
                 break
 
     def _wait_for_participants(self, samples: Samples) -> None:
-        """Handle input until every service that is due has answered, or has stalled for too long."""
+        """Handle input until every service that is due at this tick has answered, or has stalled for too long.
+
+        The host stops waiting for services that do not answer within `stall_limit_s`. The run's end ends the wait, too.
+
+        Args:
+            samples: the samples of this tick, which are published again if the robot is armed meanwhile.
+        """
         state = self._state
         tick = state.clock.tick
         state.waiting_since_ns = time.monotonic_ns()
         give_up_ns = state.waiting_since_ns + round(self._config.stall_limit_s * 1e9)
-        while (behind := self.participants.behind(tick)) and not state.ending.requested:
-            left_ns = give_up_ns - time.monotonic_ns()
+        while not state.ending.requested:
+            late_services = self.participants.behind(tick)
+            if not late_services:
+                break
+            remaining_ns = give_up_ns - time.monotonic_ns()
             if self._published_arm_session != self.authority.arm_session:  # armed in this tick: publish it
                 self._publish_samples(samples)
-            if left_ns > 0:
-                self._inbox.handle_next(min(left_ns * 1e-9, MAX_PARTICIPANT_WAIT_S))
+            if remaining_ns > 0:
+                self._inbox.handle_next(min(remaining_ns * 1e-9, MAX_PARTICIPANT_WAIT_S))
                 self._inject_faults()
                 self._status.publish()
             else:
-                for name in behind:
+                for name in late_services:
                     self._stop_waiting_for(name)
         state.waiting_since_ns = None
 

@@ -86,6 +86,12 @@ class RequestHandler:
         reply(self._with_host(answer))
 
     def _handle_lifecycle(self, request: LifecycleRequest, reply: Reply) -> None:
+        """Carry out a lifecycle request, and answer it.
+
+        Args:
+            request: what to do: arm, disarm, reset, or finish the run.
+            reply: function that sends the answer.
+        """
         if request.action == "arm":
             refusal = self._refuse_to_arm()
             if refusal is not None:
@@ -97,9 +103,10 @@ class RequestHandler:
             case "arm" if answer.ok:
                 self._state.forget_answers_before_arming()
             case "finish":
-                self._state.ending.request(
-                    "finished", f"on request by {request.requester}" if request.requester else "on request"
-                )
+                reason = "on request"
+                if request.requester:
+                    reason = f"on request by {request.requester}"
+                self._state.ending.request("finished", reason)
             case _:
                 pass
         self._finish(request, answer, reply)

@@ -40,7 +40,11 @@ class Durations:
         return self._find_percentile_us(list(accumulate(self._bins)), percent)
 
     def timing(self) -> Timing | None:
-        """Return percentiles and a coarse histogram; None if there are no durations."""
+        """Return percentiles and a coarse histogram of the durations, from their logarithmic bins.
+
+        Returns:
+            The statistics in microseconds, or None if there are no durations.
+        """
         bins = self._bins.copy()  # the host's thread may add to it meanwhile
         cumulative = list(accumulate(bins))
         count = cumulative[-1]
@@ -48,15 +52,16 @@ class Durations:
             return None
         first = bisect_left(cumulative, 1)  # the first bin that is not empty
         end = bisect_left(cumulative, count) + 1  # behind the last bin that is not empty
-        width = -(-(end - first) // SHOWN_BINS)  # in bins, rounded up
+        bins_per_shown = -(-(end - first) // SHOWN_BINS)  # rounded up
+        shown_bins = [sum(bins[begin : begin + bins_per_shown]) for begin in range(first, end, bins_per_shown)]
         return Timing(
             count=count,
             median_us=self._find_percentile_us(cumulative, 50),
             p99_us=self._find_percentile_us(cumulative, 99),
             max_us=math.exp((end - 1) * self._step),
             low_us=math.exp((first - 0.5) * self._step),
-            bin_decades=width * self._step / math.log(10),
-            bins=[sum(bins[begin : begin + width]) for begin in range(first, end, width)],
+            bin_decades=bins_per_shown * self._step / math.log(10),
+            bins=shown_bins,
         )
 
     def _find_percentile_us(self, cumulative: list[int], percent: float) -> float:

@@ -82,24 +82,26 @@ def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], rob
         return ""
     if checked is None:
         return "its joints have not been checked against its file: check them (docs/hardware/calibration.md)"
-    again = "check it again (docs/hardware/calibration.md)"
+    remedy = "check it again (docs/hardware/calibration.md)"
     since = f"since {checked.by} checked it on {checked.on}"
     if checked.joints != mounting_digest(joints):
-        return f"how its joints are mounted was changed in its file {since}: {again}"
+        return f"how its joints are mounted was changed in its file {since}: {remedy}"
     unconfirmed = [name for name in PROPERTIES if name not in checked.confirmed]
     if unconfirmed:
         return (
             f"the check by {checked.by} on {checked.on} did not confirm of every joint: {', '.join(unconfirmed)}: "
-            f"{again}"
+            f"{remedy}"
         )
     drives_report_serials = any(joint.serial for joint in robot.joints)
     if drives_report_serials or any(checked.serials):
         replaced = _replaced_drives(checked, robot)
-        return f"{'; '.join(replaced)}: changed {since}: {again}" if replaced else ""
+        if not replaced:
+            return ""
+        return f"{'; '.join(replaced)}: changed {since}: {remedy}"
     if (checked.backend, checked.hardware) != (robot.backend, robot.hardware):
         checked_on = f"{checked.backend} {checked.hardware}"
         now_on = f"{robot.backend} {robot.hardware}"
-        return f"its drives do not report an identity, and it is on {now_on} now, {checked_on} {since}: {again}"
+        return f"its drives do not report an identity, and it is on {now_on} now, {checked_on} {since}: {remedy}"
     return ""
 
 

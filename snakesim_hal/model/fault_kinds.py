@@ -316,7 +316,7 @@ def check_targets(injections: Iterable[Injection], *, services: Iterable[str], j
         buses: number of buses.
 
     Raises:
-        ConfigError: The run has no such joint, bus, process or key, or the router cannot do it.
+        ConfigError: The run has no such joint, bus, process or key, or the router does not support the fault.
     """
     processes = [*services, "host", ROUTER]
     for injection in injections:

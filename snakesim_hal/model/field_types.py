@@ -89,7 +89,15 @@ def _violation_of_tag(
 
 
 def _parts(value: Any, expected: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield every part inside of a value as (step, part, expected type)."""
+    """Yield every field of a section and every entry of a dictionary, list or tuple inside of a value.
+
+    Args:
+        value: as read from TOML or JSON.
+        expected: the expected type, which may be a union.
+
+    Yields:
+        The name or number of the part, the part itself, and the type that is expected of it.
+    """
     for option in _options(expected):
         container = get_origin(option)
         arguments = get_args(option)

@@ -99,6 +99,7 @@ def describe_range(info: inspect.Type) -> str:
 
 
 def _describe_limits(option: inspect.Type) -> str:
+    """Return the allowed values of a type in words, such as ">= 0, < 1"; empty for a type without limits."""
     match option:
         case inspect.FloatType() | inspect.IntType():
             bounds = ((">=", option.ge), (">", option.gt), ("<=", option.le), ("<", option.lt))

@@ -197,13 +197,18 @@ def _hint_for_unknown(name: str, kind: str) -> str:
 
 
 def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tuple[Path, ...] = ()) -> Table:
-    """Read a robot or a scene. A file with `extends = "planar13"` contains only what differs from that robot.
+    """Read a robot or scene file, merged into the file that it extends, if any.
+
+    A file with `extends = "planar13"` contains only what differs from that robot.
 
     Args:
         name: of a shipped file, or the path of any file.
         kind: `robots` or `scenes`.
         beside: folder that a relative path starts from; None: the working folder.
-        extended: the files that extend this one, which it cannot extend in turn.
+        extended: the files that extend this one, directly or indirectly; this file must not extend them in turn.
+
+    Returns:
+        All values, each with the file that it comes from.
 
     Raises:
         ConfigError: A file is missing or not valid, or files extend each other.
@@ -220,10 +225,10 @@ def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tup
         return table
     if not isinstance(base, str):
         raise ConfigError(f"{path}: `extends` = {shorten(repr(base))} must be the name or the path of another file")
-    whole = read_part(base, kind, path.parent, extended=(*extended, path.resolve()))
-    for dotted, value in _settings(table.values):
-        whole.set_value(dotted, value, str(path))
-    return whole
+    merged = read_part(base, kind, path.parent, extended=(*extended, path.resolve()))
+    for dotted_key, value in _settings(table.values):
+        merged.set_value(dotted_key, value, str(path))
+    return merged
 
 
 def _settings(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -266,9 +271,9 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
         assert violation is not None, error
         raise ConfigError(_explain(violation, table, under), code=_choose_code(violation)) from None
     except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
-        odd = ascii(error.object[error.start : error.end])[:MAX_SHOWN_TEXT]
+        invalid_text = ascii(error.object[error.start : error.end])[:MAX_SHOWN_TEXT]
         raise ConfigError(
-            f"{table.source}: a key or a text holds {odd}, which is not a character; write it again"
+            f"{table.source}: a key or a text holds {invalid_text}, which is not a character; write it again"
         ) from None
 
 
@@ -315,26 +320,36 @@ def _explain_unknown(violation: Violation, table: Table, dotted: str, full_key: 
         full_key: the whole key of the field.
     """
     name = violation.steps[-1]
-    elsewhere = [shorten(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(full_key)]
     suggestion = find_nearest_word(name, violation.known)
-    if not suggestion and elsewhere:
-        suggestion = elsewhere[0]
-    hint = f"did you mean `{suggestion}`?" if suggestion else f"known fields: {', '.join(sorted(violation.known))}."
+    if not suggestion:
+        same_name_keys = [key for key in table.origin if key.endswith(f".{name}") and not key.startswith(full_key)]
+        if same_name_keys:
+            suggestion = shorten(same_name_keys[0])
+    hint = f"known fields: {', '.join(sorted(violation.known))}."
+    if suggestion:
+        hint = f"did you mean `{suggestion}`?"
     origins = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
     origin = origins[0] if origins else table.file_of(dotted)
     return f"{origin}: unknown field `{dotted}`; {hint}"
 
 
 def _explain_wrong(violation: Violation, table: Table, dotted: str) -> str:
-    """Return the error text for a value that is not allowed."""
+    """Return the error text for a value that is not allowed.
+
+    Args:
+        violation: the value, the type that is expected, and the error of msgspec.
+        table: all values with their origins.
+        dotted: dotted key of the value; empty for the whole file.
+    """
     value = violation.value
     why = violation.why
     origin = table.origin_of(dotted)
     if origin == "default":
         origin = table.file_of(dotted)
 
-    each_field_is_right = isinstance(value, dict) and not why.startswith("Expected")
-    if each_field_is_right:  # the check of the whole section has failed
+    # A section whose fields all have the right type can still fail the check of the section as a whole.
+    section_check_failed = isinstance(value, dict) and not why.startswith("Expected")
+    if section_check_failed:
         return f"{origin}: `{dotted}`: {why}" if dotted else f"{origin}: {why}"
 
     info = msgspec.inspect.type_info(violation.expected)

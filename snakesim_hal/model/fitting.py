@@ -23,12 +23,17 @@ def spacing_m(robot: RobotFile) -> float | None:
 
 
 def fit_scene(scene: SceneFile, robot: RobotFile, is_set_by_flag: Callable[[str], bool]) -> dict[str, Any]:
-    """Return the values of a scene that differ for this robot, by dotted key below `scene`.
+    """Scale a scene to another robot than the one that it was laid out for.
+
+    The route and the corridors between pegs scale with the joint spacing. Clearances grow with the radius of the body.
 
     Args:
-        scene: laid out for its `reference_robot`.
+        scene: the scene, laid out for its `reference_robot`.
         robot: the robot of the run.
         is_set_by_flag: returns whether a flag sets the value of a key; such a value does not change.
+
+    Returns:
+        The changed values, by dotted key below `scene`; empty if the scene fits already or has no reference robot.
     """
     reference_robot = scene.reference_robot
     robot_spacing_m = spacing_m(robot)

@@ -206,7 +206,19 @@ def _joint_rotations(axis: str, angles_rad: Floats) -> Floats:
 def _yaw_only_frames(
     base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
 ) -> tuple[Floats, Floats]:
-    """Compute the frames without a loop: all joints rotate about the same axis, so their angles add up."""
+    """Return the frames of all links of a chain whose joints all rotate about the base's vertical axis.
+
+    The angles of such joints add up, so that no loop over the links is needed.
+
+    Args:
+        base_w: (3,) the tail end, m.
+        base_rotation: (3, 3) world_from_base.
+        angles_rad: (n_joints,) joint angles, tail to head.
+        link_lengths_m: n_joints + 1 lengths, tail to head.
+
+    Returns:
+        Origins (n_links, 3) in m, and rotations world_from_link (n_links, 3, 3).
+    """
     yaw_rad = np.concatenate(([0.0], np.cumsum(angles_rad)))  # of each link, relative to the base
     cosine = np.cos(yaw_rad)[:, None]
     sine = np.sin(yaw_rad)[:, None]

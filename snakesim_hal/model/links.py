@@ -87,15 +87,15 @@ def capsule_inertia(length_m: float, radius_m: float, mass_kg: float) -> tuple[f
     The center of a hemisphere is 3/8 of the radius from its flat side.
 
     Args:
-        length_m: without the caps.
-        radius_m: of tube and caps.
-        mass_kg: of the whole capsule.
+        length_m: length of the tube, without the hemispheres.
+        radius_m: radius of the tube and the hemispheres.
+        mass_kg: mass of the whole capsule.
     """
     # Volumes, divided by the area of the cross-section.
-    tube = length_m
-    ball = 4 * radius_m / 3
-    tube_kg = mass_kg * tube / (tube + ball)
-    ball_kg = mass_kg * ball / (tube + ball)
+    tube_m = length_m
+    ball_m = 4 * radius_m / 3
+    tube_kg = mass_kg * tube_m / (tube_m + ball_m)
+    ball_kg = mass_kg * ball_m / (tube_m + ball_m)
     along = (tube_kg / 2 + ball_kg * 2 / 5) * radius_m**2
     across = tube_kg * (radius_m**2 / 4 + length_m**2 / 12)
     across += ball_kg * (2 * radius_m**2 / 5 + length_m**2 / 4 + 3 * length_m * radius_m / 8)

@@ -196,7 +196,8 @@ def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) ->
     height_m = max(link.radius_m for link in snake)
     obstacles = [_at_height(item, height_m) for item in placed if not item.walkable]
     overlaps_m = _overlaps_m(snake, obstacles)
-    for obstacle_index, link_index in np.argwhere(overlaps_m.T > OVERLAP_M)[:1]:
+    overlapping_pairs = np.argwhere(overlaps_m.T > OVERLAP_M)  # (k, 2) indices of obstacle and link
+    for obstacle_index, link_index in overlapping_pairs[:1]:
         overlap_mm = overlaps_m[link_index, obstacle_index] * 1000
         raise ConfigError(
             f"scene {scene.name!r}: obstacle {obstacles[obstacle_index].name!r} overlaps {snake[link_index].name} of "

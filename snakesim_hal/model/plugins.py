@@ -38,22 +38,22 @@ _offered: dict[tuple[str, str], Any] = {}
 
 @contextlib.contextmanager
 def offer_plugin(group: str, name: str, plugin: Any) -> Iterator[None]:
-    """Let a name stand for an object, even if a plugin of that name is installed.
+    """Register an object as a plugin in this process, for as long as the context lasts.
 
-    This holds in this process, and as long as the context is open.
+    It has precedence over an installed plugin of the same name.
 
     Args:
         group: one of the groups of entry points.
         name: of the plugin.
         plugin: the object that `find_plugin` returns for the name.
     """
-    before = _offered.copy()
+    previously_offered = _offered.copy()
     _offered[group, name] = plugin
     try:
         yield
     finally:
         _offered.clear()
-        _offered.update(before)
+        _offered.update(previously_offered)
 
 
 def anything_offered() -> bool:

@@ -141,7 +141,16 @@ def _areas_to_keep_free(field: RandomField, route: Route | None, snake: Sequence
 
 
 def _check(field: RandomField, where: str, route: Route | None) -> None:
-    """Raise ConfigError for values that are wrong together. `where` names the field."""
+    """Check values of a random field that depend on one another.
+
+    Args:
+        field: the random field.
+        where: names the field in errors.
+        route: route of the scene, if it has one.
+
+    Raises:
+        ConfigError: corners or sizes are out of order, a route is missing, or there would be too many obstacles.
+    """
     if not np.all(np.array(field.max_corner_m) > np.array(field.min_corner_m)):
         raise ConfigError(
             f"{where}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
@@ -150,7 +159,8 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
         )
     for name in ("radius_m", "box_size_m"):
         sizes = getattr(field, name)
-        if sizes[1] < sizes[0]:
+        min_size, max_size = sizes
+        if max_size < min_size:
             raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid")
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(

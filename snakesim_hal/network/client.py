@@ -181,7 +181,7 @@ class Client:
             feed.store_arrived(newest_only=newest_only)
 
     def _take_next_clock(self, timeout_s: float | None) -> Clock:
-        """Return the next due clock from the queue.
+        """Return the next due clock from the queue, and drop the clocks that it replaces.
 
         In lockstep this is the newest clock of the next tick, because the host repeats a tick's clock while time
         is paused. Otherwise it is the newest clock of all. A pause is never skipped.
@@ -192,12 +192,12 @@ class Client:
         clock = self._next_clock or self._clocks.get(timeout=timeout_s)
         self._next_clock = None
         while not self._clocks.empty():
-            following = self._clocks.get()
-            is_next_tick = clock.clock_mode == "lockstep" and following.tick != clock.tick
-            if is_next_tick or following.paused != clock.paused:
-                self._next_clock = following
+            later_clock = self._clocks.get()
+            is_next_lockstep_tick = clock.clock_mode == "lockstep" and later_clock.tick != clock.tick
+            if is_next_lockstep_tick or later_clock.paused != clock.paused:
+                self._next_clock = later_clock  # the next call returns it
                 break
-            clock = following
+            clock = later_clock
         return clock
 
     def wait_for_clock(self, timeout_s: float) -> Clock | None:
@@ -253,22 +253,31 @@ class Client:
         return sample
 
     def _find_sample(self, feed: Feed[MessageT]) -> MessageT | None:
+        """Return the sample of a feed that the current tick refers to; None if there is none (yet).
+
+        In lockstep, `Clock.newest` names the tick of a sample, by its key or by the first part of its key. An armed
+        robot waits for the named sample.
+
+        Raises:
+            StalledError: a named sample does not arrive in time.
+        """
         clock = self._clock
         if clock is None:
             return None
         if clock.clock_mode != "lockstep":
             return feed.newest()
-        tick = clock.newest.get(feed.key)
-        if tick is None:
-            tick = clock.newest.get(feed.key.partition("/")[0])
-        if tick is None:
+        sample_tick = clock.newest.get(feed.key)
+        if sample_tick is None:
+            key_prefix = feed.key.partition("/")[0]
+            sample_tick = clock.newest.get(key_prefix)
+        if sample_tick is None:
             if feed.key.startswith("sensor/"):
-                # A delayed sensor has no sample yet at this tick. What the feed has is of a host that is ahead.
+                # A delayed sensor has no sample yet at this tick. A sample in the feed is from a later tick.
                 return None
             return feed.newest()
-        sample = feed.at(tick)
+        sample = feed.at(sample_tick)
         if sample is None and clock.lifecycle == "armed":
-            sample = self._wait_for_sample(feed, tick, clock)
+            sample = self._wait_for_sample(feed, sample_tick, clock)
         return sample
 
     def _wait_for_sample(self, feed: Feed[MessageT], tick: int, clock: Clock) -> MessageT:
@@ -293,17 +302,23 @@ class Client:
         Raises:
             WireError: no reader would accept the message; nothing is sent.
         """
-        robot = self._filter.robot
         try:
-            custom_message = None if robot is None else find_custom_message(key, robot)
-            payload = encode_checked(key, message, custom_message)
-            error = None if robot is None else find_mismatch(message, robot)
-            if error is not None:
-                raise error
+            payload = self._encode_for_robot(key, message)
         except WireError as error:
-            which = _describe_output(key, message)
-            raise WireError(error.reason, f"{which} cannot be published: {error.detail}") from None
+            output = _describe_output(key, message)
+            raise WireError(error.reason, f"{output} cannot be published: {error.detail}") from None
         self._publisher(key, type(message)).put(message, payload)
+
+    def _encode_for_robot(self, key: str, message: Message) -> bytes:
+        """Return the encoded message. Raises WireError if it is not valid, or does not fit a known robot."""
+        robot = self._filter.robot
+        if robot is None:
+            return encode_checked(key, message, None)
+        payload = encode_checked(key, message, find_custom_message(key, robot))
+        mismatch = find_mismatch(message, robot)
+        if mismatch is not None:
+            raise mismatch
+        return payload
 
     def report_done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""
@@ -344,14 +359,23 @@ class Commander:
         self.refusal: str | None = None  # why the last request of the lease was refused
 
     def ensure_lease(self, clock: Clock) -> bool:
-        """Return whether this service holds the lease at a tick. Requests a lease that it does not hold.
+        """Request the command lease if this service does not hold it.
 
-        While the robot is armed it requests nothing. It waits for the host's answer, at most two seconds.
+        A request waits for the host's answer, at most two seconds. No request is sent while the robot is armed, or
+        within LEASE_RETRY_S of the last request. If the host refuses, `refusal` has the reason.
+
+        Args:
+            clock: of the current tick; it names the lease that the host considers valid.
+
+        Returns:
+            Whether this service holds the lease now.
         """
-        if self._epoch and clock.lease_epoch == self._epoch:
+        holds_lease = self._epoch and clock.lease_epoch == self._epoch
+        if holds_lease:
             return True
         now_s = time.monotonic()
-        if clock.lifecycle == "armed" or now_s - self._last_request_s < LEASE_RETRY_S:
+        has_asked_recently = now_s - self._last_request_s < LEASE_RETRY_S
+        if clock.lifecycle == "armed" or has_asked_recently:
             return False
         self._last_request_s = now_s
         request = LeaseRequest(action="acquire", holder=self._client.service)

@@ -28,12 +28,12 @@ class CommandingClient:
     """Takes the place of the run's control service, from construction to the end of the session."""
 
     def __init__(self, session: Session, robot: Description, clock_mode: ClockMode) -> None:
-        """Acquire the lease.
+        """Subscribe to the robot's samples, and wait until this client holds the command lease.
 
         Args:
             session: a session in the robot's namespace.
-            robot: its description.
-            clock_mode: of the run.
+            robot: description of the robot.
+            clock_mode: clock mode of the run.
 
         Raises:
             RefusedError: another client commands the robot.
@@ -124,12 +124,12 @@ class CommandingClient:
         """Command ticks as `turn` does until a condition is true.
 
         Args:
-            condition: is checked after each tick.
-            limit_s: how long it may take.
-            why: returns the text of the error.
+            condition: function that is called after each tick; True ends the wait.
+            limit_s: maximum wall time until the condition is true.
+            why: function that returns the text of the error.
 
         Raises:
-            RefusedError: the condition is not true in time.
+            RefusedError: the condition is not true within `limit_s`.
         """
         deadline = time.monotonic() + limit_s
         while True:

@@ -158,20 +158,21 @@ def _describe_failure(link: Link, error: zenoh.ZError) -> NotConnectedError:
 
 @contextmanager
 def limit_receiving_threads(count: int) -> Iterator[None]:
-    """Set the number of Zenoh's receiving threads in this process, unless the user has set it.
+    """Limit the number of Zenoh's receiving threads in this process while the context opens a session.
 
-    Child processes do not inherit the setting. Any number of threads may open sessions at once; Zenoh reads the
+    The number is passed by an environment variable. If the user has set the variable, it remains unchanged. Child
+    processes do not inherit the setting. Any number of threads may open sessions at once; Zenoh reads the
     environment variable when the first of them opens.
     """
     with _environment_lock:
-        set_by_user = RUNTIME in os.environ and not _opening_counts
-        if not set_by_user:
+        is_set_by_user = RUNTIME in os.environ and not _opening_counts
+        if not is_set_by_user:
             _opening_counts.append(count)
             os.environ.setdefault(RUNTIME, f"(rx: (worker_threads: {count}))")
     try:
         yield
     finally:
-        if not set_by_user:
+        if not is_set_by_user:
             with _environment_lock:
                 _opening_counts.remove(count)
                 if not _opening_counts:

@@ -64,31 +64,37 @@ def robot_folder(robot: str, backend: str, hardware: str) -> Path:
 
 @contextlib.contextmanager
 def registered(robot: LocalRobot) -> Iterator[str | None]:
-    """Register a robot for tools, for as long as the context lasts.
+    """Register a robot for command-line tools on this computer, for as long as the context lasts.
+
+    The robot is described in a file that is named after the process. A lock on the open file shows that the process
+    still runs.
+
+    Args:
+        robot: the entry to write.
 
     Yields:
-        The reason why tools will not find it, if the file cannot be written; otherwise None.
+        None, or if the file cannot be written, the reason why tools will not find the robot.
     """
     path = _live() / f"{robot.pid}.json"
+    consequence = "`snakesim status` and `estop` find this run only with --endpoint"
     failure = None
-    only = "`snakesim status` and `estop` find this run only with --endpoint"
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
-        yield f"{path}: {error.strerror}; {only}"
+        yield f"{path}: {error.strerror}; {consequence}"
         return
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        os.write(handle, json.dumps(asdict(robot)).encode())
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        os.write(descriptor, json.dumps(asdict(robot)).encode())
     except OSError as error:
-        failure = f"{path}: {error.strerror}; {only}"
+        failure = f"{path}: {error.strerror}; {consequence}"
     try:
         yield failure
     finally:
         with contextlib.suppress(OSError):
             path.unlink()
-        os.close(handle)
+        os.close(descriptor)
 
 
 def local_robots() -> list[LocalRobot]:

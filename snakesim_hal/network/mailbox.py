@@ -40,10 +40,13 @@ class Mailbox(Generic[ItemT]):
         return len(self._lanes[lane]) == self._lanes[lane].maxlen
 
     def get(self, timeout: float | None = None) -> ItemT:
-        """Take the oldest item of the lowest lane. Waits for one, at most `timeout` seconds; None: without a limit.
+        """Remove and return the oldest item of the first lane that is not empty. Wait for an item if there is none.
+
+        Args:
+            timeout: how long to wait, in seconds; None: without a limit.
 
         Raises:
-            queue.Empty: there is no item in time, as in the queues of the standard library.
+            queue.Empty: no item came in time, as in the queues of the standard library.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
@@ -53,10 +56,10 @@ class Mailbox(Generic[ItemT]):
             if deadline is None:
                 self._bell.acquire()
                 continue
-            left_s = deadline - time.monotonic()
-            if left_s <= 0.0:
+            remaining_s = deadline - time.monotonic()
+            if remaining_s <= 0.0:
                 raise Empty
-            self._bell.acquire(timeout=left_s)
+            self._bell.acquire(timeout=remaining_s)
 
     def wait(self, timeout: float) -> None:
         """Wait until there is an item, at most `timeout` seconds, without taking it."""

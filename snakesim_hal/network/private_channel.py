@@ -53,19 +53,23 @@ class HostEnd:
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
     def serve(self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
-        """Call `handle(request, reply)` for each request, from a separate thread."""
-        opened = self._socket
-        if opened is None:
+        """Start a thread that receives the requests of the parent process; do nothing without a parent process.
+
+        Args:
+            handle: called as `handle(request, reply)` for each request; `reply` sends the answer.
+        """
+        channel = self._socket
+        if channel is None:
             return
         decoder = msgspec.msgpack.Decoder(LifecycleRequest)
 
         def receive_requests() -> None:
             while True:
                 try:
-                    request = opened.recv(MAX_BYTES)
+                    request = channel.recv(MAX_BYTES)
                 except OSError:
                     return
-                if not request:
+                if not request:  # the parent process has closed its end
                     return
                 handle(decoder.decode(request), lambda answer: self.send(HostMessage(answer=answer)))
 

@@ -48,16 +48,19 @@ class Probe:
         Args:
             patterns: keys to listen to; they may have wildcards.
             listen_s: how long to listen.
+
+        Returns:
+            The offset in s of each key on which a sample with a timestamp arrived.
         """
         offsets_s: dict[str, list[float]] = defaultdict(list)
 
-        def take(sample: zenoh.Sample) -> None:
+        def add_offset(sample: zenoh.Sample) -> None:
             if sample.timestamp is not None:
-                sent = sample.timestamp.get_time().astimezone(UTC)
-                offset = sent - datetime.now(UTC)
+                sent_at = sample.timestamp.get_time().astimezone(UTC)
+                offset = sent_at - datetime.now(UTC)
                 offsets_s[str(sample.key_expr)].append(offset.total_seconds())
 
-        subscribers = [self._session.declare_subscriber(pattern, take) for pattern in patterns]
+        subscribers = [self._session.declare_subscriber(pattern, add_offset) for pattern in patterns]
         time.sleep(listen_s)
         for subscriber in subscribers:
             subscriber.undeclare()

@@ -34,44 +34,54 @@ UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
 
 def find_mismatch(message: Message, robot: Description) -> WireError | None:
-    """Return the error of a message that does not fit a robot, with a reason to count by; None if it fits."""
-    joints = len(robot.joints)
+    """Check whether the list lengths, link numbers, rotations and path of a message fit a robot.
+
+    Args:
+        message: a decoded message of any class; classes without a check always fit.
+        robot: the description of the robot.
+
+    Returns:
+        The error, or None if the message fits. `WireError.reason` is a short code, such as `wrong_length`.
+    """
+    joint_count = len(robot.joints)
     last_link = len(robot.links) - 1
     match message:
         case JointState():
-            return (
-                None
-                if message.has_joint_count(joints)
-                else _check_lengths(message, JOINT_STATE_LISTS, joints, "one a joint")
-            )
+            if message.has_joint_count(joint_count):
+                return None
+            return _check_lengths(message, JOINT_STATE_LISTS, joint_count, "one a joint")
         case Power():
-            return _check_lengths(message, POWER_LISTS, joints, "one a joint")
+            return _check_lengths(message, POWER_LISTS, joint_count, "one a joint")
         case Imu():
-            wrong = _check_lengths(message, IMU_LISTS, len(message.link), "one for each of Imu.link")
-            return wrong or _check_link("Imu.link", max(message.link, default=0), last_link)
+            error = _check_lengths(message, IMU_LISTS, len(message.link), "one for each of Imu.link")
+            return error or _check_link("Imu.link", max(message.link, default=0), last_link)
         case Contacts():
             return _check_contacts(message, last_link)
-        case DepthImage() | ColorImage():
-            pixels = message.width * message.height
-            if isinstance(message, DepthImage):
-                wrong = _check_lengths(message, ("depth",), 2 * pixels, "two bytes a pixel")
-            else:
-                wrong = _check_lengths(message, ("rgb",), 3 * pixels, "three bytes a pixel")
-            return wrong or _check_mount(message, last_link)
+        case DepthImage():
+            error = _check_lengths(message, ("depth",), 2 * message.width * message.height, "two bytes a pixel")
+            return error or _check_mount(message, last_link)
+        case ColorImage():
+            error = _check_lengths(message, ("rgb",), 3 * message.width * message.height, "three bytes a pixel")
+            return error or _check_mount(message, last_link)
         case MountedSample():
             return _check_mount(message, last_link)
         case World():
-            wrong = _check_contacts(message, last_link)
-            return wrong or _check_rotation("World.base_orientation_wxyz", message.base_orientation_wxyz)
+            error = _check_contacts(message, last_link)
+            return error or _check_rotation("World.base_orientation_wxyz", message.base_orientation_wxyz)
         case Pose():
             return _check_rotation("Pose.orientation_wxyz", message.orientation_wxyz)
         case Trajectory():
-            if _is_path(np.array(message.path_w)):
-                return None
-            allowed = f"no two neighbors alike, no longer than {MAX_PATH_M:g} m, and no point further off"
-            return WireError("no_path", f"Trajectory.path_w of {len(message.path_w)} points is no path: {allowed}")
+            return _check_path(message)
         case _:
             return None
+
+
+def _check_path(trajectory: Trajectory) -> WireError | None:
+    """Return the error of a trajectory whose points are not a usable path."""
+    if _is_path(np.array(trajectory.path_w)):
+        return None
+    allowed = f"no two neighbors alike, no longer than {MAX_PATH_M:g} m, and no point further off"
+    return WireError("no_path", f"Trajectory.path_w of {len(trajectory.path_w)} points is no path: {allowed}")
 
 
 def _check_lengths(message: Message, fields: Sequence[str], expected_length: int, why: str) -> WireError | None:

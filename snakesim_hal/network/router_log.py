@@ -67,8 +67,9 @@ class RouterLog:
         self._dropped = 0  # lines since the last report
 
     def process_line(self, line: str) -> None:
-        """Process one line of Zenoh's log."""
-        if ALLOWED in line and LIST_END not in line:
+        """Process one line of Zenoh's log: write it, shortened, if it is relevant, and store names in certificates."""
+        is_permission = ALLOWED in line and LIST_END not in line
+        if is_permission:
             return
         line = COLOR.sub("", line)
         parts = HEAD.fullmatch(line)
@@ -77,11 +78,15 @@ class RouterLog:
             return
         text = parts["text"]
         if parts["module"].endswith("access_control"):
-            self._take_decision(parts["thread"], text)
-        elif certified := CERTIFIED.fullmatch(text):
-            _keep(self._names, certified["address"], certified["name"])
-        elif accepted := LET_IN.match(text):
-            self._report_connection(accepted["session"], accepted["address"])
+            self._process_access_decision(parts["thread"], text)
+            return
+        certificate = CERTIFIED.fullmatch(text)
+        if certificate is not None:
+            _keep(self._names, certificate["address"], certificate["name"])
+            return
+        connection = LET_IN.match(text)
+        if connection is not None:
+            self._report_connection(connection["session"], connection["address"])
         elif parts["level"] != "DEBUG":
             self._write_once(f"{parts['level']} {parts['module']}: {text}")
 
@@ -99,18 +104,22 @@ class RouterLog:
         if dropped:
             self._write(f"{dropped} lines left out: more than {LINES_PER_INTERVAL} different ones a minute")
 
-    def _take_decision(self, thread: str, text: str) -> None:
+    def _process_access_decision(self, thread: str, text: str) -> None:
         """Process a line of the access control: a refusal, a part of a list, or a session that no rule names."""
-        refused = REFUSED.fullmatch(text)
         if LIST_BEGIN in text:
             self._listing.add(thread)
-        elif thread in self._listing:
+            return
+        if thread in self._listing:
             if LIST_END in text:
                 self._listing.discard(thread)
-        elif refused is not None:
-            name = self._find_name(refused["session"], refused["subject"] or "")
-            self._write_once(f"refused: {name}: {refused['what']}")
-        elif unmatched := UNMATCHED.match(text):
+            return
+        refusal = REFUSED.fullmatch(text)
+        if refusal is not None:
+            name = self._find_name(refusal["session"], refusal["subject"] or "")
+            self._write_once(f"refused: {name}: {refusal['what']}")
+            return
+        unmatched = UNMATCHED.match(text)
+        if unmatched is not None:
             _keep(self._unmatched, unmatched["session"], "")
 
     def _find_name(self, session: str, subject: str) -> str:
@@ -152,16 +161,20 @@ def _keep(entries: dict[str, str], key: str, value: str) -> None:
 
 @contextlib.contextmanager
 def short_log() -> Iterator[None]:
-    """Send Zenoh's output on stdout shortened to stderr, for as long as the context lasts. Our output is unchanged."""
+    """Write a short form of Zenoh's log to stderr, for as long as the context lasts.
+
+    Zenoh writes its log to the file descriptor of stdout. The descriptor is replaced by a pipe, and a thread reads the
+    pipe. `sys.stdout` is redirected to a copy of the original descriptor, so that Python's output is unchanged.
+    """
     log = RouterLog(_to_stderr)
-    reading, writing = os.pipe()
-    os.set_blocking(reading, False)
-    with contextlib.suppress(PermissionError):  # the user has too many pipes
-        fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    source = os.fdopen(reading, "rb", buffering=0)
+    read_end, write_end = os.pipe()
+    os.set_blocking(read_end, False)
+    with contextlib.suppress(PermissionError):  # the pipes of this user are too large already
+        fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    source = os.fdopen(read_end, "rb", buffering=0)
     with open(os.dup(1), "w", buffering=1) as stdout:  # noqa: PTH123 - a descriptor
-        os.dup2(writing, 1)
-        os.close(writing)
+        os.dup2(write_end, 1)
+        os.close(write_end)
         reader = start_worker("log", lambda: _read_pipe(source, log))
         try:
             with contextlib.redirect_stdout(stdout):

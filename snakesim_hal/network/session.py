@@ -78,17 +78,22 @@ class Session:
             key: where it publishes.
             message: the type of its messages; it decides the priority.
             lossless: True: `put` waits for slow subscribers (lockstep); False: samples are dropped for them.
+
+        Returns:
+            The publisher, which is undeclared when this session is closed.
         """
-        is_command = key == keys.JOINT_COMMAND
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
-        ends_a_tick = is_command or key == keys.CLOCK or key.startswith(keys.done_key(""))
+        ends_a_tick = key in (keys.JOINT_COMMAND, keys.CLOCK) or key.startswith(keys.done_key(""))
+        congestion_control = zenoh.CongestionControl.DROP
+        if lossless:
+            congestion_control = zenoh.CongestionControl.BLOCK
         session = self._zenoh
         if message in IMAGES and not lossless:  # in lockstep a clock must not overtake the images that it names
             session = self._open_image_session()
         publisher = session.declare_publisher(
             key,
             encoding=format_encoding(message),
-            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+            congestion_control=congestion_control,
             priority=_choose_priority(key, message),
             express=ends_a_tick,
         )
@@ -261,7 +266,17 @@ class Session:
         return ((key, answer) for key, answer in answers if isinstance(answer, Answer))
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        """Yield every answer with its key. An answer that cannot be decoded is counted, and its error is yielded."""
+        """Send a request to all hosts whose keys match a pattern, and yield their answers.
+
+        Args:
+            pattern: key of the request; it may have wildcards.
+            request: the message to send.
+            timeout_s: how long to wait for answers.
+
+        Yields:
+            The key and the answer of each host. If the answer cannot be decoded, it is counted in `rejected`, and the
+            error is yielded instead.
+        """
         replies = self._zenoh.get(
             pattern,
             payload=encode(request),

@@ -50,20 +50,41 @@ class SessionFile:
 
 
 def read_session(path: Path) -> SessionFile:
-    """Read and check a session file, without connecting.
+    """Read and check a Zenoh session file, without connecting.
+
+    Args:
+        path: a JSON5 file for a Zenoh client. It may contain one namespace, and must not contain `listen.endpoints`.
+
+    Returns:
+        The path, text, router endpoints and namespace of the file.
 
     Raises:
         ConfigError: the file cannot be read, or is not a session file for SnakeSIM.
     """
     text, settings = read_zenoh_file(path)
-    for key, expected in REQUIRED.items():
-        value = json.loads(settings.get_json(key))
-        if value != expected and (value is not None or key == "mode"):
-            dotted_key = key.replace("/", ".")
-            present = "missing" if value is None else json.dumps(value)
-            raise ConfigError(
-                f"{path}: `{dotted_key}` is {present}, must be {json.dumps(expected)}", code="network/session-file"
-            )
+    for key, required in REQUIRED.items():
+        _check_required_value(path, key, json.loads(settings.get_json(key)), required)
+    endpoints = _read_router_endpoints(path, settings)
+    namespace = json.loads(settings.get_json("namespace"))
+    if namespace is not None:
+        check_namespace(namespace, f"{path}: `namespace`:")
+    return SessionFile(path.absolute(), text, tuple(endpoints), namespace)
+
+
+def _check_required_value(path: Path, key: str, value: Any, required: Any) -> None:
+    """Raise ConfigError if a file sets a key to another value than the required one."""
+    may_be_missing = key != "mode"  # a missing mode means `peer`
+    if value == required or (value is None and may_be_missing):
+        return
+    dotted_key = key.replace("/", ".")
+    shown_value = "missing" if value is None else json.dumps(value)
+    raise ConfigError(
+        f"{path}: `{dotted_key}` is {shown_value}, must be {json.dumps(required)}", code="network/session-file"
+    )
+
+
+def _read_router_endpoints(path: Path, settings: zenoh.Config) -> list[str]:
+    """Return the valid endpoints of the routers that a file names. Raises ConfigError if there are none."""
     if endpoints_of_mode(settings, "listen/endpoints", "client"):
         raise ConfigError(
             f"{path}: `listen.endpoints`: a session only connects; leave it out", code="network/session-file"
@@ -76,10 +97,7 @@ def read_session(path: Path) -> SessionFile:
         )
     for endpoint in endpoints:
         check_endpoint(endpoint, f"{path}: `connect.endpoints`:")
-    namespace = json.loads(settings.get_json("namespace"))
-    if namespace is not None:
-        check_namespace(namespace, f"{path}: `namespace`:")
-    return SessionFile(path.absolute(), text, tuple(endpoints), namespace)
+    return endpoints
 
 
 def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:

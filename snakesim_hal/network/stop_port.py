@@ -54,49 +54,55 @@ def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
 
 
 def open_stop_port(host: str, port: int) -> socket.socket:
-    """Bind the stop port of a host.
+    """Open the UDP socket on which a HAL host receives emergency stops.
 
     Args:
-        host: address to listen on.
+        host: IP address to listen on.
         port: number of the port; 0: any free one.
+
+    Returns:
+        The bound socket, with a kernel filter that drops other datagrams than requests.
 
     Raises:
         NotConnectedError: the port is in use.
     """
     address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    opened = socket.socket(address_family, socket.SOCK_DGRAM)
+    stop_socket = socket.socket(address_family, socket.SOCK_DGRAM)
     try:
-        opened.bind((host, port))
-        _accept_requests_only(opened)
+        stop_socket.bind((host, port))
+        _accept_requests_only(stop_socket)
     except OSError as error:
-        opened.close()
+        stop_socket.close()
         raise NotConnectedError(
             f"cannot listen for emergency stops on udp/{host}:{port}: {error.strerror}. Another run may hold the port; "
             f"choose one with --endpoint tcp/{host}:PORT",
             code="network/port-in-use",
         ) from error
-    return opened
+    return stop_socket
 
 
 def serve_stops(opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]) -> None:
-    """Call `handle(requester, reply)` for every request, from the thread `stop port`.
+    """Start the thread `stop port`, which calls `handle(requester, reply)` for every stop request.
+
+    A request consists of the constant REQUEST, a nonce that the answer repeats, and the name of the requester.
 
     Args:
         opened: the bound socket; closing it ends the thread.
-        robot: its namespace, for the answers.
+        robot: namespace of the robot; the answers contain it.
         handle: gets the name of the requester and a function that sends the answer.
     """
+    header_bytes = len(REQUEST) + NONCE_BYTES
 
     def serve() -> None:
         while True:
             try:
-                datagram, sender = opened.recvfrom(UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_REQUESTER_BYTES)
-            except OSError:
+                datagram, sender = opened.recvfrom(UDP_HEADER + header_bytes + MAX_REQUESTER_BYTES)
+            except OSError:  # the socket is closed
                 return
-            if not datagram.startswith(REQUEST) or len(datagram) < len(REQUEST) + NONCE_BYTES:
+            if not datagram.startswith(REQUEST) or len(datagram) < header_bytes:
                 continue
-            nonce = datagram[len(REQUEST) :][:NONCE_BYTES]
-            requester = datagram[len(REQUEST) + NONCE_BYTES :].decode(errors="replace")
+            nonce = datagram[len(REQUEST) : header_bytes]
+            requester = datagram[header_bytes:].decode(errors="replace")
             reply = _make_reply(opened, nonce + robot.encode() + b"\n", sender)
             handle(requester or "an unnamed client", reply)
             time.sleep(PAUSE_S)
@@ -206,11 +212,24 @@ def _open_for(address: Address) -> socket.socket:
 
 
 def _request_stop(opened: socket.socket, address: Address, requester: str, timeout_s: float) -> StopAnswer | None:
-    """Repeat a stop request until it is answered; None: no answer came in time."""
+    """Repeat a stop request until it is answered.
+
+    Args:
+        opened: a UDP socket of the requester.
+        address: host and port of the stop port.
+        requester: name of the person or program that requests the stop.
+        timeout_s: how long to repeat the request.
+
+    Returns:
+        The answer, or None if none came in time.
+
+    Raises:
+        NotConnectedError: the port is closed: it refused more than MAX_REFUSED requests.
+    """
     nonce = os.urandom(NONCE_BYTES)
     request = REQUEST + nonce + requester.encode()[:MAX_REQUESTER_BYTES]
     deadline = time.monotonic() + timeout_s
-    refused = 0
+    refused_count = 0
     opened.settimeout(REPEAT_S)
     while time.monotonic() < deadline:
         try:
@@ -222,11 +241,11 @@ def _request_stop(opened: socket.socket, address: Address, requester: str, timeo
         except TimeoutError:
             continue
         except ConnectionRefusedError:
-            refused += 1
-            if refused > MAX_REFUSED:
+            refused_count += 1
+            if refused_count > MAX_REFUSED:
                 raise NotConnectedError(f"no host takes emergency stops on udp/{address[0]}:{address[1]}") from None
             time.sleep(REPEAT_S)
-        except OSError:  # currently unreachable
+        except OSError:  # the network is unreachable at present
             time.sleep(REPEAT_S)
     return None
 

@@ -24,19 +24,19 @@ def number_type(least: float, most: float, unit: str = "") -> Callable[[str], fl
     """Return a type for argparse: a number within bounds.
 
     Args:
-        least: the minimum; if it is an int, the number has to be a whole one.
-        most: the maximum.
-        unit: for the error message.
+        least: minimum of the number; if it is an int, the number has to be a whole one.
+        most: maximum of the number.
+        unit: unit of the number, for the error message.
     """
-    is_whole = isinstance(least, int)
+    must_be_whole = isinstance(least, int)
 
     def parse(text: str) -> float:
         try:
-            value = int(text) if is_whole else float(text)
+            value = int(text) if must_be_whole else float(text)
         except ValueError:
-            value = float("nan")  # within no bounds
+            value = float("nan")  # every comparison with NaN is false, so that it is rejected below
         if not least <= value <= most:
-            kind = "a whole number" if is_whole else "a number"
+            kind = "a whole number" if must_be_whole else "a number"
             suffix = f" {unit}" if unit else ""
             bounds = f"from {least:.12g} to {most:.12g}{suffix}"
             raise argparse.ArgumentTypeError(f"{shorten(text, 40)!r}: give {kind} {bounds}")
@@ -133,7 +133,14 @@ def add_task(parser: argparse.ArgumentParser, about: str) -> None:
 
 
 def load_scenario(arguments: argparse.Namespace) -> "Loaded":
-    """Load the configuration that the arguments of `add_scenario` name. Raises ConfigError."""
+    """Load a scenario with the overrides of the command line: --set, --unset, and the flags with a name of their own.
+
+    Args:
+        arguments: parsed arguments of a parser to which `add_scenario` has added the scenario.
+
+    Raises:
+        ConfigError: a file or an override is not valid.
+    """
     from snakesim_hal.model.scenario import Override, load, parse_set
 
     flags = {
@@ -248,12 +255,18 @@ def check_network(arguments: argparse.Namespace) -> None:
 
 
 def read_session_option(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
-    """Read the session file that the arguments name, if any. Raises ConfigError.
+    """Read the Zenoh session file that the command line or the environment names.
 
     Args:
-        arguments: those of `add_network`.
+        arguments: parsed network options, such as --session, --endpoint and --router.
         or_environment: whether SNAKESIM_SESSION counts too, if the arguments name no endpoint. This is for an
             operator's tools: a process that moves or emulates a robot connects only as its command line specifies.
+
+    Returns:
+        The checked session file, or None if none is named.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not valid.
     """
     path: Path | None = arguments.session
     if path is None and or_environment and arguments.endpoint is None and arguments.router is None:
@@ -268,12 +281,15 @@ def read_session_option(arguments: argparse.Namespace, *, or_environment: bool =
 
 
 def create_link(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
-    """Return how a process of a robot joins its network. Raises ConfigError.
+    """Return endpoint, namespace and options with which a process of a robot joins its network.
 
     Args:
-        arguments: those of `add_network`.
+        arguments: parsed network options, such as --endpoint, --router and --namespace.
         config: configuration of the run.
-        hosts: whether the process is the one that the others connect to if there is no router, so that it listens.
+        hosts: whether the process is the HAL host. Without a router it listens, and the others connect to it.
+
+    Raises:
+        ConfigError: the options contradict one another, or the session file is not valid.
     """
     from snakesim_hal.network.session import Link
     from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES

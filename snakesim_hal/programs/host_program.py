@@ -121,7 +121,15 @@ def _create_host(
     session: Session,
     realtime_warnings: list[str],
 ) -> Host:
-    """Create the host for a backend, with the files that belong to this robot."""
+    """Create the HAL host for a backend, with the emergency-stop latch and the cable file of this robot.
+
+    Args:
+        arguments: parsed arguments of the host program.
+        config: configuration of the run.
+        backend: the open backend.
+        session: connection to the network.
+        realtime_warnings: real-time measures that the system refused, as short reasons.
+    """
     described = backend.describe()
     print_stderr(f"host: {describe_what_moves(described)}")  # for a lab's journal too
     unchecked = ""

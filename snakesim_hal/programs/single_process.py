@@ -122,6 +122,14 @@ class InProcessRun:
             self._open_service(name, opened)
 
     def _open_host(self, opened: ExitStack) -> None:
+        """Open the emulated backend, and create the HAL host on the network of this process.
+
+        Args:
+            opened: gets what has to be closed at the end of the run.
+
+        Raises:
+            RefusedError: the backend moves real hardware.
+        """
         config = self.config
         backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)

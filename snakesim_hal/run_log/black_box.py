@@ -65,18 +65,22 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def for_robot(robot: Description) -> "Layout":
-        """Return the columns for a robot. Names contain the units; vectors are in the frame of `Pose`."""
-        joints = len(robot.joints)
+        """Return the layout of a row for a robot.
+
+        Names of columns contain the units. Position and orientation are those of the tail end in the world. A row is
+        padded to a multiple of ROW_ALIGNMENT_BYTES.
+        """
+        joint_count = len(robot.joints)
         joint_columns = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
         columns = [
             Column("tick", "<i8"),
             Column("time_s", "<f8"),
-            *(Column(name, "<f8", joints) for name in joint_columns),
+            *(Column(name, "<f8", joint_count) for name in joint_columns),
             Column("position_w_m", "<f8", 3),
             Column("orientation_wxyz", "<f8", 4),
             Column("contact_peak_n", "<f8"),
             Column("contact_count", "<f8"),
-            Column("mode", "|i1", joints),
+            Column("mode", "|i1", joint_count),
         ]
         used_bytes = sum(column.bytes for column in columns)
         padding_bytes = -used_bytes % ROW_ALIGNMENT_BYTES
@@ -123,7 +127,15 @@ class BlackBox:
         self._contact_count = 0
 
     def record(self, tick: int, timestamp_ns: int, samples: Samples, decision: TickDecision) -> None:
-        """Record one tick."""
+        """Append the row of one tick to the ring of rows, and update the digest of the setpoints.
+
+        Args:
+            tick: number of the tick.
+            timestamp_ns: robot time of the tick.
+            samples: the joint states of this tick, and other samples by key. Pose and contacts without a new sample
+                are repeated from the row before.
+            decision: the setpoints that are applied in this tick.
+        """
         pose = samples.others.get(keys.POSE)
         if isinstance(pose, Pose):
             self._pose = [*pose.position_w, *pose.orientation_wxyz]
@@ -132,9 +144,10 @@ class BlackBox:
             self._contact_peak_n, self._contact_count = summarize_contacts(contacts)
         joints = samples.joints
         setpoints = decision.setpoints
+        offset = self._rows % self._capacity * self.layout.row_bytes
         self._pack_into(
             self._memory,
-            self._rows % self._capacity * self.layout.row_bytes,
+            offset,
             tick,
             timestamp_ns * 1e-9,
             *joints.angle_rad,
@@ -207,8 +220,8 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
     """
     try:
         with path.open("rb") as file:
-            line = file.readline(HEADER_LIMIT_BYTES)
-            layout = msgspec.json.decode(line, type=Layout)
+            header = file.readline(HEADER_LIMIT_BYTES)
+            layout = msgspec.json.decode(header, type=Layout)
             return layout, layout.arrays(file.read())
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise ConfigError(

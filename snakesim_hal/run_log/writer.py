@@ -42,14 +42,14 @@ class HostRecordWriter:
     def __init__(
         self, box: BlackBox, description: Description, numbers: Numbers, folder: Path | None, memory: int | None = None
     ) -> None:
-        """Write nothing yet.
+        """Prepare the writer; the writing thread starts when the context is entered.
 
         Args:
             box: the black box with the rows.
-            description: of the robot.
-            numbers: makes the host's statistics.
-            folder: of the run; None: no files.
-            memory: file descriptor of the in-memory file; None: none.
+            description: description of the robot, which gets a file of its own.
+            numbers: function that returns the host's statistics.
+            folder: folder of the run; None: no files are written.
+            memory: file descriptor of an in-memory file for the statistics; None: there is no such file.
         """
         # What is written, and where.
         self._box = box
@@ -124,23 +124,29 @@ class HostRecordWriter:
         return os.open(folder / BLACK_BOX, os.O_WRONLY | os.O_CLOEXEC)
 
     def _write_rows(self, folder: Path, _failure: str) -> None:
-        """Append the new rows to the black box file.
+        """Append the new rows of the black box to its file, and create the file at the first call.
+
+        Rows that the ring of the black box has overwritten before they could be written are counted as skipped.
+
+        Args:
+            folder: the folder of the run.
 
         Raises:
-            OSError: the disk does not take them all.
+            OSError: the file cannot be created, or the disk is full.
         """
         if self._file is None:
             self._file = self._open(folder)
-        size = self._box.layout.row_bytes
-        end = self._box.ticks  # of now, because a slow disk may never catch up with a host that keeps recording
-        while self._next_row < end:
-            first, rows = self._box.read_rows(self._next_row)
-            self._skipped_rows += first - self._next_row
-            self._next_row = first
-            offset = self._rows_offset + (self._next_row - self._skipped_rows) * size
-            written = os.pwrite(self._file, rows, offset)
-            self._next_row += written // size  # an incomplete row is written again next time
-            if written < len(rows):  # a full disk first takes a part
+        row_bytes = self._box.layout.row_bytes
+        # Later rows wait for the next call, because a slow disk may never catch up with a host that keeps recording.
+        end_row = self._box.ticks
+        while self._next_row < end_row:
+            first_row, rows = self._box.read_rows(self._next_row)
+            self._skipped_rows += first_row - self._next_row
+            self._next_row = first_row
+            offset = self._rows_offset + (self._next_row - self._skipped_rows) * row_bytes
+            written_bytes = os.pwrite(self._file, rows, offset)
+            self._next_row += written_bytes // row_bytes  # an incomplete row is written again next time
+            if written_bytes < len(rows):  # a disk that runs full stores a part first
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _note(self, failure: str) -> None:

@@ -66,13 +66,16 @@ class PlausibilityCheck:
     def check(
         self, joints: JointState, *, now_ns: int, applied: Applied | None, isolated: Mask
     ) -> ImplausibleState | None:
-        """Check a joint state, and keep its good values. Returns what is implausible, or None.
+        """Check a joint state, and store its plausible values as the last good ones.
 
         Args:
             joints: the newest joint state.
             now_ns: safety time. After a delay of the host, more time has passed than its ticks show.
             applied: the last setpoints of an armed robot; None if the robot is not armed.
-            isolated: (n_joints,), joints that are not checked.
+            isolated: (n_joints,) True for joints that are not checked.
+
+        Returns:
+            The fault and the joints that it concerns, or None if every joint is plausible.
         """
         count = len(self._known)
         if not joints.has_joint_count(count):
@@ -90,13 +93,26 @@ class PlausibilityCheck:
     def _check_each_joint(
         self, joints: JointState, *, now_ns: int, applied: Applied | None, isolated: Mask
     ) -> ImplausibleState | None:
-        """Do the three checks for each joint of a state that is not ordinary. The arguments are those of `check`."""
+        """Check each joint of a state for missing values, jumps and frozen values, and store the good values.
+
+        This is the slow path of `check`, for states that its shortcut does not accept.
+
+        Args:
+            joints: the newest joint state.
+            now_ns: safety time.
+            applied: the last setpoints of an armed robot; None if the robot is not armed.
+            isolated: (n_joints,) True for joints whose faults are ignored.
+
+        Returns:
+            The first of the three faults that any joint has, or None.
+        """
         newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
         columns = np.array(newest)
         measured_s = _measurement_times_s(joints, now_ns)
         plausible = self._find_plausible(joints, columns)
 
-        # Angles that are too far from the last good one.
+        # Find angles that are too far from the last good one. While the robot is not armed, an angle that stays at its
+        # new place for some samples is accepted.
         elapsed_s = (measured_s - self._good_s).max(axis=0)
         jump_rad = np.where(plausible, columns[0], 0.0) - self._columns[0]
         jumped = plausible & self._known & (np.abs(jump_rad) > self._jumps.max_turn_rad(elapsed_s))
@@ -107,14 +123,15 @@ class PlausibilityCheck:
         if applied is None:
             jumped = jumped & ~settled
 
-        # Keep the good values.
-        good = plausible & ~jumped
-        self._columns = np.where(good, columns, self._columns)
-        self._good_s = np.where(good, measured_s, self._good_s)
-        self._known |= good
+        # Store the good values.
+        is_good = plausible & ~jumped
+        self._columns = np.where(is_good, columns, self._columns)
+        self._good_s = np.where(is_good, measured_s, self._good_s)
+        self._known |= is_good
 
+        # Report the first fault of the joints that are not isolated.
         frozen = self._frozen.find_frozen(columns, measured_s[0], applied)
-        if not np.count_nonzero(~good | frozen):
+        if not np.count_nonzero(~is_good | frozen):
             return None
         unknown = ~plausible & ~isolated
         if unknown.any():
@@ -197,26 +214,37 @@ def _measurement_times_s(joints: JointState, now_ns: int) -> Floats:
     return (np.array([[joints.timestamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
 
 
-def replace_unreadable(joints: JointState, good: Measured) -> JointState:
-    """Return a joint state for publishing: NaN or infinity would make a reader reject the states of all joints.
+def replace_unreadable(joints: JointState, last_good: Measured) -> JointState:
+    """Replace NaN and infinite values of a joint state, so that it can be published.
 
-    The last good values of a joint replace it, marked invalid. A state of another number of joints is unchanged.
+    A single value that is not finite would make a reader reject the states of all joints. Every joint with such a value
+    gets its last good state, and is marked as not valid.
+
+    Args:
+        joints: the newest joint state.
+        last_good: the last good state of every joint.
+
+    Returns:
+        The joint state, unchanged if all its values are finite or if it has a wrong number of joints.
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
     all_finite = all(all(map(math.isfinite, column)) for column in columns)
-    if all_finite or not joints.has_joint_count(len(good.angle_rad)):
+    if all_finite or not joints.has_joint_count(len(last_good.angle_rad)):
         return joints
-    angle = list(joints.angle_rad)
-    velocity = list(joints.velocity_rad_s)
-    torque = list(joints.torque_nm)
+    angle_rad = list(joints.angle_rad)
+    velocity_rad_s = list(joints.velocity_rad_s)
+    torque_nm = list(joints.torque_nm)
     valid = list(joints.valid)
-    for i, values in enumerate(zip(*columns, strict=True)):
-        if not all(map(math.isfinite, values)):
-            angle[i] = float(good.angle_rad[i])
-            velocity[i] = float(good.velocity_rad_s[i])
-            torque[i] = float(good.torque_nm[i])
-            valid[i] = False
-    return msgspec.structs.replace(joints, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, valid=valid)
+    for i, joint_values in enumerate(zip(*columns, strict=True)):
+        if all(map(math.isfinite, joint_values)):
+            continue
+        angle_rad[i] = float(last_good.angle_rad[i])
+        velocity_rad_s[i] = float(last_good.velocity_rad_s[i])
+        torque_nm[i] = float(last_good.torque_nm[i])
+        valid[i] = False
+    return msgspec.structs.replace(
+        joints, angle_rad=angle_rad, velocity_rad_s=velocity_rad_s, torque_nm=torque_nm, valid=valid
+    )
 
 
 class _JumpDetector:
@@ -234,22 +262,27 @@ class _JumpDetector:
         return SLACK_RAD + self._speed_rad_s * np.maximum(elapsed_s, 0.0)
 
     def find_settled(self, jumped: Mask, angle_rad: Floats, measured_s: Floats) -> Mask:
-        """Process the newest angles, and return which of those that jumped have settled at a new place.
+        """Process the newest angles, and find the joints that have settled at a new place after a jump.
+
+        A joint has settled if SETTLED_SAMPLES rejected angles in a row are near one another.
 
         Args:
-            jumped: (n_joints,), joints whose newest angle is too far from the last good one.
-            angle_rad: (n_joints,), the newest angles; only those of joints that jumped are used.
-            measured_s: (2, n_joints), when they were measured, by both clocks.
+            jumped: (n_joints,) True for joints whose newest angle is too far from the last good one.
+            angle_rad: (n_joints,) the newest angles; only those of joints that jumped are used.
+            measured_s: (2, n_joints) when the angles were measured, by the timestamps and by safety time.
+
+        Returns:
+            (n_joints,) True for joints that have jumped and settled.
         """
         if not np.count_nonzero(jumped):
             self._in_a_row[:] = 0
             return jumped
         newest_rad = np.where(jumped, angle_rad, 0.0)
         elapsed_s = measured_s - self._measured_s
-        follows = np.abs(newest_rad - self._angle_rad) <= self.max_turn_rad(elapsed_s.max(axis=0))
-        repeated = follows & (elapsed_s[0] <= 0)  # a repeated sample is not new information
-        counted = np.where(follows, self._in_a_row + ~repeated, 1)
-        self._in_a_row = np.where(jumped, counted, 0)
+        is_near_last = np.abs(newest_rad - self._angle_rad) <= self.max_turn_rad(elapsed_s.max(axis=0))
+        is_repeated = is_near_last & (elapsed_s[0] <= 0)  # a repeated sample is not new information
+        sample_count = np.where(is_near_last, self._in_a_row + ~is_repeated, 1)
+        self._in_a_row = np.where(jumped, sample_count, 0)
         self._angle_rad = newest_rad
         self._measured_s = measured_s
         return jumped & (self._in_a_row >= SETTLED_SAMPLES)
@@ -282,25 +315,37 @@ class _FrozenDetector:
         self._far_since_s = self._never_s
 
     def find_frozen(self, columns: Floats, measured_s: Floats, applied: Applied | None) -> Mask:
-        """Process the newest states, and return which joints are frozen, (n_joints,).
+        """Process the newest states, and find the joints whose measurements are frozen.
+
+        A joint is frozen if it repeats the same state to the bit for more than a lease after its position target has
+        moved far, unless its torque is at the limit: then a constant torque is plausible.
 
         Args:
-            columns: (3, n_joints), angle, velocity and torque.
-            measured_s: (n_joints,), when they were measured, by their timestamp.
+            columns: (3, n_joints) angle in rad, velocity in rad/s and torque in N·m.
+            measured_s: (n_joints,) when they were measured, by their timestamp.
             applied: the last setpoints of an armed robot; None if the robot is not armed.
+
+        Returns:
+            (n_joints,) True for frozen joints.
         """
-        follows = np.zeros_like(self._followed) if applied is None else applied.mode == Mode.POSITION
-        same = (columns == self._columns).all(axis=0) & follows & self._followed
-        if applied is None or not np.count_nonzero(same):
+        if applied is None:
+            self.restart(columns, None)
+            return np.zeros_like(self._followed)
+        in_position_mode = applied.mode == Mode.POSITION
+        is_same = (columns == self._columns).all(axis=0) & in_position_mode & self._followed
+        if not np.count_nonzero(is_same):
             self.restart(columns, applied)
-            return same
-        target = applied.target
+            return is_same
+
+        # The range of the targets since the state has been the same.
+        target_rad = applied.target
         self._columns = columns
-        self._followed = follows
-        self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)
-        self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)
-        far = same & (self._high_rad - self._low_rad > self._far_rad)
-        self._far_since_s = np.where(far, np.minimum(self._far_since_s, measured_s), self._never_s)
-        long = measured_s - self._far_since_s > self._lease_s
-        free = np.abs(columns[2]) < SATURATED_TORQUE_FRACTION * applied.torque_limit_nm
-        return far & long & free
+        self._followed = in_position_mode
+        self._low_rad = np.where(is_same, np.minimum(self._low_rad, target_rad), target_rad)
+        self._high_rad = np.where(is_same, np.maximum(self._high_rad, target_rad), target_rad)
+
+        has_moved_far = is_same & (self._high_rad - self._low_rad > self._far_rad)
+        self._far_since_s = np.where(has_moved_far, np.minimum(self._far_since_s, measured_s), self._never_s)
+        lasts_a_lease = measured_s - self._far_since_s > self._lease_s
+        has_free_torque = np.abs(columns[2]) < SATURATED_TORQUE_FRACTION * applied.torque_limit_nm
+        return has_moved_far & lasts_a_lease & has_free_torque

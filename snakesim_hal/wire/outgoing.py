@@ -69,11 +69,14 @@ def encode_unchecked(message: Message) -> bytes:
 
 
 def find_wrong_value(message: Message, called: str = "") -> str:
-    """Describe the first value that no reader accepts, and what is allowed; empty if each is right by itself.
+    """Describe the first field value of a message that readers would reject.
 
     Args:
         message: the message.
-        called: its name in the text; empty means the name of its class.
+        called: name of the message in the text; empty means the name of its class.
+
+    Returns:
+        The field, its value and what is allowed; empty if each value is valid by itself.
     """
     name = called or type(message).__name__
     for field in msgspec.structs.fields(type(message)):

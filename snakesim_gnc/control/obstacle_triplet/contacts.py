@@ -60,16 +60,16 @@ def plan_contact(
         window_m: how far from there it searches.
     """
     if obstacle.shape == "box":
-        s, push, distance_m = _find_place_at_box(route, obstacle, near_s_m, window_m)
+        s, away_w, distance_m = _find_place_at_box(route, obstacle, near_s_m, window_m)
     else:
         center_w = np.array(obstacle.position_w[:2])
         s = route.project(center_w, near_s_m, window_m)
         x, y = route.point_at(s)
-        push = (x - float(center_w[0]), y - float(center_w[1]))
-        distance_m = math.hypot(*push) - obstacle.radius_m
+        away_w = (x - float(center_w[0]), y - float(center_w[1]))
+        distance_m = math.hypot(*away_w) - obstacle.radius_m
     heading_rad = route.heading_rad(s)
     tangent = (math.cos(heading_rad), math.sin(heading_rad))
-    is_pushed_left = tangent[0] * push[1] - tangent[1] * push[0] >= 0
+    is_pushed_left = tangent[0] * away_w[1] - tangent[1] * away_w[0] >= 0
     side = 1 if is_pushed_left else -1
     return PlannedContact(
         obstacle=obstacle.name,
@@ -83,7 +83,17 @@ def plan_contact(
 
 
 def _find_place_at_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
-    """Return the arc length nearest to a box, the direction from the box to there, and the distance in m."""
+    """Find the place on a route that is nearest to a box, by a coarse and a fine search.
+
+    Args:
+        route: the path.
+        box: the obstacle.
+        near_s_m: arc length around which the search begins.
+        window_m: how far from there it searches.
+
+    Returns:
+        The arc length of the place in m, the unit vector from the box to it, and its distance from the box in m.
+    """
     outline = Outlines.from_obstacles([box])
     low = near_s_m - window_m
     high = near_s_m + window_m

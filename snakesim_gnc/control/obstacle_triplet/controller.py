@@ -102,7 +102,13 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._position_until_s = 0.0
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return the setpoints for the next period."""
+        """Return the setpoints of the next period: one joint propels by its torque, the others follow the path.
+
+        Push-points and the triplet that propels are chosen anew for each new world model.
+
+        Args:
+            observation: the inputs of this tick.
+        """
         located = self._progress.update(observation)
         if isinstance(located, str):
             return self._wait(observation, located)
@@ -171,8 +177,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
             body_pose = located.on_path.pose_at(s)
         else:
             last_s = last_pose.tail_s_m
-            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * parameters.overspeed_ratio * observation.period_s
-            followed_s = min(max(last_s, s - parameters.slack_m), s + parameters.slack_m, last_s + max_advance_m)
+            max_speed_m_s = max(located.trajectory.speed_m_s, 0.0) * parameters.overspeed_ratio
+            max_s = last_s + max_speed_m_s * observation.period_s
+            followed_s = min(max(last_s, s - parameters.slack_m), s + parameters.slack_m, max_s)
             body_pose = located.on_path.pose_at(max(followed_s, s - parameters.brake_m))
         lift_rad = self._climb.angles_rad(located.trajectory.rises, body_pose.tail_s_m)
         reference = self._body.all_angles(body_pose) + lift_rad
@@ -213,8 +220,8 @@ class ObstacleTriplet(Controller[TripletParameters]):
         limit_nm = self._body.torque_limit_nm[joint]
         torque_per_n = choice.torque_per_n
 
-        slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
-        desired_n = parameters.propulsion_n * min(max(slow, 0.0), 1.0)
+        speed_error_ratio = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
+        desired_n = parameters.propulsion_n * min(max(speed_error_ratio, 0.0), 1.0)
 
         swing_rad = observation.joints.angle_rad[joint] - float(self._reference[joint])
         if torque_per_n <= 0:
@@ -280,7 +287,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         )
 
     def _update_choice(self, observation: Observation, located: Located, body_pose: BodyPose) -> None:
-        """Choose a triplet for the present push-points, or none."""
+        """Choose the triplet that propels, with its joint, for the present push-points; `_choice` is None without one.
+
+        No triplet is chosen if no motion is desired, or for some time after a stall. A triplet at which the body was
+        stationary is chosen only if there is no other.
+        """
         self._expire_restrictions(observation.time_s, located.tail_s_m)
         barred_joint = None
         if self._barred is not None:
@@ -291,13 +302,13 @@ class ObstacleTriplet(Controller[TripletParameters]):
         if located.trajectory.speed_m_s <= 0 or observation.time_s < self._position_until_s:
             self._choice = None
             return
-        present = None
+        present_triplet = None
         if self._choice is not None:
-            present = self._choice.triplet
+            present_triplet = self._choice.triplet
         switch_fraction = self.parameters.switch_fraction
-        choice = choose_triplet(choices, present, switch_fraction=switch_fraction, banned=self._banned)
+        choice = choose_triplet(choices, present_triplet, switch_fraction=switch_fraction, banned=self._banned)
         if choice is None:  # a banned triplet is better than none
-            choice = choose_triplet(choices, present, switch_fraction=switch_fraction)
+            choice = choose_triplet(choices, present_triplet, switch_fraction=switch_fraction)
         self._choice = choice
 
     def _expire_restrictions(self, time_s: float, tail_s_m: float) -> None:
@@ -350,7 +361,12 @@ class ObstacleTriplet(Controller[TripletParameters]):
             self._position_until_s = observation.time_s + self.parameters.release_s
 
     def _wait(self, observation: Observation, why: str) -> ControllerCommand:
-        """Move every joint to its reference without a push, because the pose of the body is unknown."""
+        """Command every joint to its reference angle without propulsion, while the position of the body is unknown.
+
+        Args:
+            observation: the inputs of this tick.
+            why: why the position is unknown, for the telemetry.
+        """
         self._choice = None
         self._unlimited_n = 0.0
         self._force_n = 0.0
@@ -397,14 +413,14 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self, located: Located, body_pose: BodyPose, choice: Choice, demand: PropulsionDemand
     ) -> Telemetry:
         """Report which joint pushes, at which contacts, and with which force."""
-        why = ""
+        stall_reason = ""
         if self._stall is not None:
             stall, _ = self._stall
-            why = stall.reason
+            stall_reason = stall.reason
         forces_n: list[float] = (demand.force_n * choice.triplet.unit.forces).tolist()
         full_torque_nm = abs(self.parameters.propulsion_n * choice.torque_per_n)
         return Telemetry(
-            reason=why,
+            reason=stall_reason,
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
             propulsion_joint=demand.joint,

@@ -104,7 +104,9 @@ def find_alternating_triples(sides: Sequence[int]) -> list[tuple[int, int, int]]
 def find_propulsion_joint(
     node_body_s_m: Sequence[float], behind_m: float, ahead_m: float, present: int | None, hold_on_m: float
 ) -> int | None:
-    """Return the first joint ahead of o_2 and behind o_3, which has the longest lever; None if there is no joint.
+    """Find the joint that propels a triplet of push-points o_1, o_2, o_3 (tail to head).
+
+    It is the first joint ahead of o_2 and behind o_3, because that joint has the longest lever.
 
     Args:
         node_body_s_m: (n_nodes,) arc lengths of the body's nodes from the tail end; joint i is node i + 1.
@@ -113,6 +115,9 @@ def find_propulsion_joint(
         present: the present propulsion joint of this triplet. It remains until the joint behind it is `hold_on_m`
             past o_2, so that noise does not switch back and forth.
         hold_on_m: that distance.
+
+    Returns:
+        Index of the joint, or None if there is no joint between o_2 and o_3.
     """
     joint = max(bisect_right(node_body_s_m, behind_m) - 1, 0)
     last_joint = len(node_body_s_m) - 3
@@ -230,7 +235,16 @@ class Triplets:
         present_joint: int | None,
         barred_joint: int | None,
     ) -> Choice | str:
-        """Return the triplet with its propulsion joint, or why it cannot propel."""
+        """Return a triplet with its propulsion joint and the torque for 1 N, or the reason why it cannot propel.
+
+        Args:
+            triplet: three contacts, with the forces for 1 N of propulsion.
+            places_m: arc lengths of the contacts on the body.
+            nodes_w: (2, n_nodes) m, the body; joint i is node i + 1.
+            node_body_s_m: (n_nodes,) arc lengths of the nodes from the tail end.
+            present_joint: the present propulsion joint of this triplet, if any.
+            barred_joint: a joint that must not propel.
+        """
         if triplet.unit.reason:
             return triplet.unit.reason
         _, behind_m, ahead_m = places_m

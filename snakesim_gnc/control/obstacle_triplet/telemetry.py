@@ -31,7 +31,17 @@ def compute_bending_nm(body: PlanarBody, body_pose: BodyPose, choice: Choice, fo
 def make_contact_messages(
     body: PlanarBody, world: World, choice: Choice, forces_n: Sequence[float]
 ) -> list[WorldContact]:
-    """Return the planned push-points of a triplet with their planned forces, tail to head."""
+    """Return the three contacts of a triplet with their desired forces, as messages.
+
+    Args:
+        body: the robot's body.
+        world: the world model, for the height of the body.
+        choice: the triplet, and where its contacts are on the body.
+        forces_n: desired force of each contact along its normal.
+
+    Returns:
+        The contacts, tail to head.
+    """
     height_m = world.base_position_w[2]
     messages: list[WorldContact] = []
     for contact, body_s_m, force_n in zip(choice.triplet.contacts, choice.body_s_m, forces_n, strict=True):
