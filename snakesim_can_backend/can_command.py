@@ -148,30 +148,37 @@ def _cell(joints: int, reports: ReportSchedule) -> str:
 
 
 def scan_channels(arguments: argparse.Namespace) -> int:
-    """List the modules that answer on some buses. Returns 1 if none answers."""
-    found: list[dict[str, str]] = []
-    in_use: list[str] = []
+    """List the joint modules that answer on some buses. Returns 1 if none answers.
+
+    Nothing is sent on a bus that unknown nodes use, unless `--anyway` is given.
+    """
+    all_rows: list[dict[str, str]] = []  # of all buses, by column
+    channels_in_use: list[str] = []
     print_text = discard_line if arguments.json else print_line
     for channel in arguments.channel:
-        if not arguments.anyway and (others := list_unknown_senders(channel, arguments.bit_rate)):
-            in_use.append(channel)
+        unknown_senders: list[UnknownFrames] = []
+        if not arguments.anyway:
+            unknown_senders = list_unknown_senders(channel, arguments.bit_rate)
+        if unknown_senders:
+            channels_in_use.append(channel)
             print_text(
                 f"{channel}: others use this bus, and nothing was sent; add --anyway to request modules all the same"
             )
-            for other in others:
-                print_text(f"  {other}")
+            for sender in unknown_senders:
+                print_text(f"  {sender}")
             continue
         wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
             rows = scan(wire, arguments.duration)
         finally:
             wire.close()
-        for line in align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
+        lines = align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]
+        for line in lines:
             print_text(line)
-        found += rows
+        all_rows += rows
     if arguments.json:
-        print_json({"drives": found, "in_use_by_others": in_use})
-    return OK if found else FAILED
+        print_json({"drives": all_rows, "in_use_by_others": channels_in_use})
+    return OK if all_rows else FAILED
 
 
 def list_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
@@ -192,19 +199,34 @@ def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
 
 
 def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
+    """Return a module's row of the scan, by column; values that it has not reported are UNKNOWN.
+
+    Args:
+        identity: the module's answer to the request for its identity.
+        reading: the reports of all modules that arrived during the scan.
+    """
+    if identity.stepped:
+        emulated = "stepped"
+    elif identity.emulated:
+        emulated = "yes"
+    else:
+        emulated = "no"
     row = dict.fromkeys(COLUMNS, UNKNOWN) | {
         "channel": identity.channel,
         "node": str(identity.node),
         "serial": f"{identity.serial:08X}",
         "firmware": identity.firmware,
         "protocol": str(identity.protocol),
-        "emulated": "stepped" if identity.stepped else "yes" if identity.emulated else "no",
+        "emulated": emulated,
     }
     if not FIRST_NODE <= identity.node <= LAST_NODE:
         return row
     i = identity.node - 1
-    module, health, shaft = reading.modules[i], reading.health()[i], reading.shaft_raw[i]
-    if module.uptime_ms >= 0:  # it has sent a heartbeat
+    module = reading.modules[i]
+    health = reading.health()[i]
+    shaft_torque = reading.shaft_raw[i]
+    has_sent_heartbeat = module.uptime_ms >= 0
+    if has_sent_heartbeat:
         row["state"] = module.state.name.lower()
         row["faults"] = "+".join(module.fault_names()) or "none"
         row["uptime"] = f"{module.uptime_ms / 1000:.1f} s"
@@ -213,8 +235,9 @@ def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
         row["voltage"] = f"{signals['voltage'].decode(health[0]):.1f} V"
         row["motor"] = f"{signals['motor_temperature'].decode(health[2]):.0f} °C"
         row["board"] = f"{signals['board_temperature'].decode(health[3]):.0f} °C"
-    if shaft is not None:  # only while a host sends Syncs, and modules report their IMUs
-        row["shaft"] = f"{load_layouts()[Opcode.SHAFT_LOAD].signals['torque'].decode(shaft):.3f} N·m"
+    if shaft_torque is not None:  # only while a host sends Syncs, and modules report their IMUs
+        torque_nm = load_layouts()[Opcode.SHAFT_LOAD].signals["torque"].decode(shaft_torque)
+        row["shaft"] = f"{torque_nm:.3f} N·m"
     return row
 
 
