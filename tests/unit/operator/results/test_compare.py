@@ -146,25 +146,48 @@ def test_a_black_box_with_odd_arrays_is_one_error(odd: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_one_joint_that_is_off_is_named_with_its_time() -> None:
-    a = made_up()
-    angle = a.angle_rad.copy()
-    angle[120:, 4] += 0.2
-    angle[150, 4] += 0.1
-    difference = differ(a, dataclasses.replace(a, angle_rad=angle))
-    worst, divergence = difference.angle.worst, difference.divergence
+OFF_JOINT = 4  # joint_5
+OFF_FROM_TICK = 120
+MOST_OFF_TICK = 150
+TICKS = 200  # of the made-up run, at 100 Hz
+
+
+def compare_with_one_joint_off() -> Difference:
+    """Compare a run with one in which a joint is off by 0.2 rad from 1.2 s on, and by 0.3 rad at 1.5 s."""
+    run = made_up()
+    angle_rad = run.angle_rad.copy()
+    angle_rad[OFF_FROM_TICK:, OFF_JOINT] += 0.2
+    angle_rad[MOST_OFF_TICK, OFF_JOINT] += 0.1
+    return differ(run, dataclasses.replace(run, angle_rad=angle_rad))
+
+
+def test_compare_one_joint_off_has_its_worst_difference() -> None:
+    worst = compare_with_one_joint_off().angle.worst
     assert worst is not None
-    assert worst.joint == 4
+    assert worst.joint == OFF_JOINT
     assert worst.time_s == pytest.approx(1.5)
     assert worst.difference == pytest.approx(0.3)
-    assert difference.angle.joint_rms[4] == pytest.approx(math.sqrt((79 * 0.2**2 + 0.3**2) / 200))
-    assert difference.angle.joint_rms[[0, 3, 5, 12]].tolist() == [0, 0, 0, 0]
-    assert divergence is not None
-    assert divergence.joint == 4
-    assert divergence.time_s == pytest.approx(1.2)
+
+
+def test_compare_one_joint_off_has_rms_of_this_joint_alone() -> None:
+    difference = compare_with_one_joint_off()
+    ticks_off_by_02 = TICKS - OFF_FROM_TICK - 1
+    rms_rad = math.sqrt((ticks_off_by_02 * 0.2**2 + 0.3**2) / TICKS)
+    expected = [rms_rad if joint == OFF_JOINT else 0.0 for joint in range(JOINTS)]
+    assert difference.angle.joint_rms.tolist() == pytest.approx(expected)
     assert difference.torque.rms == 0
+
+
+def test_compare_one_joint_off_diverges_at_its_first_difference() -> None:
+    difference = compare_with_one_joint_off()
     assert not difference.identical
-    text, html = shown(difference)
+    assert difference.divergence is not None
+    assert difference.divergence.joint == OFF_JOINT
+    assert difference.divergence.time_s == pytest.approx(1.2)
+
+
+def test_compare_one_joint_off_is_named_in_text_and_page() -> None:
+    text, html = shown(compare_with_one_joint_off())
     assert "The runs diverge at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
     assert "joint_5 at 1.50 s" in text
     assert 'data-joint="joint_5"' in html

@@ -132,22 +132,26 @@ def image(kind: type[Any], **more: Any) -> Any:
     return kind(tick=0, timestamp_ns=0, link=1, **{**pose, **limits, **size, **pixels, **more})
 
 
-def test_depth_in_millimetres_or_metres() -> None:
-    seen = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "head_depth_optical_frame", image(m.DepthImage)))
-    assert seen.width == 4
-    assert seen.height == 3
-    assert seen.step == 8
-    assert seen.encoding == "16UC1"
-    assert seen.is_bigendian == 0
-    assert seen.header.frame_id == "head_depth_optical_frame"
-    assert at(seen.header.stamp) == STAMP_NS
-    assert np.array_equal(seen.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
-    coarse = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "f", image(m.DepthImage, scale_m=0.01)))
-    assert coarse.encoding == "32FC1"
-    assert coarse.step == 16
-    metres = np.frombuffer(coarse.data.tobytes(), "<f4")
-    assert np.isnan(metres[0])
-    assert np.allclose(metres[1:], 0.01 * np.arange(1, 12))
+def test_ros_depth_image_with_1_mm_scale_is_sent_as_it_is() -> None:
+    frame_id = "head_depth_optical_frame"
+    message = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, frame_id, image(m.DepthImage)))
+    assert message.header.frame_id == frame_id
+    assert at(message.header.stamp) == STAMP_NS
+    assert (message.width, message.height) == (4, 3)
+    assert message.encoding == "16UC1"
+    assert message.is_bigendian == 0
+    assert message.step == 4 * 2  # bytes in a row of 4 pixels
+    assert np.array_equal(message.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
+
+
+def test_ros_depth_image_with_other_scale_is_sent_in_meters() -> None:
+    coarse = image(m.DepthImage, scale_m=0.01)
+    message = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "f", coarse))
+    assert message.encoding == "32FC1"
+    assert message.step == 4 * 4  # bytes in a row of 4 pixels
+    depth_m = np.frombuffer(message.data.tobytes(), "<f4")
+    assert np.isnan(depth_m[0])  # count 0: not measured
+    assert np.allclose(depth_m[1:], 0.01 * np.arange(1, 12))
 
 
 def test_ros_color_image_has_intrinsics() -> None:
@@ -180,26 +184,32 @@ def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
         assert np.array_equal(millimetres, np.arange(12).reshape(3, 4) * round(scale_m / 0.001))
 
 
-def test_an_imu_has_no_orientation() -> None:
-    sent = m.Imu(
+def read_imu_of_link_5() -> Any:
+    """Return the ROS message of the second of two IMUs."""
+    sample = m.Imu(
         tick=0,
         timestamp_ns=0,
         link=[3, 5],
         angular_velocity_rad_s=[(0, 0, 0), (1, 2, 3)],
         acceleration_m_s2=[(0, 0, 0), (4, 5, 6)],
     )
-    seen = read(ros.IMU, robot_in_ros.encode_imu(STAMP_NS, "link_5_imu_frame", sent, 1))
-    assert at(seen.header.stamp) == STAMP_NS
-    assert seen.header.frame_id == "link_5_imu_frame"
-    turn, push = seen.angular_velocity, seen.linear_acceleration
-    assert turn.x == 1
-    assert turn.y == 2
-    assert turn.z == 3
-    assert push.x == 4
-    assert push.y == 5
-    assert push.z == 6
-    assert seen.orientation_covariance[0] == -1
-    assert seen.linear_acceleration_covariance.tolist() == [0] * 9
+    return read(ros.IMU, robot_in_ros.encode_imu(STAMP_NS, "link_5_imu_frame", sample, 1))
+
+
+def test_ros_imu_message_has_rates_and_acceleration_of_its_link() -> None:
+    message = read_imu_of_link_5()
+    rate = message.angular_velocity
+    acceleration = message.linear_acceleration
+    assert at(message.header.stamp) == STAMP_NS
+    assert message.header.frame_id == "link_5_imu_frame"
+    assert (rate.x, rate.y, rate.z) == (1, 2, 3)
+    assert (acceleration.x, acceleration.y, acceleration.z) == (4, 5, 6)
+
+
+def test_ros_imu_message_marks_orientation_as_missing() -> None:
+    message = read_imu_of_link_5()
+    assert message.orientation_covariance[0] == -1  # ROS: the orientation is not measured
+    assert message.linear_acceleration_covariance.tolist() == [0] * 9  # ROS: unknown
 
 
 @FEW
