@@ -281,27 +281,40 @@ def test_ticks_that_are_missing_are_told() -> None:
     assert difference.identical
 
 
-def test_targets_are_compared_only_within_one_mode() -> None:
-    a = made_up()
-    mode, target = a.mode.copy(), a.target.copy()
-    mode[100:, 6], target[100:, 6] = Mode.TORQUE, 5.0
-    difference = differ(a, dataclasses.replace(a, mode=mode, target=target))
-    assert difference.other_mode == pytest.approx(100 / (200 * JOINTS))
-    assert [gap.what for gap in difference.targets] == ["angle target"]
-    assert difference.targets[0].rms == 0
+TORQUE_JOINT = 6
+TORQUE_FROM_TICK = 100  # 1 s
+
+
+def made_up_with_torque_joint(torque_nm: float) -> RunRecord:
+    """Return the made-up run with one joint in torque mode from 1 s on."""
+    run = made_up()
+    mode = run.mode.copy()
+    mode[TORQUE_FROM_TICK:, TORQUE_JOINT] = Mode.TORQUE
+    target = run.target.copy()
+    target[TORQUE_FROM_TICK:, TORQUE_JOINT] = torque_nm
+    return dataclasses.replace(run, mode=mode, target=target)
+
+
+def test_compare_targets_of_different_modes_are_not_compared() -> None:
+    difference = differ(made_up(), made_up_with_torque_joint(5.0))
+    (angle_target,) = difference.targets
+    assert angle_target.what == "angle target"
+    assert angle_target.rms == 0
     assert not difference.identical
+    assert difference.other_mode == pytest.approx((TICKS - TORQUE_FROM_TICK) / (TICKS * JOINTS))
     assert difference.tracking_rad == pytest.approx((0.01, 0.01))
-    both = differ(
-        dataclasses.replace(a, mode=mode, target=target), dataclasses.replace(a, mode=mode, target=target + 1)
-    )
-    torque = both.targets[1]
-    assert torque.what == "torque target"
-    assert torque.worst is not None
-    assert torque.worst.joint == 6
-    assert torque.worst.time_s == pytest.approx(1.0)
-    assert torque.worst.difference == 1.0
-    assert [joint for joint, worst in enumerate(torque.joint_worst) if worst is not None] == [6]
-    shown(both)
+
+
+def test_compare_torque_targets_names_worst_joint_and_time() -> None:
+    difference = differ(made_up_with_torque_joint(5.0), made_up_with_torque_joint(6.0))
+    torque_target = difference.targets[1]
+    assert torque_target.what == "torque target"
+    assert torque_target.worst is not None
+    assert torque_target.worst.joint == TORQUE_JOINT
+    assert torque_target.worst.time_s == pytest.approx(1.0)
+    assert torque_target.worst.difference == 1.0
+    assert [joint for joint, worst in enumerate(torque_target.joint_worst) if worst is not None] == [TORQUE_JOINT]
+    shown(difference)
 
 
 @pytest.mark.parametrize(("speed_m_s", "percent"), [(0.09, -10.0), (0.125, 25.0), (-0.1, -200.0)])
