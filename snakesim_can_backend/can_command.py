@@ -245,37 +245,39 @@ def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
 
 
 def replay_log(arguments: argparse.Namespace) -> int:
-    """Compare the log of a bus with the record of its run. Returns 1 if they differ."""
+    """Compare the log of a bus with the run log of the same run. Returns 1 if they differ."""
     loaded = load_scenario(str(arguments.run / "config.json"), [])
-    if loaded.config.backend != MODULES:
+    config = loaded.config
+    if config.backend != MODULES:
         raise ConfigError(
-            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim drive replay can` "
+            f"{arguments.run}: is a run with the backend {config.backend!r}, and `snakesim drive replay can` "
             f"reads the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run",
             code="recording/missing-data",
         )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)
-    mounting, limit_s = Mounting(loaded.config.robot.joint_table), answer_limit_s(loaded.config, settings)
-    done = LogReplay(mounting, plan_reports(loaded.config, settings), limit_s)
+    replay = LogReplay(
+        Mounting(config.robot.joint_table), plan_reports(config, settings), answer_limit_s(config, settings)
+    )
     log = BusLog(arguments.log)
-    done.read(log)
-    if not done.joints:
-        found = f"{done.frames} frames, and no Sync among them: the log of another bus"
-        print_line(f"{arguments.log}: {found}{looks(done.foreign)}")
+    replay.read(log)
+    if not replay.joints:
+        finding = f"{replay.frames} frames, and no Sync among them: the log of another bus"
+        print_line(f"{arguments.log}: {finding}{looks(replay.foreign)}")
         return FAILED
-    print_line(f"{arguments.log}: {done.frames} frames, {len(done.joints)} Syncs")
+    print_line(f"{arguments.log}: {replay.frames} frames, {len(replay.joints)} Syncs")
     for line in log.report():
         print_line(f"  {line}")
-    for name, silent in zip(layout.joints, done.silent, strict=True):
-        if silent:
-            print_line(f"  {name} did not answer {silent} Syncs in time")
-    for node, count in sorted(done.reading.unknown_nodes.items()):
-        print_line(f"  {count} frames of node {node}, which is not of this robot")
-    verdict = compare_with_run_log(done, layout, rows)
-    if verdict.first_wrong:
-        print_line(f"joint states differ from {arguments.run}: {verdict.first_wrong}")
+    for name, silent_syncs in zip(layout.joints, replay.silent, strict=True):
+        if silent_syncs:
+            print_line(f"  {name} did not answer {silent_syncs} Syncs in time")
+    for node, frame_count in sorted(replay.reading.unknown_nodes.items()):
+        print_line(f"  {frame_count} frames of node {node}, which is not of this robot")
+    comparison = compare_with_run_log(replay, layout, rows)
+    if comparison.first_wrong:
+        print_line(f"joint states differ from {arguments.run}: {comparison.first_wrong}")
         return FAILED
-    print_line(f"joint states of {verdict.compared} ticks are those of the record, to the bit")
+    print_line(f"joint states of {comparison.compared} ticks are those of the record, to the bit")
     return OK
 
 

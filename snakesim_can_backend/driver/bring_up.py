@@ -124,19 +124,24 @@ def discovery_errors(
         lockstep: whether the run is in lockstep, which only stepped emulators support.
     """
     errors: list[str] = []
-    channel_of = {node: bus.wire.channel for bus in buses for node in bus.nodes}
-    by_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
+    channel_of_node = {node: bus.wire.channel for bus in buses for node in bus.nodes}
+    identities_of_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
     for identity in found:
-        by_node[identity.node].append(identity)
-    for node, channel in channel_of.items():
+        identities_of_node[identity.node].append(identity)
+    for node, channel in channel_of_node.items():
         subject = f"{joints[node - 1]} (node {node} on {channel})"
-        here = [identity for identity in by_node[node] if identity.channel == channel]
-        elsewhere = [identity for identity in by_node[node] if identity.channel != channel]
-        errors += _node_errors(subject, here, elsewhere)
-        for identity in here:
+        on_its_channel: list[ModuleIdentity] = []
+        on_other_channels: list[ModuleIdentity] = []
+        for identity in identities_of_node[node]:
+            if identity.channel == channel:
+                on_its_channel.append(identity)
+            else:
+                on_other_channels.append(identity)
+        errors += _node_errors(subject, on_its_channel, on_other_channels)
+        for identity in on_its_channel:
             errors += _identity_errors(subject, identity, lockstep=lockstep)
     for identity in found:
-        if identity.node not in channel_of:
+        if identity.node not in channel_of_node:
             errors.append(
                 f"node {identity.node} with serial {identity.serial:08X} on {identity.channel} is not a joint of this "
                 f"robot"
