@@ -96,10 +96,14 @@ def test_contacts_are_arrows_along_their_forces(contacts: list[m.WorldContact]) 
         assert np.allclose(tip - tail, 0.01 * np.array(contact.force_w), rtol=1e-6, atol=1e-6)
 
 
-def test_obstacles_have_their_shapes() -> None:
-    known = [
+def read_obstacle_markers() -> list[Any]:
+    """Return the ROS markers of a cylinder of confidence 0.5, a box turned by 90 degrees, and a touched sphere."""
+    quarter_turn_rad = np.pi / 2
+    obstacles = [
         m.Obstacle(name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5),
-        m.Obstacle(name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=np.pi / 2, half_size_m=(0.1, 0.2, 0.3)),
+        m.Obstacle(
+            name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=quarter_turn_rad, half_size_m=(0.1, 0.2, 0.3)
+        ),
         m.Obstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True),
     ]
     world = m.World(
@@ -109,19 +113,32 @@ def test_obstacles_have_their_shapes() -> None:
         base_orientation_wxyz=(1, 0, 0, 0),
         base_confidence=1,
         contacts=[],
-        obstacles=known,
+        obstacles=obstacles,
     )
-    _, *shapes = read(
-        ros.MARKERS, ros.encode_markers(STAMP_NS, "odom", robot_in_ros.make_obstacle_markers(world))
-    ).markers
-    assert [shape.type for shape in shapes] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
-    sizes = [(shape.scale.x, shape.scale.y, shape.scale.z) for shape in shapes]
-    assert sizes == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
-    assert [(shape.pose.position.x, shape.pose.position.y) for shape in shapes] == [(1, 2), (3, 4), (5, 6)]
-    assert shapes[1].pose.orientation.z == pytest.approx(np.sqrt(0.5))
-    assert shapes[1].pose.orientation.x == 0
-    assert shapes[0].color.a == pytest.approx(0.6)
-    assert shapes[2].color.r > shapes[1].color.r
+    markers = robot_in_ros.make_obstacle_markers(world)
+    _, *shapes = read(ros.MARKERS, ros.encode_markers(STAMP_NS, "odom", markers)).markers
+    return shapes
+
+
+def test_ros_obstacle_markers_have_shape_size_and_pose() -> None:
+    markers = read_obstacle_markers()
+    assert [marker.type for marker in markers] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
+    sizes_m = [(marker.scale.x, marker.scale.y, marker.scale.z) for marker in markers]
+    assert sizes_m == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
+    assert [(marker.pose.position.x, marker.pose.position.y) for marker in markers] == [(1, 2), (3, 4), (5, 6)]
+    box_orientation = markers[1].pose.orientation
+    assert box_orientation.z == pytest.approx(np.sqrt(0.5))
+    assert box_orientation.x == 0
+
+
+def test_ros_obstacle_marker_of_uncertain_obstacle_is_translucent() -> None:
+    cylinder, _, _ = read_obstacle_markers()
+    assert cylinder.color.a == pytest.approx(0.6)  # of confidence 0.5
+
+
+def test_ros_obstacle_marker_of_touched_obstacle_is_redder() -> None:
+    _, box, sphere = read_obstacle_markers()
+    assert sphere.color.r > box.color.r
 
 
 def image(kind: type[Any], **more: Any) -> Any:
