@@ -148,30 +148,37 @@ def _cell(joints: int, reports: ReportSchedule) -> str:
 
 
 def scan_channels(arguments: argparse.Namespace) -> int:
-    """List the modules that answer on some buses. Returns 1 if none answers."""
-    found: list[dict[str, str]] = []
-    in_use: list[str] = []
+    """List the joint modules that answer on some buses. Returns 1 if none answers.
+
+    Nothing is sent on a bus that unknown nodes use, unless `--anyway` is given.
+    """
+    all_rows: list[dict[str, str]] = []  # of all buses, by column
+    channels_in_use: list[str] = []
     print_text = discard_line if arguments.json else print_line
     for channel in arguments.channel:
-        if not arguments.anyway and (others := list_unknown_senders(channel, arguments.bit_rate)):
-            in_use.append(channel)
+        unknown_senders: list[UnknownFrames] = []
+        if not arguments.anyway:
+            unknown_senders = list_unknown_senders(channel, arguments.bit_rate)
+        if unknown_senders:
+            channels_in_use.append(channel)
             print_text(
                 f"{channel}: others use this bus, and nothing was sent; add --anyway to request modules all the same"
             )
-            for other in others:
-                print_text(f"  {other}")
+            for sender in unknown_senders:
+                print_text(f"  {sender}")
             continue
         wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
             rows = scan(wire, arguments.duration)
         finally:
             wire.close()
-        for line in align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]:
+        lines = align_columns(COLUMNS, rows) if rows else [f"{channel}: no module answers"]
+        for line in lines:
             print_text(line)
-        found += rows
+        all_rows += rows
     if arguments.json:
-        print_json({"drives": found, "in_use_by_others": in_use})
-    return OK if found else FAILED
+        print_json({"drives": all_rows, "in_use_by_others": channels_in_use})
+    return OK if all_rows else FAILED
 
 
 def list_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
@@ -192,19 +199,34 @@ def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
 
 
 def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
+    """Return a module's row of the scan, by column; values that it has not reported are UNKNOWN.
+
+    Args:
+        identity: the module's answer to the request for its identity.
+        reading: the reports of all modules that arrived during the scan.
+    """
+    if identity.stepped:
+        emulated = "stepped"
+    elif identity.emulated:
+        emulated = "yes"
+    else:
+        emulated = "no"
     row = dict.fromkeys(COLUMNS, UNKNOWN) | {
         "channel": identity.channel,
         "node": str(identity.node),
         "serial": f"{identity.serial:08X}",
         "firmware": identity.firmware,
         "protocol": str(identity.protocol),
-        "emulated": "stepped" if identity.stepped else "yes" if identity.emulated else "no",
+        "emulated": emulated,
     }
     if not FIRST_NODE <= identity.node <= LAST_NODE:
         return row
     i = identity.node - 1
-    module, health, shaft = reading.modules[i], reading.health()[i], reading.shaft_raw[i]
-    if module.uptime_ms >= 0:  # it has sent a heartbeat
+    module = reading.modules[i]
+    health = reading.health()[i]
+    shaft_torque = reading.shaft_raw[i]
+    has_sent_heartbeat = module.uptime_ms >= 0
+    if has_sent_heartbeat:
         row["state"] = module.state.name.lower()
         row["faults"] = "+".join(module.fault_names()) or "none"
         row["uptime"] = f"{module.uptime_ms / 1000:.1f} s"
@@ -213,8 +235,9 @@ def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
         row["voltage"] = f"{signals['voltage'].decode(health[0]):.1f} V"
         row["motor"] = f"{signals['motor_temperature'].decode(health[2]):.0f} °C"
         row["board"] = f"{signals['board_temperature'].decode(health[3]):.0f} °C"
-    if shaft is not None:  # only while a host sends Syncs, and modules report their IMUs
-        row["shaft"] = f"{load_layouts()[Opcode.SHAFT_LOAD].signals['torque'].decode(shaft):.3f} N·m"
+    if shaft_torque is not None:  # only while a host sends Syncs, and modules report their IMUs
+        torque_nm = load_layouts()[Opcode.SHAFT_LOAD].signals["torque"].decode(shaft_torque)
+        row["shaft"] = f"{torque_nm:.3f} N·m"
     return row
 
 
@@ -222,37 +245,39 @@ def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
 
 
 def replay_log(arguments: argparse.Namespace) -> int:
-    """Compare the log of a bus with the record of its run. Returns 1 if they differ."""
+    """Compare the log of a bus with the run log of the same run. Returns 1 if they differ."""
     loaded = load_scenario(str(arguments.run / "config.json"), [])
-    if loaded.config.backend != MODULES:
+    config = loaded.config
+    if config.backend != MODULES:
         raise ConfigError(
-            f"{arguments.run}: is a run with the backend {loaded.config.backend!r}, and `snakesim drive replay can` "
+            f"{arguments.run}: is a run with the backend {config.backend!r}, and `snakesim drive replay can` "
             f"reads the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run",
             code="recording/missing-data",
         )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)
-    mounting, limit_s = Mounting(loaded.config.robot.joint_table), answer_limit_s(loaded.config, settings)
-    done = LogReplay(mounting, plan_reports(loaded.config, settings), limit_s)
+    replay = LogReplay(
+        Mounting(config.robot.joint_table), plan_reports(config, settings), answer_limit_s(config, settings)
+    )
     log = BusLog(arguments.log)
-    done.read(log)
-    if not done.joints:
-        found = f"{done.frames} frames, and no Sync among them: the log of another bus"
-        print_line(f"{arguments.log}: {found}{looks(done.foreign)}")
+    replay.read(log)
+    if not replay.joints:
+        finding = f"{replay.frames} frames, and no Sync among them: the log of another bus"
+        print_line(f"{arguments.log}: {finding}{looks(replay.foreign)}")
         return FAILED
-    print_line(f"{arguments.log}: {done.frames} frames, {len(done.joints)} Syncs")
+    print_line(f"{arguments.log}: {replay.frames} frames, {len(replay.joints)} Syncs")
     for line in log.report():
         print_line(f"  {line}")
-    for name, silent in zip(layout.joints, done.silent, strict=True):
-        if silent:
-            print_line(f"  {name} did not answer {silent} Syncs in time")
-    for node, count in sorted(done.reading.unknown_nodes.items()):
-        print_line(f"  {count} frames of node {node}, which is not of this robot")
-    verdict = compare_with_run_log(done, layout, rows)
-    if verdict.first_wrong:
-        print_line(f"joint states differ from {arguments.run}: {verdict.first_wrong}")
+    for name, silent_syncs in zip(layout.joints, replay.silent, strict=True):
+        if silent_syncs:
+            print_line(f"  {name} did not answer {silent_syncs} Syncs in time")
+    for node, frame_count in sorted(replay.reading.unknown_nodes.items()):
+        print_line(f"  {frame_count} frames of node {node}, which is not of this robot")
+    comparison = compare_with_run_log(replay, layout, rows)
+    if comparison.first_wrong:
+        print_line(f"joint states differ from {arguments.run}: {comparison.first_wrong}")
         return FAILED
-    print_line(f"joint states of {verdict.compared} ticks are those of the record, to the bit")
+    print_line(f"joint states of {comparison.compared} ticks are those of the record, to the bit")
     return OK
 
 

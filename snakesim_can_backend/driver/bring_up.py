@@ -56,40 +56,48 @@ class ModuleBus:
 def find_modules(
     buses: Sequence[ModuleBus], limit_s: float, on_frame: Callable[[Frame], None] | None = None
 ) -> list[ModuleIdentity]:
-    """Send `identify` until all expected nodes have answered, or the time is over.
+    """Request the identity of all modules until the expected ones have answered, or the time is over.
 
     Args:
         buses: the buses, with the nodes that are expected there.
         limit_s: how long to wait at most.
-        on_frame: gets all frames that are no answers.
+        on_frame: gets all frames that are not answers to the request.
 
     Returns:
-        Everything that answered, sorted by node. Two modules may have the same id.
+        Every identity that was received, sorted by node. Two modules may have the same id.
     """
-    layout = load_layouts()[Opcode.IDENTITY]
     identities: dict[tuple[str, int, int], ModuleIdentity] = {}  # by channel, node and serial number
     missing = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
     end_s = time.monotonic() + limit_s
-    ask_at_s = 0.0
-    complete = False
-    while (now_s := time.monotonic()) < end_s:
-        if now_s >= ask_at_s:
+    next_request_s = 0.0
+    is_complete = False
+    now_s = time.monotonic()
+    while now_s < end_s:
+        if now_s >= next_request_s:
             for wire in wires:
                 wire.send(commands.make_command(CommandAction.IDENTIFY))
-            ask_at_s = now_s + ASK_EVERY_S
+            next_request_s = now_s + ASK_EVERY_S
         for wire, frame in receive_frames(wires, end_s - now_s):
-            is_identity = parse_opcode(frame.id) == Opcode.IDENTITY and len(frame.data) == layout.length
-            if is_identity:
-                identity = _make_identity(wire.channel, parse_node(frame.id), layout.decode(frame.data))
+            identity = _parse_identity(wire.channel, frame)
+            if identity is not None:
                 identities[identity.channel, identity.node, identity.serial] = identity
                 missing.discard((identity.channel, identity.node))
             elif on_frame is not None:
                 on_frame(frame)
-        if not complete and not missing:
-            complete = True
-            end_s = min(end_s, time.monotonic() + LISTEN_ON_S)
+        if not is_complete and not missing:
+            is_complete = True
+            end_s = min(end_s, time.monotonic() + LISTEN_ON_S)  # a second module with the same id may still answer
+        now_s = time.monotonic()
     return sorted(identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial))
+
+
+def _parse_identity(channel: str, frame: Frame) -> ModuleIdentity | None:
+    """Return the identity in a frame from a channel; None if the frame is another message."""
+    layout = load_layouts()[Opcode.IDENTITY]
+    if parse_opcode(frame.id) != Opcode.IDENTITY or len(frame.data) != layout.length:
+        return None
+    return _make_identity(channel, parse_node(frame.id), layout.decode(frame.data))
 
 
 def _make_identity(channel: str, node: int, values: Mapping[str, float]) -> ModuleIdentity:
@@ -116,19 +124,24 @@ def discovery_errors(
         lockstep: whether the run is in lockstep, which only stepped emulators support.
     """
     errors: list[str] = []
-    channel_of = {node: bus.wire.channel for bus in buses for node in bus.nodes}
-    by_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
+    channel_of_node = {node: bus.wire.channel for bus in buses for node in bus.nodes}
+    identities_of_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
     for identity in found:
-        by_node[identity.node].append(identity)
-    for node, channel in channel_of.items():
+        identities_of_node[identity.node].append(identity)
+    for node, channel in channel_of_node.items():
         subject = f"{joints[node - 1]} (node {node} on {channel})"
-        here = [identity for identity in by_node[node] if identity.channel == channel]
-        elsewhere = [identity for identity in by_node[node] if identity.channel != channel]
-        errors += _node_errors(subject, here, elsewhere)
-        for identity in here:
+        on_its_channel: list[ModuleIdentity] = []
+        on_other_channels: list[ModuleIdentity] = []
+        for identity in identities_of_node[node]:
+            if identity.channel == channel:
+                on_its_channel.append(identity)
+            else:
+                on_other_channels.append(identity)
+        errors += _node_errors(subject, on_its_channel, on_other_channels)
+        for identity in on_its_channel:
             errors += _identity_errors(subject, identity, lockstep=lockstep)
     for identity in found:
-        if identity.node not in channel_of:
+        if identity.node not in channel_of_node:
             errors.append(
                 f"node {identity.node} with serial {identity.serial:08X} on {identity.channel} is not a joint of this "
                 f"robot"

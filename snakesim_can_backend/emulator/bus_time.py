@@ -129,7 +129,13 @@ class BusTime:
         return Traffic(now_us, tuple(self._frames), tuple(self._busy_us), self._replaced, self._late_us)
 
     def _advance(self, now_us: float) -> None:
-        """Run the bus until now. A frame that would begin now waits for others that are enqueued now."""
+        """Send waiting frames in the order of arbitration, up to the present time.
+
+        A frame that would begin exactly now does not begin yet, because others may still be enqueued now.
+
+        Args:
+            now_us: present time.
+        """
         while True:
             if self._under_way is not None:
                 frame, end_us = self._under_way
@@ -140,8 +146,8 @@ class BusTime:
             if not self._first:
                 return
             _, sender, mailbox = self._first[0]
-            frame, since_us = self._waiting[sender][mailbox]
-            start_us = max(self._free_us, since_us)
+            _, waiting_since_us = self._waiting[sender][mailbox]
+            start_us = max(self._free_us, waiting_since_us)
             if start_us >= now_us:
                 return
             heappop(self._first)

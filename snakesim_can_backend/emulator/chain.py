@@ -290,25 +290,30 @@ class ModuleChain:
     # --- a Sync --------------------------------------------------------------------------------------------
 
     def _receive_sync(self, channel: int, frame: Frame) -> None:
-        """Advance to a Sync, send the pose, and let every module of its bus answer and follow its setpoint."""
-        count, time = read_sync(frame.data)
-        frames = self._outgoing[channel]
-        sent_before = len(frames)
-        if self.stepped:
-            self._step_to(time)
-        self._send_pose_once(time)
+        """Advance to a Sync, send the pose, and let every module of its bus answer and follow its setpoint.
 
-        slots = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
-        own_slots = slots[: self.modules_per_bus[channel]]
-        imu_due = [slot.module.imu_is_due() for slot in own_slots]
+        Args:
+            channel: index of the bus on which the Sync arrived.
+            frame: the Sync.
+        """
+        count, time_us = read_sync(frame.data)
+        outgoing = self._outgoing[channel]
+        sent_before = len(outgoing)
+        if self.stepped:
+            self._step_to(time_us)
+        self._send_pose_once(time_us)
+
+        slots_on_bus = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
+        slots_of_joints = slots_on_bus[: self.modules_per_bus[channel]]
+        imu_due = [slot.module.imu_is_due() for slot in slots_of_joints]
         readings = self._sensors[channel].read(self.motors.torque_nm, self.motors.derated(), imu_due)
         first_joint = sum(self.modules_per_bus[:channel])
-        for slot in slots:
+        for slot in slots_on_bus:
             slot.module.sync(count, readings[slot.joint - first_joint])
             self._follow_module(slot)
 
-        answers = sorted(frames[sent_before:], key=lambda frame: frame.id)  # in the order of arbitration
-        frames[sent_before:] = answers
+        # Answers to the same Sync arrive in the order of arbitration: the lowest id first.
+        outgoing[sent_before:] = sorted(outgoing[sent_before:], key=lambda answer: answer.id)
 
     def _step_to(self, sync_time: int) -> None:
         """Advance by the time from the latest Sync to this one. The first sets zero, as does one of another clock."""

@@ -314,7 +314,7 @@ class ModuleFirmware:
         self._after_boot = ModuleState.DISARMED
         self.faults = 0  # bits of ModuleFault
 
-        # SafeSetpoints.
+        # Setpoints.
         self.demand = PASSIVE
         self._pending: Demand | None = None  # followed from the next Sync on
         self._expected_count: int | None = None  # counter of the next setpoint; None: any

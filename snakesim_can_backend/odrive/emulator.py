@@ -162,6 +162,7 @@ class EmulatedOdrive(CanEmulator):
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _obey(self, i: int, axis: EmulatedAxis, message: MessageId, values: tuple[float, ...]) -> None:
+        """Execute a command to an axis, with the values of its payload; an unknown command has no effect."""
         match message:
             case MessageId.ESTOP:
                 self._fail(i, axis, AxisError.ESTOP_REQUESTED)

@@ -71,6 +71,14 @@ class InertiaModel(PhysicsModel):
         self._buffer = np.zeros(count)  # of intermediate results, so that a step allocates no memory
 
     def advance(self, torque_nm: Floats) -> None:
+        """Advance by one step of semi-implicit Euler integration, without allocating memory.
+
+        Viscous friction is implicit, so that any coefficient is stable. Dry friction takes a fixed part of the
+        velocity, but never reverses a motion.
+
+        Args:
+            torque_nm: (n_joints,) torques of the motors during the step.
+        """
         angle_rad = self._angle_rad
         velocity_rad_s = self._velocity_rad_s
         buffer = self._buffer

@@ -223,22 +223,22 @@ def group_by_port(
 
     Args:
         joints: The joints of a driver type, by their indices in the robot.
-        settings: Its settings.
+        settings: The settings of the driver type.
         ports: Names of the ports.
-        open_drives: Opens a port, by its name, for joints with these indices.
+        open_drives: Opens the port of this name with the drives of these joints, which fill the readings.
     """
     port_indices = assign_ports(list(joints.values()), ports)
     specs: list[BusSpec] = []
     for port_index, port in enumerate(ports):
-        here = tuple(joint for joint, index in zip(joints, port_indices, strict=True) if index == port_index)
-        if here:
-            specs.append(
-                BusSpec(
-                    name=port,
-                    joints=here,
-                    open=partial(open_drives, port, here),
-                    decimation=settings.decimation,
-                    watchdog_s=settings.watchdog_s,
-                )
-            )
+        joints_on_port = tuple(joint for joint, index in zip(joints, port_indices, strict=True) if index == port_index)
+        if not joints_on_port:
+            continue
+        spec = BusSpec(
+            name=port,
+            joints=joints_on_port,
+            open=partial(open_drives, port, joints_on_port),
+            decimation=settings.decimation,
+            watchdog_s=settings.watchdog_s,
+        )
+        specs.append(spec)
     return specs

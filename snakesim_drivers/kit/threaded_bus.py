@@ -163,6 +163,10 @@ class ThreadedBus(InlineBus):
     # --- in the bus thread ------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        """Run cycles until the bus is closed, then close the drives.
+
+        An error in a cycle switches the drives off, and is passed to the host, which ends the run.
+        """
         closing = False
         while not closing:
             closing = self._closing  # read before the cycle: the last cycle still sends what was queued

@@ -246,20 +246,26 @@ def _derive_velocity(previous: MocapSample, sample: MocapSample, duration_s: flo
 
 
 def _derive_angular_velocity(previous: MocapSample, sample: MocapSample, duration_s: float) -> q.Vector:
-    """Return the mean angular velocity between two poses, in the world, for a small rotation.
+    """Return the mean angular velocity between two poses, for a small rotation.
 
         angular velocity = 2 / duration * vector part of (orientation * conjugate(previous orientation))
 
     The sign is that of the shorter rotation, because q and -q are the same orientation.
+
+    Args:
+        previous: The earlier pose.
+        sample: The later pose.
+        duration_s: Time between the two.
+
+    Returns:
+        (3,) in rad/s, in the world frame.
     """
-    before = previous.orientation_wxyz
-    after = sample.orientation_wxyz
-    cosine = sum(i * j for i, j in zip(before, after, strict=True))
+    w1, x1, y1, z1 = previous.orientation_wxyz
+    w2, x2, y2, z2 = sample.orientation_wxyz
+    cosine = sum(i * j for i, j in zip(previous.orientation_wxyz, sample.orientation_wxyz, strict=True))
     factor = math.copysign(2.0 / duration_s, cosine)
-    w, x, y, z = before
-    bw, bx, by, bz = after
     return (
-        factor * (bx * w - bw * x - by * z + bz * y),
-        factor * (by * w - bw * y - bz * x + bx * z),
-        factor * (bz * w - bw * z - bx * y + by * x),
+        factor * (x2 * w1 - w2 * x1 - y2 * z1 + z2 * y1),
+        factor * (y2 * w1 - w2 * y1 - z2 * x1 + x2 * z1),
+        factor * (z2 * w1 - w2 * z1 - x2 * y1 + y2 * x1),
     )

@@ -15,6 +15,12 @@ from snakesim_drivers.kit.drive_backend import LATCHED_STATES
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 
+# Resolution of what `BusWorkbench` sends and measures.
+ANGLE_DECIMALS = 4  # of rad
+VELOCITY_DECIMALS = 3  # of rad/s
+TORQUE_DECIMALS = 3  # of N·m
+TORQUE_LIMIT_DECIMALS = 2  # of N·m
+
 DOCS = Path(__file__).parents[2] / "docs" / "hardware" / "write-a-backend.md"
 
 
@@ -114,29 +120,53 @@ class BusWorkbench(DrivesWorkbench):
         self.old = (np.zeros(joints), np.zeros(joints), np.zeros(joints))
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """The synchronisation: what was handed over acts from here on. Odd joints answer a period late."""
-        if self.on_its_way is not None:
-            self.armed_for = self.armed_for + 1 if self.lifecycle == "armed" else 0
-            asleep = np.arange(len(self.angle)) + self.WAKES_AFTER > self.armed_for
-            super().enact(self.on_its_way, self.lifecycle)
-            self.mode = np.where(asleep, int(Mode.PASSIVE), self.mode)
-            self.limit = np.round(self.limit, 2)
+        """Apply the commands that are on the bus, then measure. Joints with an odd index report one period late.
+
+        Args:
+            tick: Number of the control cycle.
+            timestamp_ns: The robot's time.
+        """
+        self._apply_commands_on_bus()
         fresh = super().sample(tick, timestamp_ns).joints
-        now = np.round(fresh.angle_rad, 4), np.round(fresh.velocity_rad_s, 3), np.round(fresh.torque_nm, 3)
-        late = np.arange(len(self.angle)) % 2 == 1
-        if self.samples == 0 and self.KNOWN_AT_ONCE:
-            self.old = now
-        angle, velocity, torque = (np.where(late, old, new).tolist() for old, new in zip(self.old, now, strict=True))
-        age_ns = [
-            age + self.description.period_ns * int(is_late) for age, is_late in zip(fresh.age_ns, late, strict=True)
-        ]
-        known = [self.KNOWN_AT_ONCE or not is_late or self.samples > 0 for is_late in late]
-        self.old, self.samples = now, self.samples + 1
-        return Samples(
-            msgspec.structs.replace(
-                fresh, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, age_ns=age_ns, valid=known
-            )
+        measured = (
+            np.round(fresh.angle_rad, ANGLE_DECIMALS),
+            np.round(fresh.velocity_rad_s, VELOCITY_DECIMALS),
+            np.round(fresh.torque_nm, TORQUE_DECIMALS),
         )
+        is_late = np.arange(len(self.angle)) % 2 == 1
+        is_first_sample = self.samples == 0
+        if is_first_sample and self.KNOWN_AT_ONCE:
+            self.old = measured
+        angle_rad, velocity_rad_s, torque_nm = (
+            np.where(is_late, previous, present).tolist() for previous, present in zip(self.old, measured, strict=True)
+        )
+        self.old = measured
+        self.samples += 1
+
+        delay_ns = self.description.period_ns * is_late
+        has_late_values = self.KNOWN_AT_ONCE or not is_first_sample
+        joints = msgspec.structs.replace(
+            fresh,
+            angle_rad=angle_rad,
+            velocity_rad_s=velocity_rad_s,
+            torque_nm=torque_nm,
+            age_ns=(np.array(fresh.age_ns) + delay_ns).tolist(),
+            valid=[has_late_values or not late for late in is_late],
+        )
+        return Samples(joints)
+
+    def _apply_commands_on_bus(self) -> None:
+        """Apply the newest setpoints; a joint that was armed only just now stays passive."""
+        if self.on_its_way is None:
+            return
+        if self.lifecycle == "armed":
+            self.armed_for += 1
+        else:
+            self.armed_for = 0
+        wakes_after = self.WAKES_AFTER + np.arange(len(self.angle))  # periods, of every joint
+        super().enact(self.on_its_way, self.lifecycle)
+        self.mode = np.where(self.armed_for < wakes_after, int(Mode.PASSIVE), self.mode)
+        self.limit = np.round(self.limit, TORQUE_LIMIT_DECIMALS)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Put it on the bus."""

@@ -32,6 +32,7 @@ NODE = 3
 SERIAL = 0xC0FFEE
 MS = 1000.0
 BOOTED = 100 * MS
+ARMED_AT_US = 110 * MS  # after all modules have booted
 HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 QUIET = ModuleReadings(0, 0, 0)
 
@@ -117,23 +118,36 @@ class Host:
 
 
 def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], Traffic, Traffic, int]:
-    """A whole bus for some time; how late each joint state came, in periods, and the traffic."""
+    """Run a whole bus of armed modules for some time, and measure its traffic.
+
+    Args:
+        joints: Number of modules on the bus.
+        rate_hz: Rate of the Syncs.
+        seconds: Duration of the run after arming.
+
+    Returns:
+        The lateness of each joint state in periods, the traffic counts before and after the run, and the maximum
+        number of frames that waited for the bus.
+    """
     emulators = chain(config(joints, rate_hz=rate_hz), stepped=False)
     emulators.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     for slot in emulators.slots:
         slot.module.parameters.values |= {ModuleParameter.CONTACT_EVERY: 1.0, ModuleParameter.IMU_EVERY: 20.0}
-    emulators.advance_to(110_000.0)
+    emulators.advance_to(ARMED_AT_US)
     emulators.receive(0, make_command(CommandAction.ARM))
-    period_us, before = 1e6 / rate_hz, emulators.traffic()[0]
-    late: list[int] = []
-    backlog = 0
+    traffic_before = emulators.traffic()[0]
+    period_us = 1e6 / rate_hz
+    lateness_periods: list[int] = []
+    max_waiting_frames = 0
     for tick in range(round(seconds * rate_hz)):
-        emulators.advance_to(110_000.0 + tick * period_us)
+        emulators.advance_to(ARMED_AT_US + tick * period_us)
         for answer in emulators.take_frames(0):
             if parse_opcode(answer.id) == Opcode.JOINT_STATE:
-                late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
+                sync_count = answer.data[6] & 0xF  # the number of the answered Sync, modulo 16
+                lateness_periods.append(((tick - 1) - sync_count) % 16)
         emulators.receive(0, make_sync(tick, 0))
         for node in range(1, joints + 1):
             emulators.receive(0, setpoint(tick, node=node, target=0.0))
-        backlog = max(backlog, sum(map(len, emulators.buses[0]._waiting.values())))
-    return late, before, emulators.traffic()[0], backlog
+        waiting_frames = sum(map(len, emulators.buses[0]._waiting.values()))
+        max_waiting_frames = max(max_waiting_frames, waiting_frames)
+    return lateness_periods, traffic_before, emulators.traffic()[0], max_waiting_frames

@@ -104,10 +104,24 @@ def depth_image(
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> DepthImage:
-    """An image from a camera at a pose in the world (rotation: world_from_camera); the mount is only reported."""
+    """Return the image of a depth camera.
+
+    Args:
+        obstacles: What the camera can see, besides the ground.
+        position_w: (3,) place of the camera in the world, m.
+        rotation: (3, 3) world_from_camera.
+        ground: Height of the ground.
+        eye: Errors of the camera; None: it is exact.
+        timestamp_ns: Time of the image.
+        link: Link that the message reports as the camera's.
+        position_l: Mount on this link that the message reports, m; it does not move the camera.
+    """
     rays = INTRINSICS.rays().astype(np.float64) @ rotation.T
-    depth = (eye or Eye()).through(distance_along(position_w, rays, obstacles, ground))
-    counts = np.where(np.isfinite(depth) & (depth < RANGE_M[1]) & (depth > RANGE_M[0]), depth / SCALE_M, 0.0)
+    errors = eye or Eye()
+    depth_m = errors.through(distance_along(position_w, rays, obstacles, ground))
+    min_range_m, max_range_m = RANGE_M
+    is_measured = np.isfinite(depth_m) & (depth_m < max_range_m) & (depth_m > min_range_m)
+    counts = np.where(is_measured, depth_m / SCALE_M, 0.0)  # 0: not measured
     return DepthImage(
         tick=0,
         timestamp_ns=timestamp_ns,
@@ -115,8 +129,8 @@ def depth_image(
         position_l=position_l,
         orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
         **asdict(INTRINSICS),
-        range_min_m=RANGE_M[0],
-        range_max_m=RANGE_M[1],
+        range_min_m=min_range_m,
+        range_max_m=max_range_m,
         scale_m=SCALE_M,
         depth=np.round(counts).astype("<u2").tobytes(),
     )
@@ -125,10 +139,20 @@ def depth_image(
 def lidar(
     obstacles: Sequence[Obstacle], position_w: Floats, rotation: Floats, *, beams: int = 181, timestamp_ns: int = 0
 ) -> Ranges:
-    """A planar lidar that sees half a turn, without errors."""
-    angles = np.linspace(-math.pi / 2, math.pi / 2, beams)
-    rays = np.stack([np.cos(angles), np.sin(angles), np.zeros(beams)], axis=1) @ rotation.T
-    found = distance_along(position_w, rays, obstacles)
+    """Return the scan of an exact planar lidar that covers half a turn.
+
+    Args:
+        obstacles: What the beams can hit, besides flat ground.
+        position_w: (3,) place of the lidar in the world, m.
+        rotation: (3, 3) world_from_lidar; x points forward.
+        beams: Number of beams, from right to left.
+        timestamp_ns: Time of the scan.
+    """
+    max_range_m = 4.0
+    angles_rad = np.linspace(-math.pi / 2, math.pi / 2, beams)
+    rays = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beams)], axis=1) @ rotation.T
+    distances_m = distance_along(position_w, rays, obstacles)
+    angle_step_rad = float(angles_rad[1] - angles_rad[0]) if beams > 1 else 0.01  # a message needs a step above 0
     return Ranges(
         tick=0,
         timestamp_ns=timestamp_ns,
@@ -136,10 +160,10 @@ def lidar(
         position_l=(0.0, 0.0, 0.0),
         orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
         angle_min_rad=-math.pi / 2,
-        angle_step_rad=float(angles[1] - angles[0]) if beams > 1 else 0.01,
+        angle_step_rad=angle_step_rad,
         range_min_m=0.02,
-        range_max_m=4.0,
-        range_m=[float(r) if r < 4.0 else None for r in found],
+        range_max_m=max_range_m,
+        range_m=[float(distance_m) if distance_m < max_range_m else None for distance_m in distances_m],
     )
 
 

@@ -89,20 +89,32 @@ class Stage:
 
 @contextmanager
 def stage(**config: Any) -> Iterator[Stage]:
-    """The worm in real time, with guidance, navigation, and control with the controller that shows its observations."""
-    common = {"controller": "showing", "clock_mode": "realtime", "services": SCHEDULE, "rate_hz": 50.0}
-    made = run_config(**{**common, "allow_fault_injection": True, **POSE, **config})
-    Showing.observations, Showing.answers = [], []
+    """Run the worm in real time with guidance, navigation and control; the controller records its observations.
+
+    Args:
+        config: Changes of the configuration, as for `run_config`.
+    """
+    defaults = {
+        "controller": "showing",
+        "clock_mode": "realtime",
+        "services": SCHEDULE,
+        "rate_hz": 50.0,
+        "allow_fault_injection": True,
+        **POSE,
+    }
+    run_settings = run_config(**{**defaults, **config})
+    Showing.observations = []
+    Showing.answers = []
     with (
         offer_plugin(CONTROLLERS, "showing", Showing),
-        running(made) as run,
+        running(run_settings) as run,
         open_session(run.link) as session,
         ExitStack() as stack,
     ):
         states = session.reader(keys.CONTROL_STATE, ControlState)
         services: dict[str, Serving] = {}
         for name in SCHEDULE:
-            services[name] = Serving(name, made, run.link)
+            services[name] = Serving(name, run_settings, run.link)
             stack.callback(services[name].stop)
         wait_until(lambda: set(SCHEDULE) <= set(run.status.alive), "all services")
         yield Stage(run, services, states, Showing.observations)

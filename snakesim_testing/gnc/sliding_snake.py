@@ -24,6 +24,11 @@ IMAGE_EVERY = 3  # turns
 DELAY_TURNS = 2
 POSE_NOISE = PoseNoise(0.0005, 0.001)
 NOISE = Noise(0.002, 0.003)
+# Random obstacles.
+MAX_TRIES_PER_OBSTACLE = 100
+BOX_FRACTION = 0.35
+MIN_GAP_M = 0.12  # between obstacles
+WAVE_HALF_WIDTH_M = 0.1  # strip along the x axis that stays free
 ROUTE = Route(sine_points(0.045, 0.6, 12.0))
 
 
@@ -133,21 +138,32 @@ class Drive:
 
 
 def random_field(seed: int, count: int = 60) -> list[Obstacle]:
-    """Cylinders, and a third boxes, at least 12 cm apart, on both sides of the wave."""
+    """Return random obstacles on both sides of the wave: about two thirds cylinders, one third boxes.
+
+    Args:
+        seed: Seed of shapes and places.
+        count: Number of obstacles; there are fewer if no free places are found.
+    """
     random = np.random.default_rng(seed)
-    found: list[Obstacle] = []
-    for _ in range(100 * count):
-        if len(found) == count:
+    obstacles: list[Obstacle] = []
+    for _ in range(MAX_TRIES_PER_OBSTACLE * count):
+        if len(obstacles) == count:
             break
-        x, y = random.uniform([1.6, -1.0], [6.0, 1.0]).tolist()
-        size, round_m = random.uniform(0.06, 0.18, 2), float(random.uniform(0.03, 0.06))
-        boxy = random.random() < 0.35
-        reach = math.hypot(*size) / 2 if boxy else round_m
-        apart = all(outline_distance_m(o, np.array([x, y])) > reach + 0.12 for o in found)
-        if apart and abs(y) > reach + 0.1:
-            name = f"{len(found)}"
-            yaw = float(random.uniform(0, 3))
-            found.append(
-                box(name, x, y, (float(size[0]), float(size[1])), yaw) if boxy else cylinder(name, x, y, round_m)
-            )
-    return found
+        x, y = random.uniform([1.6, -1.0], [6.0, 1.0]).tolist()  # m
+        length_m, width_m = random.uniform(0.06, 0.18, 2).tolist()
+        radius_m = float(random.uniform(0.03, 0.06))
+        is_box = random.random() < BOX_FRACTION
+        half_extent_m = math.hypot(length_m, width_m) / 2 if is_box else radius_m
+        has_free_place = all(
+            outline_distance_m(other, np.array([x, y])) > half_extent_m + MIN_GAP_M for other in obstacles
+        )
+        is_beside_wave = abs(y) > half_extent_m + WAVE_HALF_WIDTH_M
+        if not (has_free_place and is_beside_wave):
+            continue
+        name = f"{len(obstacles)}"
+        yaw_rad = float(random.uniform(0, 3))  # drawn for cylinders, too: the next obstacle depends on it
+        if is_box:
+            obstacles.append(box(name, x, y, (length_m, width_m), yaw_rad))
+        else:
+            obstacles.append(cylinder(name, x, y, radius_m))
+    return obstacles

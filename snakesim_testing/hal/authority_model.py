@@ -31,8 +31,30 @@ def within(value: float, low: float, high: float) -> float:
 
 
 def stoppable(distance: float) -> float:
-    """The speed from which a joint stops within a distance, after it went on for the reaction time."""
-    return ACCELERATION * (math.sqrt(REACTION_S**2 + 2 * distance / ACCELERATION) - REACTION_S) if distance > 0 else 0.0
+    """Return the speed from which a joint stops within a distance, after it went on for the reaction time."""
+    if distance <= 0:
+        return 0.0
+    return ACCELERATION * (math.sqrt(REACTION_S**2 + 2 * distance / ACCELERATION) - REACTION_S)
+
+
+def torque_bounds(angle: float, velocity: float, torque_limit: float) -> tuple[float, float]:
+    """Return the range of torques that keep a joint able to stop at its end stops.
+
+    Args:
+        angle: Angle of the joint in rad.
+        velocity: Its velocity in rad/s.
+        torque_limit: Torque limit in N·m.
+    """
+    # The limiter brakes with 1 N·m·s/rad, so speeds and torques have the same numbers here.
+    low = -stoppable(ANGLE + angle) - velocity
+    high = stoppable(ANGLE - angle) - velocity
+    if angle >= ANGLE:  # at the upper stop: no torque pushes further
+        low = min(low, min(high, 0.0))
+        high = min(high, 0.0)
+    if angle <= -ANGLE:
+        high = max(high, max(low, 0.0))
+        low = max(low, 0.0)
+    return within(low, -torque_limit, torque_limit), within(high, -torque_limit, torque_limit)
 
 
 class Health:
@@ -262,28 +284,41 @@ class Model(RuleBasedStateMachine):
                 assert i not in decision.limited
 
     def check_target(self, i: int, decision: TickDecision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
-        """Inside the limits, no faster than allowed, as near to what is wanted as that permits; else named."""
+        """Check the target that the authority applied to one joint.
+
+        It must be inside the limits, change no faster than allowed, and be as near to the command as both permit. A
+        target that differs from the command must be reported as limited.
+
+        Args:
+            i: Index of the joint.
+            decision: What the authority applied.
+            mode: Mode of the command.
+            wanted: Target of the command, in rad, rad/s or N·m, by its mode.
+            bound_by_heat: Whether derating lowers the torque limit of the command.
+        """
         angle, velocity, torque = (column[i] for column in self.measured)
         target = decision.setpoints.target[i]
-        if mode is Mode.POSITION:
-            low, high = (within(angle + side * FAR, -ANGLE, ANGLE) for side in (-1, 1))
-            step, start = SPEED * PERIOD_S, angle + (torque + DAMPING * velocity) / STIFFNESS
-        elif mode is Mode.VELOCITY:
-            low, high = max(-SPEED, -stoppable(ANGLE + angle)), min(SPEED, stoppable(ANGLE - angle))
-            step, start = ACCELERATION * PERIOD_S, velocity + torque / VELOCITY_GAIN
-        else:
-            most = decision.setpoints.torque_limit_nm[i]
-            low, high = -stoppable(ANGLE + angle) - velocity, stoppable(ANGLE - angle) - velocity  # gain 1 N·m·s/rad
-            if angle >= ANGLE:
-                low, high = min(low, min(high, 0.0)), min(high, 0.0)
-            if angle <= -ANGLE:
-                low, high = max(low, 0.0), max(high, max(low, 0.0))
-            low, high = within(low, -most, most), within(high, -most, most)
-            step, start = TORQUE_RATE * PERIOD_S, torque
+        match mode:
+            case Mode.POSITION:
+                low = within(angle - FAR, -ANGLE, ANGLE)
+                high = within(angle + FAR, -ANGLE, ANGLE)
+                max_change = SPEED * PERIOD_S
+                start = angle + (torque + DAMPING * velocity) / STIFFNESS
+            case Mode.VELOCITY:
+                low = max(-SPEED, -stoppable(ANGLE + angle))
+                high = min(SPEED, stoppable(ANGLE - angle))
+                max_change = ACCELERATION * PERIOD_S
+                start = velocity + torque / VELOCITY_GAIN
+            case _:
+                low, high = torque_bounds(angle, velocity, decision.setpoints.torque_limit_nm[i])
+                max_change = TORQUE_RATE * PERIOD_S
+                start = torque
         if self.last is not None and self.last.setpoints.mode[i] is mode:
             start = self.last.setpoints.target[i]
         assert math.isfinite(target)
         assert low <= target <= high
-        assert abs(target - start) <= step + TINY or target in (low, high)  # the limits themselves outrank the rate
-        assert abs(target - within(within(wanted, start - step, start + step), low, high)) <= TINY
+        # The limits have priority over the rate of change.
+        assert abs(target - start) <= max_change + TINY or target in (low, high)
+        nearest_reachable = within(wanted, start - max_change, start + max_change)
+        assert abs(target - within(nearest_reachable, low, high)) <= TINY
         assert (i in decision.limited) == (target != wanted or bound_by_heat)

@@ -142,27 +142,25 @@ def replaced(value: Any, at: Place, by: Any) -> Any:
     return copy
 
 
-def poisons(info: inspect.Type) -> list[Any]:
-    """Values that a field of this type must refuse."""
+def poisons(info: inspect.Type) -> list[Any]:  # noqa: C901 - one case a type
+    """Return values that a field of this type must reject: values out of its bounds, and values of other types."""
     match info:
         case inspect.FloatType():
-            bad: list[Any] = [float("nan"), float("inf"), float("-inf"), "1.0", [1.0]]
-            bad += [] if info.ge is None else [info.ge - 1e-3 - abs(info.ge) * 1e-9]
-            bad += [] if info.gt is None else [info.gt]
-            bad += [] if info.le is None else [info.le + 1e-3 + abs(info.le) * 1e-9]
-            bad += [] if info.lt is None else [info.lt]
-            return bad
+            return _invalid_floats(info)
         case inspect.IntType():
-            low, high = lowest(info), highest(info)
-            edges = [None if low is None else low - 1, None if high is None else high + 1]
-            return [-(2**63), 2**63, 0.5, "1", *(edge for edge in edges if edge is not None)]
+            return _invalid_integers(info)
         case inspect.StrType():
-            bad = [1, b"a"]
-            bad += [] if info.max_length is None else ["a" * (info.max_length + 1)]
-            bad += [""] if info.min_length else []
-            return bad
+            invalid: list[Any] = [1, b"a"]
+            if info.max_length is not None:
+                invalid.append("a" * (info.max_length + 1))
+            if info.min_length:
+                invalid.append("")
+            return invalid
         case inspect.BytesType():
-            return [1, [1], *([] if info.max_length is None else [bytes(info.max_length + 1)])]
+            invalid = [1, [1]]
+            if info.max_length is not None:
+                invalid.append(bytes(info.max_length + 1))
+            return invalid
         case inspect.BoolType():
             return [0, 1, "true"]
         case inspect.LiteralType():
@@ -170,10 +168,39 @@ def poisons(info: inspect.Type) -> list[Any]:
         case inspect.EnumType():
             return [-1, 1000, "POSITION"]
         case inspect.ListType():
-            return [{}, 1] + ([] if not info.min_length else [[]])
+            invalid = [{}, 1]
+            if info.min_length:
+                invalid.append([])
+            return invalid
         case inspect.TupleType():
             return [[], [0.0] * (len(info.item_types) + 1)]
         case inspect.DictType() | inspect.StructType():
             return [[], 1]
         case _:
             return []
+
+
+def _invalid_floats(info: inspect.FloatType) -> list[Any]:
+    """Return numbers that are not finite or out of bounds, and values of other types."""
+    invalid: list[Any] = [float("nan"), float("inf"), float("-inf"), "1.0", [1.0]]
+    if info.ge is not None:
+        invalid.append(info.ge - 1e-3 - abs(info.ge) * 1e-9)  # the second term: large bounds absorb the first
+    if info.gt is not None:
+        invalid.append(info.gt)
+    if info.le is not None:
+        invalid.append(info.le + 1e-3 + abs(info.le) * 1e-9)
+    if info.lt is not None:
+        invalid.append(info.lt)
+    return invalid
+
+
+def _invalid_integers(info: inspect.IntType) -> list[Any]:
+    """Return integers out of the wire's range or the field's bounds, and values of other types."""
+    invalid: list[Any] = [-(2**63), 2**63, 0.5, "1"]
+    minimum = lowest(info)
+    if minimum is not None:
+        invalid.append(minimum - 1)
+    maximum = highest(info)
+    if maximum is not None:
+        invalid.append(maximum + 1)
+    return invalid

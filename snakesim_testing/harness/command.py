@@ -61,10 +61,18 @@ def call(
     limit_s: float = LIMIT_S,
     begin: Callable[[], None] | None = None,
 ) -> Ended:
-    """Any program to its end. env: all of its environment. begin: is called in its process, before it begins."""
-    began = time.monotonic()
+    """Run a program to its end, without input.
+
+    Args:
+        typed: The program and its arguments.
+        cwd: Folder in which it runs.
+        env: All of its environment; None: `environment(cwd)`.
+        limit_s: Time after which it is killed; its exit code is then TOO_LONG.
+        begin: Called in the child process before the program begins.
+    """
+    start_s = time.monotonic()
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             [str(word) for word in typed],
             cwd=cwd,
             env=environment(cwd) if env is None else env,
@@ -74,12 +82,14 @@ def call(
             check=False,
             preexec_fn=begin,
         )
-    except subprocess.TimeoutExpired as late:
-        code, out, err = TOO_LONG, late.stdout, (late.stderr or b"") + b"\n[did not end within %g s]" % limit_s
-    else:
-        code, out, err = done.returncode, done.stdout, done.stderr
-    said = [(text or b"").decode(errors="replace") for text in (out, err)]
-    return Ended(code, *said, took_s=time.monotonic() - began)
+        code = completed.returncode
+        out = completed.stdout
+        err = completed.stderr
+    except subprocess.TimeoutExpired as timeout:
+        code = TOO_LONG
+        out = timeout.stdout or b""
+        err = (timeout.stderr or b"") + b"\n[did not end within %g s]" % limit_s
+    return Ended(code, out.decode(errors="replace"), err.decode(errors="replace"), took_s=time.monotonic() - start_s)
 
 
 @dataclass(frozen=True)

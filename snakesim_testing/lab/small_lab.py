@@ -31,7 +31,12 @@ MACHINES = ("hub", "robot1", "robot2", "ws1", "ws2", "laptop")
 
 
 def lab_text(folder: Path, port: int) -> str:
-    """Two robots, each with every role, behind one router; `spare` is a router that is never started."""
+    """Return the lab file of two robots, each with every role, behind one router.
+
+    Args:
+        folder: Where each machine has a folder of its own.
+        port: Port of the router. The port after it is that of `spare`, a router that is never started.
+    """
     machines = [f'[machines.{name}]\naddress = "127.0.0.1"\nfolder = "{folder}/{name}"' for name in MACHINES]
     routers = [
         f'[routers.main]\nmachine = "hub"\nport = {port}',
@@ -41,19 +46,22 @@ def lab_text(folder: Path, port: int) -> str:
         f'[robots.{OWN}]\nmachine = "robot1"\nscenario = "triplet"\nbackend = "sim"\nfaults = true',
         f'[robots.{OTHER}]\nmachine = "robot2"\nscenario = "triplet"\nbackend = "sim"',
     ]
-    roles = [
-        f'[[roles]]\nmachine = "{machine}"\nrole = "{role}"\nrobot = "{robot}"'
-        for robot, station in ((OWN, "ws1"), (OTHER, "ws2"))
-        for role, machine in (
-            ("gnc", station),
-            ("recorder", station),
-            ("operator", "laptop"),
-            ("viewer", "laptop"),
-            ("administrator", "hub"),
-        )
-    ]
-    roles.append('[[roles]]\nmachine = "laptop"\nrole = "operator"\nrobot = "all"')
+    roles: list[str] = []
+    for robot, workstation in ((OWN, "ws1"), (OTHER, "ws2")):
+        roles += [
+            _role_text("gnc", workstation, robot),
+            _role_text("recorder", workstation, robot),
+            _role_text("operator", "laptop", robot),
+            _role_text("viewer", "laptop", robot),
+            _role_text("administrator", "hub", robot),
+        ]
+    roles.append(_role_text("operator", "laptop", "all"))
     return "\n\n".join(['name = "small lab"', *machines, *routers, *robots, *roles])
+
+
+def _role_text(role: str, machine: str, robot: str) -> str:
+    """Return the section of the lab file that gives a machine a role for a robot."""
+    return f'[[roles]]\nmachine = "{machine}"\nrole = "{role}"\nrobot = "{robot}"'
 
 
 @dataclass
@@ -97,13 +105,15 @@ def opened(settings: dict[str, Any]) -> zenoh.Session:
 
 @contextmanager
 def small_lab(folder: Path) -> Iterator[SmallLab]:
-    """Made and running."""
+    """Create the certificates and configuration files of a lab in a folder, and run its router meanwhile."""
     port = free_port()
-    (folder / "lab.toml").write_text(lab_text(folder, port))
-    lab = load_lab(folder / "lab.toml")
+    lab_file = folder / "lab.toml"
+    lab_file.write_text(lab_text(folder, port))
+    lab = load_lab(lab_file)
     write_certificates(lab, folder, folder / "authority")
     render(lab, folder)
-    log, parent = folder / "router.log", os.getpid()
+    log = folder / "router.log"
+    parent = os.getpid()
     with log.open("w") as out:
         router = subprocess.Popen(
             [*SNAKESIM, "start", "router", str(folder / "hub" / "router.main.json5")],

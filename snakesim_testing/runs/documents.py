@@ -67,24 +67,33 @@ class Section:
 
 
 def sections(path: Path) -> list[Section]:
-    """Every section of a document that has blocks."""
-    found = [Section("")]
-    fence: list[str] | None = None
+    """Return the sections of a Markdown document that have code blocks.
+
+    A block whose info line names a file, such as "python my.py", is also one of the section's files. Each section has
+    the files of the sections before it, too.
+    """
+    result = [Section("")]
+    block_lines: list[str] | None = None  # of the open code block; None: outside of blocks
     info = ""
     for line in path.read_text(encoding="utf-8").splitlines():
-        if fence is None and (heading := re.match(r"#+ (.*)", line)):
-            found.append(Section(heading[1], files=dict(found[-1].files)))
-        elif line.startswith("```") and fence is None:
-            fence, info = [], line.removeprefix("```").strip()
-        elif line.startswith("```") and fence is not None:
-            _, _, name = info.partition(" ")
-            if "." in name:
-                found[-1].files[name] = "\n".join(fence) + "\n"
-            found[-1].blocks.append((info, "\n".join(fence) + "\n"))
-            fence = None
-        elif fence is not None:
-            fence.append(line)
-    return [section for section in found if section.blocks]
+        is_fence = line.startswith("```")
+        if block_lines is None:
+            heading = re.match(r"#+ (.*)", line)
+            if heading:
+                result.append(Section(heading[1], files=dict(result[-1].files)))
+            elif is_fence:
+                block_lines = []
+                info = line.removeprefix("```").strip()
+        elif is_fence:
+            text = "\n".join(block_lines) + "\n"
+            _, _, file_name = info.partition(" ")
+            if "." in file_name:
+                result[-1].files[file_name] = text
+            result[-1].blocks.append((info, text))
+            block_lines = None
+        else:
+            block_lines.append(line)
+    return [section for section in result if section.blocks]
 
 
 def script(section: Section) -> str:

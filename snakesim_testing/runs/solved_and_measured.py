@@ -60,21 +60,25 @@ def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.R
 
 @contextmanager
 def recorded() -> Iterator[list[dict[str, float]]]:
-    """Forces of the obstacles that the body touches, one dict a physics step of the run within."""
+    """Record the contact forces of simulations that run within the context.
+
+    Yields:
+        One entry for each physics step: the force on each obstacle that the body touches, N, by its name.
+    """
     steps: list[dict[str, float]] = []
-    feel = ContactReader._measure_force  # pyright: ignore[reportPrivateUsage] - called in every physics step
+    measure_force = ContactReader._measure_force  # pyright: ignore[reportPrivateUsage] - called in every physics step
 
-    def record(self: ContactReader) -> None:
+    def record_and_measure(self: ContactReader) -> None:
         touches = self._touches  # pyright: ignore[reportPrivateUsage]
-        found: dict[str, float] = {}
-        names = touches._obstacle_of_geom  # pyright: ignore[reportPrivateUsage]
-        for pair, force_n in touches.sum_forces_n().items():
-            name = next(names[geom] for geom in pair if names[geom] is not None)  # pyright: ignore
-            found[name] = found.get(name, 0.0) + force_n
-        steps.append(found)
-        feel(self)
+        obstacle_of_geom = touches._obstacle_of_geom  # pyright: ignore[reportPrivateUsage]
+        force_of_obstacle: dict[str, float] = {}
+        for geom_pair, force_n in touches.sum_forces_n().items():
+            name = next(obstacle_of_geom[geom] for geom in geom_pair if obstacle_of_geom[geom] is not None)  # pyright: ignore
+            force_of_obstacle[name] = force_of_obstacle.get(name, 0.0) + force_n
+        steps.append(force_of_obstacle)
+        measure_force(self)
 
-    with mock.patch.object(ContactReader, "_measure_force", record):
+    with mock.patch.object(ContactReader, "_measure_force", record_and_measure):
         yield steps
 
 
@@ -102,30 +106,53 @@ def cases(scenario: str) -> Iterator[str]:
 
 
 def causes(scenario: str, controller: str, **options: Any) -> str:
-    """The parts of the difference between desired and measured forces."""
+    """Run a controller, and return the row of its differences between desired and measured contact forces.
+
+    Args:
+        scenario: Name of the scenario.
+        controller: Name of the controller.
+        options: Changes of the scenario, by key.
+    """
     result, forces = measured(scenario, controller, **options)
     states = [state for state in result.record.control if state.state == "Locomoting"]
-    desired_n, measured_n = table_of(states, forces, 0.0)
-    judged = [one for one in np.arange(len(desired_n)) if desired_n[one].max(initial=0.0) >= ASKED_N]
-    desired_n, measured_n = desired_n[judged], measured_n[judged]
-    empty = float(desired_n[measured_n < EMPTY_N].sum())
-    unasked = float(measured_n[desired_n == 0.0].sum())
-    both = (desired_n > 0.0) & (measured_n >= EMPTY_N)
-    total, split = 0.0, 0.0
-    for wanted, found, here in zip(desired_n, measured_n, both, strict=True):
-        if here.any():
-            scale = found[here].sum() / wanted[here].sum()
-            total += abs(found[here].sum() - wanted[here].sum())
-            split += float(np.abs(found[here] - scale * wanted[here]).sum())
-    whole = empty + unasked + total + split
-    by_shift = [correlation(*table_of(states, forces, float(shift))) for shift in SHIFTS_S]
-    best = int(np.argmax(by_shift))
-    shares = " | ".join(f"{part / whole:.0%}" for part in (empty, unasked, total, split))
+    desired_n, measured_n = table_of(states, forces, 0.0)  # (n_states, n_obstacles)
+    requests_force = (desired_n >= ASKED_N).any(axis=1)
+    desired_n = desired_n[requests_force]
+    measured_n = measured_n[requests_force]
+    parts_n = _split_difference(desired_n, measured_n)
+    fractions = " | ".join(f"{part_n / sum(parts_n):.0%}" for part_n in parts_n)
+    correlations = [correlation(*table_of(states, forces, float(shift_s))) for shift_s in SHIFTS_S]
+    best = int(np.argmax(correlations))
     return (
         f"| `{scenario}` | `{controller}` | {desired_n.sum(axis=1).mean():.1f} | {measured_n.sum(axis=1).mean():.1f} "
-        f"| {shares} "
-        f"| {correlation(desired_n, measured_n):.2f} | {by_shift[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
+        f"| {fractions} "
+        f"| {correlation(desired_n, measured_n):.2f} | {correlations[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
     )
+
+
+def _split_difference(desired_n: Floats, measured_n: Floats) -> tuple[float, float, float, float]:
+    """Split the difference between desired and measured contact forces by its causes.
+
+    Args:
+        desired_n: (n_states, n_obstacles) forces that the controller desired.
+        measured_n: (n_states, n_obstacles) forces at the same times.
+
+    Returns:
+        Sums over all states: desired without contact, measured but not desired, error of the total force, and error of
+        its distribution among the obstacles.
+    """
+    without_contact_n = float(desired_n[measured_n < EMPTY_N].sum())
+    undesired_n = float(measured_n[desired_n == 0.0].sum())
+    is_common = (desired_n > 0.0) & (measured_n >= EMPTY_N)
+    total_error_n = 0.0
+    distribution_error_n = 0.0
+    for state in np.flatnonzero(is_common.any(axis=1)):
+        desired = desired_n[state, is_common[state]]
+        actual = measured_n[state, is_common[state]]
+        scale = actual.sum() / desired.sum()
+        total_error_n += abs(actual.sum() - desired.sum())
+        distribution_error_n += float(np.abs(actual - scale * desired).sum())
+    return without_contact_n, undesired_n, total_error_n, distribution_error_n
 
 
 def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:

@@ -103,45 +103,68 @@ def identity(node: int, serial: int) -> Frame:
     return load_layouts()[Opcode.IDENTITY].encode(node, serial=serial, firmware_major=1, protocol=1, emulated=1)
 
 
-def scanned(*said: Frame) -> tuple[list[dict[str, str]], list[Frame]]:
-    """What a scan makes of the frames on a bus, and what it sends."""
+def scanned(*frames_on_bus: Frame) -> tuple[list[dict[str, str]], list[Frame]]:
+    """Scan a bus on which these frames arrive, and return the rows of the scan and the frames that it sent."""
     channel = f"scan-{uuid.uuid4().hex[:8]}"
-    wire, others = VirtualWire(channel), VirtualWire(channel)
-    for frame in said:
-        others.send(frame)
+    wire = VirtualWire(channel)
+    other_end = VirtualWire(channel)
+    for frame in frames_on_bus:
+        other_end.send(frame)
     rows = scan(wire, 0.25)
-    heard = others.receive()
+    sent_by_scan = other_end.receive()
     wire.close()
-    others.close()
-    return rows, heard
+    other_end.close()
+    return rows, sent_by_scan
 
 
-def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
-    rows, heard = scanned(
-        *(identity(node, serial) for node, serial in ((62, 0xBEEF), (3, 0xCAFE), (3, 0xF00D))),
+def test_can_scan_lists_modules_by_node_and_serial() -> None:
+    rows, _ = scanned(identity(62, 0xBEEF), identity(3, 0xCAFE), identity(3, 0xF00D))
+    assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
+
+
+def test_can_scan_sends_only_requests_for_identities() -> None:
+    _, sent_by_scan = scanned(identity(3, 0xCAFE), heartbeat(3, 1.0))
+    assert sent_by_scan
+    assert set(sent_by_scan) == {make_command(CommandAction.IDENTIFY)}
+
+
+def test_can_scan_of_reporting_module_has_all_values_with_units() -> None:
+    (row,), _ = scanned(
+        identity(3, 0xCAFE),
         heartbeat(3, 12.34, ModuleState.FAULT, fault_leak=1, fault_voltage=1),
         health(3, voltage=23.9, motor_temperature=41, board_temperature=33),
         load_layouts()[Opcode.SHAFT_LOAD].encode(3, torque=-1.25),
-        heartbeat(62, 1.0),
     )
-    assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
-    assert rows[0]["state"] == "fault"
-    assert rows[0]["faults"] == "leak+voltage"
-    assert rows[0]["uptime"] == "12.3 s"
-    assert rows[0]["voltage"] == "23.9 V"
-    assert rows[0]["motor"] == "41 °C"
-    assert rows[0]["board"] == "33 °C"
-    assert rows[0]["shaft"] == "-1.250 N·m"
-    assert rows[0]["emulated"] == "yes"
-    assert rows[0]["firmware"] == "1.0"
-    assert rows[2]["state"] == "disarmed"
-    assert rows[2]["faults"] == "none"
-    assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
-    assert heard
-    assert set(heard) == {make_command(CommandAction.IDENTIFY)}
+    del row["channel"]
+    assert row == {
+        "node": "3",
+        "serial": "0000CAFE",
+        "firmware": "1.0",
+        "protocol": "1",
+        "emulated": "yes",
+        "state": "fault",
+        "faults": "leak+voltage",
+        "uptime": "12.3 s",
+        "voltage": "23.9 V",
+        "motor": "41 °C",
+        "board": "33 °C",
+        "shaft": "-1.250 N·m",
+    }
+
+
+def test_can_scan_of_module_with_heartbeat_alone_has_state_without_health() -> None:
+    (row,), _ = scanned(identity(62, 0xBEEF), heartbeat(62, 1.0))
+    assert row["state"] == "disarmed"
+    assert row["faults"] == "none"
+    assert row["voltage"] == UNKNOWN
+    assert row["shaft"] == UNKNOWN
+
+
+def test_can_scan_table_has_heading_and_one_line_per_module() -> None:
+    rows, _ = scanned(identity(3, 0xCAFE), identity(62, 0xBEEF))
     heading, *lines = align_columns(COLUMNS, rows)
     assert heading.split() == list(COLUMNS)
-    assert len(lines) == 3
+    assert len(lines) == len(rows) == 2
 
 
 def test_can_scan_of_minimal_module_invents_no_values() -> None:

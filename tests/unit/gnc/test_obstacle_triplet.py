@@ -23,30 +23,56 @@ def stay(controller, stage, ticks, **more):
     return [controller.update(stage.observe(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
 
 
-def test_triplet_one_joint_pushes_while_all_others_hold_shape():
+STEADY_TICKS = 100  # until the controller of a body that does not move has settled
+
+
+def make_settled_command():
+    """Return the command of a controller with default parameters for a body that does not move."""
     stage = make_stage()
-    command = stay(make_controller(stage), stage, 100)
+    return stay(make_controller(stage), stage, STEADY_TICKS)
+
+
+def test_triplet_one_joint_pushes_while_all_others_hold_shape():
+    command = make_settled_command()
     report = command.telemetry
     assert torque_joints(command) == [report.propulsion_joint]
+    others = [i for i in range(13) if i != report.propulsion_joint]
+    targets_rad = np.array(command.setpoints.target)
+    reference_rad = np.array(report.reference_rad)
+    assert targets_rad[others] == pytest.approx(reference_rad[others], abs=1e-3)
+
+
+def test_triplet_report_has_place_and_propulsion_on_path():
+    report = make_settled_command().telemetry
     assert report.reason == ""
     assert report.usable_push_points == 4
     assert report.propulsion_n == pytest.approx(35.0, rel=0.01)
     assert report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
-    others = [i for i in range(13) if i != report.propulsion_joint]
-    targets, angles = np.array(command.setpoints.target), np.array(report.reference_rad)
-    assert targets[others] == pytest.approx(angles[others], abs=1e-3)
-    forces = np.array([point.force_w for point in report.push_points])[:, :2]
-    tangent = np.array(report.push_points[0].tangent_w)[:2]
-    assert forces.sum(axis=0) == pytest.approx(report.propulsion_n * tangent, abs=1e-6)
-    assert np.hypot(*forces.T) == pytest.approx(report.desired_force_n)
-    assert min(report.desired_force_n) > 0
-    places = [point.body_s_m for point in report.push_points]
-    assert places == sorted(places)
-    torque = report.bending_torque_nm[known(report.propulsion_joint)]
-    assert report.propulsion_torque_nm == pytest.approx(torque, rel=1e-6)
-    assert report.torque_headroom_nm == pytest.approx(7.0 - abs(torque), abs=0.05)
     assert len(report.bending_torque_nm) == len(report.reference_rad) == 13
     assert 1 < known(report.condition) < 20
+
+
+def test_triplet_push_point_forces_add_up_to_propulsion_along_tail():
+    report = make_settled_command().telemetry
+    forces_n = np.array([point.force_w for point in report.push_points])[:, :2]
+    tail_tangent = np.array(report.push_points[0].tangent_w)[:2]
+    assert forces_n.sum(axis=0) == pytest.approx(report.propulsion_n * tail_tangent, abs=1e-6)
+    assert np.hypot(*forces_n.T) == pytest.approx(report.desired_force_n)
+    assert min(report.desired_force_n) > 0
+
+
+def test_triplet_push_points_are_listed_from_tail_to_head():
+    report = make_settled_command().telemetry
+    places_m = [point.body_s_m for point in report.push_points]
+    assert places_m == sorted(places_m)
+
+
+def test_triplet_propulsion_torque_is_bending_torque_of_its_joint():
+    report = make_settled_command().telemetry
+    torque_nm = report.bending_torque_nm[known(report.propulsion_joint)]
+    assert report.propulsion_torque_nm == pytest.approx(torque_nm, rel=1e-6)
+    rated_nm = 7.0
+    assert report.torque_headroom_nm == pytest.approx(rated_nm - abs(torque_nm), abs=0.05)
 
 
 def test_triplet_servo_targets_lead_by_load_when_requested():

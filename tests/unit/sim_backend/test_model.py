@@ -8,31 +8,52 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
 
+FRICTION_NM = 0.12
+VISCOUS_NM_S_PER_RAD = 0.03
 
-@pytest.mark.parametrize("name", ["planar13", "mamba"])
-def test_model_masses_lengths_limits_and_motors_match_robot_file(name):
-    config = make_config({"motor": {"friction_nm": 0.12, "viscous_nm_s_per_rad": 0.03}}, base_robot=name)
-    robot, model = config.robot, open_sim(config).sim.model
-    links = [model.body(f"link_{i}") for i in range(robot.chain.modules + 1)]
-    assert sum(float(link.mass[0]) for link in links) == pytest.approx(robot.chain.modules * robot.module.mass_kg)
-    for i, link in enumerate(links):
-        assert link.mass[0] == pytest.approx(robot.link_masses_kg[i])
-        assert link.ipos == pytest.approx([robot.link_lengths_m[i] / 2, 0, 0])
-        geom = model.geom(f"link_{i}")
-        assert geom.size[0] == robot.module.radius_m
-        assert 2 * geom.size[1] == pytest.approx(robot.link_lengths_m[i])
+
+@pytest.fixture(params=["planar13", "mamba"])
+def robot_and_model(request):
+    """Return a robot file and the model that is compiled from it."""
+    motor = {"friction_nm": FRICTION_NM, "viscous_nm_s_per_rad": VISCOUS_NM_S_PER_RAD}
+    config = make_config({"motor": motor}, base_robot=request.param)
+    return config.robot, open_sim(config).sim.model
+
+
+def test_model_links_have_masses_of_robot_file(robot_and_model):
+    robot, model = robot_and_model
+    masses_kg = [float(model.body(f"link_{i}").mass[0]) for i in range(robot.chain.modules + 1)]
+    assert masses_kg == pytest.approx(list(robot.link_masses_kg))
+    assert sum(masses_kg) == pytest.approx(robot.chain.modules * robot.module.mass_kg)
+
+
+def test_model_links_are_capsules_with_mass_center_in_their_middle(robot_and_model):
+    robot, model = robot_and_model
+    for i, length_m in enumerate(robot.link_lengths_m):
+        radius_m, half_length_m, _ = model.geom(f"link_{i}").size
+        assert radius_m == robot.module.radius_m
+        assert 2 * half_length_m == pytest.approx(length_m)
+        assert model.body(f"link_{i}").ipos == pytest.approx([length_m / 2, 0, 0])
+
+
+def test_model_joints_have_axes_limits_and_places_of_robot_file(robot_and_model):
+    robot, model = robot_and_model
     for i, axis in enumerate(robot.axes):
         joint = model.joint(f"joint_{i + 1}")
         assert joint.axis == pytest.approx([0, 0, 1] if axis == "yaw" else [0, 1, 0])
         assert joint.range == pytest.approx([-robot.limits.angle_rad, robot.limits.angle_rad])
-        assert model.dof_armature[joint.dofadr[0]] == robot.motor.armature_kg_m2
         assert model.body_pos[joint.bodyid[0]] == pytest.approx([robot.link_lengths_m[i], 0, 0])
-    assert model.dof_frictionloss[6:] == pytest.approx(0.12)
-    assert model.dof_damping[6:] == pytest.approx(0.03)
+
+
+def test_model_motors_have_values_of_robot_file(robot_and_model):
+    robot, model = robot_and_model
+    base_dofs = 6  # of the free joint
+    assert model.dof_armature[base_dofs:].tolist() == [robot.motor.armature_kg_m2] * robot.chain.modules
+    assert model.dof_frictionloss[base_dofs:] == pytest.approx(FRICTION_NM)
+    assert model.dof_damping[base_dofs:] == pytest.approx(VISCOUS_NM_S_PER_RAD)
     assert model.actuator_forcerange[:, 1] == pytest.approx(robot.limits.torque_nm)
-    assert [model.actuator(i).name for i in range(robot.chain.modules)] == [
-        f"motor_joint_{i + 1}" for i in range(robot.chain.modules)
-    ]
+    motor_names = [model.actuator(i).name for i in range(robot.chain.modules)]
+    assert motor_names == [f"motor_joint_{i + 1}" for i in range(robot.chain.modules)]
 
 
 def test_model_link_inertia_is_that_of_a_capsule():

@@ -167,26 +167,43 @@ def test_over_a_long_run_the_number_of_samples_is_exact():
     assert sum(schedule.is_due(tick * 1_000_000) for tick in range(1, 10_001)) == 700
 
 
-def test_a_delayed_sensor_gives_what_was_there_before():
-    slow = pushed({"pose": {"delay_s": 0.03}, "joints": {"delay_s": 0.02}})
+PERIOD_NS = 10_000_000
+
+
+def test_sensor_delayed_joint_states_are_those_of_earlier_ticks():
+    delay_ticks = 2
+    delayed = pushed({"joints": {"delay_s": 0.02}})
     prompt = pushed()
     history = []
     for tick in range(12):
-        late, now = slow.sample(), prompt.sample()
-        history.append(now)
-        taken = history[max(tick - 2, 0)]
-        assert late.joints.tick == tick
-        assert late.joints.timestamp_ns == tick * 10_000_000
-        assert late.joints.age_ns == [min(tick, 2) * 10_000_000] * 6
-        assert late.joints.angle_rad == taken.joints.angle_rad
-        if tick < 3:
-            assert keys.POSE not in late.others
+        joints = delayed.sample().joints
+        history.append(prompt.sample().joints)
+        captured_tick = max(tick - delay_ticks, 0)
+        assert joints.tick == tick
+        assert joints.timestamp_ns == tick * PERIOD_NS
+        assert joints.age_ns == [(tick - captured_tick) * PERIOD_NS] * 6
+        assert joints.angle_rad == history[captured_tick].angle_rad
+        delayed.go()
+        prompt.go()
+
+
+def test_sensor_delayed_pose_is_that_of_earlier_tick_with_its_timestamp():
+    delay_ticks = 3
+    delayed = pushed({"pose": {"delay_s": 0.03}})
+    prompt = pushed()
+    history = []
+    for tick in range(12):
+        pose = delayed.sample().others.get(keys.POSE)
+        history.append(prompt.sample().others[keys.POSE])
+        captured_tick = tick - delay_ticks
+        if captured_tick < 0:
+            assert pose is None
         else:
-            pose, then = late.others[keys.POSE], history[tick - 3].others[keys.POSE]
+            captured = history[captured_tick]
             assert isinstance(pose, Pose)
-            assert isinstance(then, Pose)
+            assert isinstance(captured, Pose)
             assert pose.tick == tick
-            assert pose.timestamp_ns == (tick - 3) * 10_000_000
-            assert pose.position_w == then.position_w
-        slow.go()
+            assert pose.timestamp_ns == captured_tick * PERIOD_NS
+            assert pose.position_w == captured.position_w
+        delayed.go()
         prompt.go()

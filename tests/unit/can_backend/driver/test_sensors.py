@@ -53,22 +53,28 @@ def contacts_of(samples: Samples) -> Contacts:
 # --- joints ------------------------------------------------------------------------------------------------
 
 
-def test_joint_state_age_is_reported_and_valid_for_the_lease() -> None:
+def test_joint_state_of_newest_sync_has_its_values_and_age_zero() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
-    fresh = sensors.make_samples(7, 70 * 10**6).joints
-    assert fresh.tick == 7
-    assert fresh.timestamp_ns == 70 * 10**6
-    assert fresh.angle_rad == pytest.approx([0.5] * JOINTS)
-    assert fresh.velocity_rad_s == pytest.approx([-1.0] * JOINTS)
-    assert fresh.torque_nm == pytest.approx([2.0] * JOINTS)
-    assert fresh.age_ns == [0] * JOINTS
-    assert fresh.valid == [True] * JOINTS
+    joints = sensors.make_samples(tick=7, timestamp_ns=70_000_000).joints
+    assert joints.tick == 7
+    assert joints.timestamp_ns == 70_000_000
+    assert joints.angle_rad == pytest.approx([0.5] * JOINTS)
+    assert joints.velocity_rad_s == pytest.approx([-1.0] * JOINTS)
+    assert joints.torque_nm == pytest.approx([2.0] * JOINTS)
+    assert joints.age_ns == [0] * JOINTS
+    assert joints.valid == [True] * JOINTS
+
+
+def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
+    lease_periods = 5
+    reading, sensors = sensors_of(config())
+    syncs(reading, 1, angle=0.5)
     for missed in range(1, 9):
-        syncs(reading, 1, [1, 2, 4], angle=0.6)
+        syncs(reading, 1, [1, 2, 4], angle=0.6)  # node 3 is silent
         joints = sensors.make_samples(7 + missed, 0).joints
         assert joints.age_ns == [0, 0, missed * PERIOD_NS, 0]
-        assert joints.valid == [True, True, missed <= 5, True], "the lease is five periods"
+        assert joints.valid == [True, True, missed <= lease_periods, True]
         assert joints.angle_rad == pytest.approx([0.6, 0.6, 0.5, 0.6])
 
 
@@ -183,41 +189,46 @@ def test_contact_position_is_on_the_capsule(along_m: float, bearing: float, leng
 # --- IMUs, power, pose -------------------------------------------------------------------------------------
 
 
-def test_an_imu_message_holds_only_what_is_new() -> None:
+def test_imu_sample_has_only_new_and_complete_reports() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     syncs(reading, 1)
     assert keys.IMU not in sensors.make_samples(0, 0).others
     reading.process_frame(gyro(3, 0, 0.5))
     reading.process_frame(accelerometer(3, 0, 9.81))
-    reading.process_frame(gyro(1, 0, 0.5))
-    found = sensors.make_samples(1, 10).others[keys.IMU]
-    assert isinstance(found, Imu)
-    assert found.tick == 1
-    assert found.timestamp_ns == 10
-    assert found.link == [3]
-    assert found.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
-    assert found.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
+    reading.process_frame(gyro(1, 0, 0.5))  # incomplete: without its acceleration
+    imu = sensors.make_samples(1, 10).others[keys.IMU]
+    assert isinstance(imu, Imu)
+    assert imu.tick == 1
+    assert imu.timestamp_ns == 10
+    assert imu.link == [3]
+    assert imu.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
+    assert imu.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
     assert keys.IMU not in sensors.make_samples(2, 0).others
 
 
-def test_power_sample_at_two_hertz_marks_unknown_values_invalid() -> None:
+def test_power_sample_is_made_every_half_second() -> None:
+    reading, sensors = sensors_of(config())
+    syncs(reading, 1)
+    ticks_with_power = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).others]
+    assert ticks_with_power == [0, 50, 100]  # at 100 Hz
+
+
+def test_power_sample_of_modules_without_report_is_invalid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
     reading.process_frame(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
     reading.process_frame(health(4, voltage=24.0))
-    due = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).others]
-    assert due == [0, 50, 100]
-    found = sensors.make_samples(50, 7).others[keys.POWER]
-    assert isinstance(found, Power)
-    assert found.tick == 50
-    assert found.timestamp_ns == 7
-    assert found.valid == [False, True, False, True]
-    assert found.leak == [False, True, False, False]
-    assert found.voltage_v[1] == pytest.approx(23.5)
-    assert found.current_a[1] == pytest.approx(-1.5)
-    assert found.motor_c[1] == -10.0
-    assert found.board_c[1] == 40.0
-    assert all(len(column) == JOINTS for column in (found.voltage_v, found.current_a, found.motor_c, found.board_c))
+    power = sensors.make_samples(50, 7).others[keys.POWER]
+    assert isinstance(power, Power)
+    assert power.tick == 50
+    assert power.timestamp_ns == 7
+    assert power.valid == [False, True, False, True]
+    assert power.leak == [False, True, False, False]
+    assert power.voltage_v == pytest.approx([0.0, 23.5, 0.0, 24.0])
+    assert power.current_a[1] == pytest.approx(-1.5)
+    assert power.motor_c[1] == -10.0
+    assert power.board_c[1] == 40.0
+    assert all(len(column) == JOINTS for column in (power.current_a, power.motor_c, power.board_c))
 
 
 def test_power_values_of_a_module_expire() -> None:

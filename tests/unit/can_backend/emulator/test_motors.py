@@ -94,22 +94,39 @@ def test_motor_position_mode_at_1_ms_is_stable_and_arrives():
     assert np.abs(physics_model.velocity_rad_s).max() < 1e-3
 
 
-def test_heat_bounds_the_torque_and_says_so():
+TICKS_UNTIL_STEADY = 100  # until the torque has followed its demand
+
+
+def make_hot_motor() -> Motors:
+    """Return a motor that demands 3 N·m and may have half of its rated torque because of heat."""
     motors, _ = motor()
     drive(motors, Mode.TORQUE, 3.0)
     motors.step(REST, REST)
     motors.derate(np.array([0.5]))
+    return motors
+
+
+def test_motor_torque_of_hot_motor_is_derated() -> None:
+    motors = make_hot_motor()
     assert motors.derated()[0]
-    for _ in range(100):
+    for _ in range(TICKS_UNTIL_STEADY):
         motors.step(REST, REST)
     assert motors.torque_nm[0] == RATED_NM / 2
+
+
+def test_motor_small_demand_of_hot_motor_is_not_derated() -> None:
+    motors = make_hot_motor()
     drive(motors, Mode.TORQUE, 1.0)
     motors.step(REST, REST)
     assert not motors.derated()[0]
+
+
+def test_motor_demanded_limit_below_heat_limit_is_not_reduced_further() -> None:
+    motors = make_hot_motor()
     drive(motors, Mode.TORQUE, 3.0, limit=RATED_NM / 4)
-    for _ in range(100):
+    for _ in range(TICKS_UNTIL_STEADY):
         motors.step(REST, REST)
-    assert motors.torque_nm[0] == RATED_NM / 4, "what is asked for is not reduced once more"
+    assert motors.torque_nm[0] == RATED_NM / 4
 
 
 def test_the_simulator_s_motors_do_the_same():

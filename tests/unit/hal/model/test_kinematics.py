@@ -86,15 +86,24 @@ def test_the_planar_shortcut_is_the_full_calculation(
     assert short_r == pytest.approx(full_r[:-1], abs=1e-9)
 
 
-def test_directions_are_what_the_words_say() -> None:
-    """Yaw turns left seen from above; pitch, right-handed about y, lowers the nose."""
-    half = math.pi / 2
-    origins, rotations = link_frames((0, 0, 0), np.eye(3), [half], ["yaw"], [1.0, 1.0])
+QUARTER_TURN_RAD = math.pi / 2
+
+
+def test_positive_yaw_turns_next_link_left() -> None:
+    origins, rotations = link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["yaw"], [1.0, 1.0])
     assert origins[1] == pytest.approx([1, 0, 0])
     assert rotations[1][:, 0] == pytest.approx([0, 1, 0])
-    _, rotations = link_frames((0, 0, 0), np.eye(3), [half], ["pitch"], [1.0, 1.0])
+
+
+def test_positive_pitch_turns_next_link_down() -> None:
+    """Pitch is right-handed about y, which points left."""
+    _, rotations = link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["pitch"], [1.0, 1.0])
     assert rotations[1][:, 0] == pytest.approx([0, 0, -1])
-    origins, rotations = link_frames((0, 0, 0), np.eye(3), [half, half], ["yaw", "pitch"], [1.0, 2.0, 1.0])
+
+
+def test_pitch_after_yaw_turns_about_yawed_axis() -> None:
+    angles_rad = [QUARTER_TURN_RAD, QUARTER_TURN_RAD]
+    origins, rotations = link_frames((0, 0, 0), np.eye(3), angles_rad, ["yaw", "pitch"], [1.0, 2.0, 1.0])
     assert origins[2] == pytest.approx([1, 2, 0])
     assert rotations[2][:, 0] == pytest.approx([0, 0, -1])
 

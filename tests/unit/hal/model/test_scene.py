@@ -46,32 +46,53 @@ def refused_only_if(overlaps: bool, made: SceneFile, name: str) -> None:
         check_clear(made, place_scene(made), SNAKE)
 
 
-def test_every_kind_of_obstacle_is_placed_as_described() -> None:
-    placed = place_scene(
-        scene(
-            cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}],
-            box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}],
-            sphere=[{"position_m": [0, 3], "radius_m": 0.2, "center_height_m": 0.05}],
-            wall=[{"from_m": [0, 5], "to_m": [3, 9], "thickness_m": 0.1, "height_m": 0.5}],
-            step=[{"position_m": [0, -4], "size_m": [1.0, 0.5], "height_m": 0.03}],
-        )
+def place_one(**sections: Any) -> Placed:
+    """Return the only obstacle of a scene with these sections."""
+    (placed,) = place_scene(scene(**sections))
+    return placed
+
+
+def test_scene_cylinder_stands_on_ground_with_its_name_and_friction() -> None:
+    placed = place_one(
+        cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}]
     )
-    post, box, ball, wall, step = placed
-    assert post == Placed(
-        obstacle=Obstacle(name="post", shape="cylinder", position_w=(1, 2, 0.2), radius_m=0.1, height_m=0.4),
+    center_height_m = 0.4 / 2
+    assert placed == Placed(
+        obstacle=Obstacle(
+            name="post", shape="cylinder", position_w=(1, 2, center_height_m), radius_m=0.1, height_m=0.4
+        ),
         friction=0.3,
     )
-    assert box.obstacle.half_size_m == pytest.approx((0.2, 0.1, 0.3))
-    assert box.obstacle.position_w[2] == 0.3
-    assert box.obstacle.yaw_rad == 0.5
-    assert box.obstacle.name == "box_0"
-    assert ball.obstacle.position_w == (0, 3, 0.05)
-    assert ball.obstacle.radius_m == 0.2
-    assert wall.obstacle.position_w == pytest.approx((1.5, 7, 0.25))
-    assert wall.obstacle.half_size_m == pytest.approx((2.5, 0.05, 0.25))
-    assert wall.obstacle.yaw_rad == pytest.approx(math.atan2(4, 3))
+
+
+def test_scene_box_without_name_is_numbered_and_stands_on_ground() -> None:
+    obstacle = place_one(box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}]).obstacle
+    assert obstacle.name == "box_0"
+    assert obstacle.half_size_m == pytest.approx((0.2, 0.1, 0.3))
+    assert obstacle.position_w[2] == 0.6 / 2
+    assert obstacle.yaw_rad == 0.5
+
+
+def test_scene_sphere_is_at_its_center_height() -> None:
+    obstacle = place_one(sphere=[{"position_m": [0, 3], "radius_m": 0.2, "center_height_m": 0.05}]).obstacle
+    assert obstacle.position_w == (0, 3, 0.05)
+    assert obstacle.radius_m == 0.2
+
+
+def test_scene_wall_is_box_from_end_to_end() -> None:
+    obstacle = place_one(
+        wall=[{"from_m": [0, 5], "to_m": [3, 9], "thickness_m": 0.1, "height_m": 0.5}]  # 5 m long
+    ).obstacle
+    assert obstacle.position_w == pytest.approx((1.5, 7, 0.25))
+    assert obstacle.half_size_m == pytest.approx((2.5, 0.05, 0.25))
+    assert obstacle.yaw_rad == pytest.approx(math.atan2(4, 3))
+
+
+def test_scene_step_alone_is_walkable() -> None:
+    step = place_one(step=[{"position_m": [0, -4], "size_m": [1.0, 0.5], "height_m": 0.03}])
+    wall = place_one(wall=[{"from_m": [0, 5], "to_m": [3, 9], "thickness_m": 0.1, "height_m": 0.5}])
     assert step.walkable
-    assert not any(item.walkable for item in placed[:4])
+    assert not wall.walkable
 
 
 def test_scene_row_material_applies_to_all_and_keeps_places() -> None:

@@ -41,34 +41,70 @@ def all_rows(box: BlackBox) -> dict[str, Any]:
     return box.layout.arrays(bytes(rows))
 
 
-def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
+LONG_RUN_TICKS = 9000  # several times what `read_rows` returns at once
+FIRST_POSE_TICK = 2
+TOUCH_TICK = 3
+RELEASE_TICK = 6
+
+
+@pytest.fixture(scope="module")
+def long_run() -> BlackBox:
+    """Return the record of a long run whose third joint and targets move steadily."""
     box = BlackBox(ROBOT)
-    count = 9000  # several times what is taken at once
-    for tick in range(count):
+    for tick in range(LONG_RUN_TICKS):
         others: dict[str, Any] = {}
-        if tick == 2:
+        if tick == FIRST_POSE_TICK:
             others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
-        if tick in (3, 6):
+        if tick == TOUCH_TICK:
             touches = [contact(obstacle="a", force_l=(3.0, 4.0, 0.0)), contact(obstacle="a"), contact(obstacle="b")]
-            others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=touches if tick == 3 else [])
+            others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=touches)
+        if tick == RELEASE_TICK:
+            others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=[])
         joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
         box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
-    columns = all_rows(box)
-    assert compute_digest(columns) == box.command_digest
-    assert box.ticks == count
-    assert all(len(column) == count for column in columns.values())
-    assert columns["time_s"] == pytest.approx(0.01 * np.arange(count))
-    assert columns["angle_rad"][-1].tolist() == pytest.approx([0.1, 0.2, 0.001 * (count - 1)])
+    return box
+
+
+def test_black_box_of_long_run_has_every_tick(long_run: BlackBox) -> None:
+    columns = all_rows(long_run)
+    assert long_run.ticks == LONG_RUN_TICKS
+    assert all(len(column) == LONG_RUN_TICKS for column in columns.values())
+    assert columns["time_s"] == pytest.approx(0.01 * np.arange(LONG_RUN_TICKS))
+
+
+def test_black_box_columns_of_long_run_have_its_command_digest(long_run: BlackBox) -> None:
+    assert compute_digest(all_rows(long_run)) == long_run.command_digest
+
+
+def test_black_box_of_long_run_has_joint_states(long_run: BlackBox) -> None:
+    columns = all_rows(long_run)
+    last_tick = LONG_RUN_TICKS - 1
+    assert columns["angle_rad"][last_tick].tolist() == pytest.approx([0.1, 0.2, 0.001 * last_tick])
     assert columns["velocity_rad_s"][7].tolist() == [2.0] * 3
     assert columns["torque_nm"][7].tolist() == [3.0, 4.0, 5.0]
+
+
+def test_black_box_of_long_run_has_setpoints(long_run: BlackBox) -> None:
+    columns = all_rows(long_run)
     assert columns["target"][4321] == pytest.approx([0.4321] * 3)
     assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3
-    assert set(columns["mode"].flat) == {3}
-    assert np.isnan(columns["position_w_m"][:2]).all()  # unknown until the first pose
-    assert columns["position_w_m"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
+    assert set(columns["mode"].flat) == {Mode.TORQUE}
+
+
+def test_black_box_pose_is_nan_before_first_pose_and_kept_afterwards(long_run: BlackBox) -> None:
+    columns = all_rows(long_run)
+    assert np.isnan(columns["position_w_m"][:FIRST_POSE_TICK]).all()
+    ticks_with_pose = LONG_RUN_TICKS - FIRST_POSE_TICK
+    assert columns["position_w_m"][FIRST_POSE_TICK:].tolist() == [[1.0, 2.0, 3.0]] * ticks_with_pose
     assert columns["orientation_wxyz"][5].tolist() == [1.0, 0.0, 0.0, 0.0]
-    assert columns["contact_peak_n"][:8].tolist() == [0, 0, 0, 5, 5, 5, 0, 0]
-    assert columns["contact_count"][:8].tolist() == [0, 0, 0, 2, 2, 2, 0, 0]
+
+
+def test_black_box_contacts_are_kept_until_next_sample(long_run: BlackBox) -> None:
+    columns = all_rows(long_run)
+    force_n = 5.0  # norm of (3, 4, 0)
+    obstacles = 2  # three contacts on obstacles "a" and "b"
+    assert columns["contact_peak_n"][:8].tolist() == [0, 0, 0, force_n, force_n, force_n, 0, 0]
+    assert columns["contact_count"][:8].tolist() == [0, 0, 0, obstacles, obstacles, obstacles, 0, 0]
 
 
 def test_black_box_digest_depends_only_on_commands() -> None:

@@ -84,21 +84,34 @@ def test_the_robot_file_says_from_where_to_where() -> None:
     assert len(bench.receive(60.0)) == JOINTS
 
 
-def test_derating_overheated_winding_stops_robot_until_it_has_cooled() -> None:
+STOP_AT_C = 105.0
+COOL_BELOW_C = 80.0
+
+
+def test_derating_winding_at_stop_temperature_is_a_fault_of_its_joint() -> None:
     bench = Bench()
-    assert bench.receive([20.0, 104.9, 20.0]) == []
-    (fault,) = bench.receive([20.0, 105.0, 20.0])
+    assert bench.receive([20.0, STOP_AT_C - 0.1, 20.0]) == []
+    (fault,) = bench.receive([20.0, STOP_AT_C, 20.0])
     assert fault.what == "overheated"
     assert fault.joint == "joint_2"
     assert fault.tick == 3
-    assert fault.cause == ("the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C")
-    assert bench.receive([20.0, 104.0, 20.0]) == []
+    assert fault.cause == "the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C"
+
+
+@pytest.mark.parametrize("temperature_c", [STOP_AT_C - 1.0, COOL_BELOW_C])
+def test_derating_overheated_fault_stays_until_winding_has_cooled(temperature_c: float) -> None:
+    bench = Bench()
+    bench.receive([20.0, STOP_AT_C, 20.0])
+    assert bench.receive([20.0, temperature_c, 20.0]) == [], "the fault is reported once"
     assert len(bench.derating.present_faults) == 1
-    assert bench.receive([20.0, 80.0, 20.0]) == []
-    assert len(bench.derating.present_faults) == 1
-    assert bench.receive([20.0, 79.9, 20.0]) == []
+
+
+def test_derating_cooled_winding_that_overheats_again_is_a_new_fault() -> None:
+    bench = Bench()
+    bench.receive([20.0, STOP_AT_C, 20.0])
+    assert bench.receive([20.0, COOL_BELOW_C - 0.1, 20.0]) == []
     assert bench.derating.present_faults == []
-    assert len(bench.receive([20.0, 110.0, 20.0])) == 1
+    assert len(bench.receive([20.0, STOP_AT_C + 5.0, 20.0])) == 1
 
 
 def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:

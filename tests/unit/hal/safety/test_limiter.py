@@ -103,20 +103,44 @@ def test_what_is_checked_first_is_told_first() -> None:
 # --- heat ------------------------------------------------------------------------------------------------------
 
 
-def test_heat_bounds_the_torque_limit_and_is_named() -> None:
-    share = np.array([1.0, 0.5, 0.25])
+TORQUE_FRACTIONS = np.array([1.0, 0.5, 0.25])  # of the 4 N·m of each joint, which its heat permits
 
-    def judged(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
-        applied = limited(asked, every(), before(Mode.TORQUE, 2.0), share)
-        return applied.torque_limit_nm.tolist(), words(asked, applied, every(), share)
 
-    assert judged(command(ROBOT, 2.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"})
-    assert judged(command(ROBOT, 9.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {0: "torque", 1: "thermal", 2: "thermal"})
-    assert judged(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[2.0] * 3)) == ([2.0, 2.0, 1.0], {2: "thermal"})
-    assert judged(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[1.0] * 3))[1] == dict.fromkeys(range(3), "torque")
-    far = judged(command(ROBOT, 9.0, Mode.POSITION))[1]
-    assert far == dict.fromkeys(range(3), "angle")  # a target that was changed is named by what changed it
-    assert judged(command(ROBOT, 9.0, Mode.PASSIVE))[1] == {}
+def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
+    """Limit a command to joints that are cool, warm and hot; return torque limits, and reasons by joint."""
+    applied = limited(asked, every(), before(Mode.TORQUE, 2.0), TORQUE_FRACTIONS)
+    return applied.torque_limit_nm.tolist(), words(asked, applied, every(), TORQUE_FRACTIONS)
+
+
+@pytest.mark.parametrize(
+    ("commanded_limit_nm", "applied_limit_nm", "reasons"),
+    [
+        (None, [4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"}),
+        (2.0, [2.0, 2.0, 1.0], {2: "thermal"}),
+        (1.0, [1.0, 1.0, 1.0], {0: "torque", 1: "torque", 2: "torque"}),  # the command's own limit is below its target
+    ],
+)
+def test_limiter_hot_joint_has_lower_torque_limit(
+    commanded_limit_nm: float | None, applied_limit_nm: list[float], reasons: dict[int, str]
+) -> None:
+    limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINTS
+    asked = command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=limits_nm)
+    assert limit_hot_joints(asked) == (applied_limit_nm, reasons)
+
+
+def test_limiter_cool_joint_with_excessive_torque_is_limited_by_rating() -> None:
+    _, reasons = limit_hot_joints(command(ROBOT, 9.0, Mode.TORQUE))
+    assert reasons == {0: "torque", 1: "thermal", 2: "thermal"}
+
+
+def test_limiter_changed_target_of_hot_joint_names_target_limit() -> None:
+    _, reasons = limit_hot_joints(command(ROBOT, 9.0, Mode.POSITION))
+    assert reasons == dict.fromkeys(range(JOINTS), "angle")
+
+
+def test_limiter_passive_hot_joint_is_not_limited() -> None:
+    _, reasons = limit_hot_joints(command(ROBOT, 9.0, Mode.PASSIVE))
+    assert reasons == {}
 
 
 # --- words -----------------------------------------------------------------------------------------------------

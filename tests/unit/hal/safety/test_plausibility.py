@@ -63,7 +63,7 @@ def test_the_first_angle_is_believed_wherever_it_is() -> None:
 
 @pytest.mark.parametrize("applied", [None, targets()])
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_glitch_is_not_believed_and_named(applied: Applied | None, side: int) -> None:
+def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(applied: Applied | None, side: int) -> None:
     bench = Bench()
     assert bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied) is None
     fault = bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
@@ -71,11 +71,21 @@ def test_a_glitch_is_not_believed_and_named(applied: Applied | None, side: int) 
     assert fault.what == WORD
     assert fault.joint == "joint_2"
     assert fault.tick == 7
-    assert fault.cause == f"faster than any joint turns: a jump of joint_2 by {side * 0.75:+.2f} rad in 10 ms"
+    jump_rad = side * (0.9 - REACH)
+    assert fault.cause == f"faster than any joint turns: a jump of joint_2 by {jump_rad:+.2f} rad in 10 ms"
+
+
+@pytest.mark.parametrize("applied", [None, targets()])
+@pytest.mark.parametrize("side", [1, -1])
+def test_plausibility_jumping_joint_keeps_last_valid_angle(applied: Applied | None, side: int) -> None:
+    bench = Bench()
+    bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied)
+    bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
     assert bench.angles == pytest.approx([0.01, side * REACH, 0.0], abs=1e-5)
     assert bench.watch.measured.velocity_rad_s.tolist() == [1.0, 0.0, 1.0]
     assert bench.watch.measured.torque_nm.tolist() == [2.0, 0.0, 2.0]
-    assert bench.see([0.02, side * 0.16, 0.0], applied=applied) is None  # back where it was
+    returned = [0.02, side * (REACH + 0.01), 0.0]
+    assert bench.see(returned, applied=applied) is None
 
 
 def test_a_jump_of_several_joints_names_them_all() -> None:

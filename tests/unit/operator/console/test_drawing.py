@@ -14,14 +14,19 @@ from snakesim_operator.features.console.scene.drawing import LONGEST_M, M_PER_N,
 from snakesim_testing.operator.drawn_samples import COUNT, ROBOT, contact, joints, pushing, world
 
 
-def test_links_and_hinges_follow_base_and_angles():
-    base = (1.0, 2.0, 0.1), quaternion_from_yaw(math.pi / 2)
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(-math.pi / 2), base=base), None)
+def test_drawing_links_and_hinges_follow_base_pose_and_joint_angles():
+    """The base heads along y, and the first joint turns right, so that the second link heads along x."""
+    quarter_turn_rad = math.pi / 2
+    base_x, base_y, base_z = 1.0, 2.0, 0.1
+    base = (base_x, base_y, base_z), quaternion_from_yaw(quarter_turn_rad)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(-quarter_turn_rad), base=base), None)
     assert drawing is not None
-    first, second = ROBOT.links[0].length_m, ROBOT.links[1].length_m
-    assert drawing.links_w[0] == pytest.approx([1.0, 2.0 + first / 2, 0.1])
-    assert drawing.hinges_w[0] == pytest.approx([1.0, 2.0 + first, 0.1])
-    assert drawing.links_w[1] == pytest.approx([1.0 + second / 2, 2.0 + first, 0.1])
+    first_m = ROBOT.links[0].length_m
+    second_m = ROBOT.links[1].length_m
+    hinge_y = base_y + first_m
+    assert drawing.links_w[0] == pytest.approx([base_x, base_y + first_m / 2, base_z])
+    assert drawing.hinges_w[0] == pytest.approx([base_x, hinge_y, base_z])
+    assert drawing.links_w[1] == pytest.approx([base_x + second_m / 2, hinge_y, base_z])
     assert rotation_from_quaternion(drawing.links_wxyz[1])[:, 0] == pytest.approx([1.0, 0.0, 0.0])
     axis = [0.0, 0.0, 1.0] if ROBOT.joints[0].axis == "yaw" else [0.0, 1.0, 0.0]
     assert rotation_from_quaternion(drawing.hinges_wxyz[0])[:, 2] == pytest.approx(axis, abs=1e-9)

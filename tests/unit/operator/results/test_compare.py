@@ -146,25 +146,48 @@ def test_a_black_box_with_odd_arrays_is_one_error(odd: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_one_joint_that_is_off_is_named_with_its_time() -> None:
-    a = made_up()
-    angle = a.angle_rad.copy()
-    angle[120:, 4] += 0.2
-    angle[150, 4] += 0.1
-    difference = differ(a, dataclasses.replace(a, angle_rad=angle))
-    worst, divergence = difference.angle.worst, difference.divergence
+OFF_JOINT = 4  # joint_5
+OFF_FROM_TICK = 120
+MOST_OFF_TICK = 150
+TICKS = 200  # of the made-up run, at 100 Hz
+
+
+def compare_with_one_joint_off() -> Difference:
+    """Compare a run with one in which a joint is off by 0.2 rad from 1.2 s on, and by 0.3 rad at 1.5 s."""
+    run = made_up()
+    angle_rad = run.angle_rad.copy()
+    angle_rad[OFF_FROM_TICK:, OFF_JOINT] += 0.2
+    angle_rad[MOST_OFF_TICK, OFF_JOINT] += 0.1
+    return differ(run, dataclasses.replace(run, angle_rad=angle_rad))
+
+
+def test_compare_one_joint_off_has_its_worst_difference() -> None:
+    worst = compare_with_one_joint_off().angle.worst
     assert worst is not None
-    assert worst.joint == 4
+    assert worst.joint == OFF_JOINT
     assert worst.time_s == pytest.approx(1.5)
     assert worst.difference == pytest.approx(0.3)
-    assert difference.angle.joint_rms[4] == pytest.approx(math.sqrt((79 * 0.2**2 + 0.3**2) / 200))
-    assert difference.angle.joint_rms[[0, 3, 5, 12]].tolist() == [0, 0, 0, 0]
-    assert divergence is not None
-    assert divergence.joint == 4
-    assert divergence.time_s == pytest.approx(1.2)
+
+
+def test_compare_one_joint_off_has_rms_of_this_joint_alone() -> None:
+    difference = compare_with_one_joint_off()
+    ticks_off_by_02 = TICKS - OFF_FROM_TICK - 1
+    rms_rad = math.sqrt((ticks_off_by_02 * 0.2**2 + 0.3**2) / TICKS)
+    expected = [rms_rad if joint == OFF_JOINT else 0.0 for joint in range(JOINTS)]
+    assert difference.angle.joint_rms.tolist() == pytest.approx(expected)
     assert difference.torque.rms == 0
+
+
+def test_compare_one_joint_off_diverges_at_its_first_difference() -> None:
+    difference = compare_with_one_joint_off()
     assert not difference.identical
-    text, html = shown(difference)
+    assert difference.divergence is not None
+    assert difference.divergence.joint == OFF_JOINT
+    assert difference.divergence.time_s == pytest.approx(1.2)
+
+
+def test_compare_one_joint_off_is_named_in_text_and_page() -> None:
+    text, html = shown(compare_with_one_joint_off())
     assert "The runs diverge at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
     assert "joint_5 at 1.50 s" in text
     assert 'data-joint="joint_5"' in html
@@ -258,27 +281,40 @@ def test_ticks_that_are_missing_are_told() -> None:
     assert difference.identical
 
 
-def test_targets_are_compared_only_within_one_mode() -> None:
-    a = made_up()
-    mode, target = a.mode.copy(), a.target.copy()
-    mode[100:, 6], target[100:, 6] = Mode.TORQUE, 5.0
-    difference = differ(a, dataclasses.replace(a, mode=mode, target=target))
-    assert difference.other_mode == pytest.approx(100 / (200 * JOINTS))
-    assert [gap.what for gap in difference.targets] == ["angle target"]
-    assert difference.targets[0].rms == 0
+TORQUE_JOINT = 6
+TORQUE_FROM_TICK = 100  # 1 s
+
+
+def made_up_with_torque_joint(torque_nm: float) -> RunRecord:
+    """Return the made-up run with one joint in torque mode from 1 s on."""
+    run = made_up()
+    mode = run.mode.copy()
+    mode[TORQUE_FROM_TICK:, TORQUE_JOINT] = Mode.TORQUE
+    target = run.target.copy()
+    target[TORQUE_FROM_TICK:, TORQUE_JOINT] = torque_nm
+    return dataclasses.replace(run, mode=mode, target=target)
+
+
+def test_compare_targets_of_different_modes_are_not_compared() -> None:
+    difference = differ(made_up(), made_up_with_torque_joint(5.0))
+    (angle_target,) = difference.targets
+    assert angle_target.what == "angle target"
+    assert angle_target.rms == 0
     assert not difference.identical
+    assert difference.other_mode == pytest.approx((TICKS - TORQUE_FROM_TICK) / (TICKS * JOINTS))
     assert difference.tracking_rad == pytest.approx((0.01, 0.01))
-    both = differ(
-        dataclasses.replace(a, mode=mode, target=target), dataclasses.replace(a, mode=mode, target=target + 1)
-    )
-    torque = both.targets[1]
-    assert torque.what == "torque target"
-    assert torque.worst is not None
-    assert torque.worst.joint == 6
-    assert torque.worst.time_s == pytest.approx(1.0)
-    assert torque.worst.difference == 1.0
-    assert [joint for joint, worst in enumerate(torque.joint_worst) if worst is not None] == [6]
-    shown(both)
+
+
+def test_compare_torque_targets_names_worst_joint_and_time() -> None:
+    difference = differ(made_up_with_torque_joint(5.0), made_up_with_torque_joint(6.0))
+    torque_target = difference.targets[1]
+    assert torque_target.what == "torque target"
+    assert torque_target.worst is not None
+    assert torque_target.worst.joint == TORQUE_JOINT
+    assert torque_target.worst.time_s == pytest.approx(1.0)
+    assert torque_target.worst.difference == 1.0
+    assert [joint for joint, worst in enumerate(torque_target.joint_worst) if worst is not None] == [TORQUE_JOINT]
+    shown(difference)
 
 
 @pytest.mark.parametrize(("speed_m_s", "percent"), [(0.09, -10.0), (0.125, 25.0), (-0.1, -200.0)])

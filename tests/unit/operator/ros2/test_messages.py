@@ -96,10 +96,14 @@ def test_contacts_are_arrows_along_their_forces(contacts: list[m.WorldContact]) 
         assert np.allclose(tip - tail, 0.01 * np.array(contact.force_w), rtol=1e-6, atol=1e-6)
 
 
-def test_obstacles_have_their_shapes() -> None:
-    known = [
+def read_obstacle_markers() -> list[Any]:
+    """Return the ROS markers of a cylinder of confidence 0.5, a box turned by 90 degrees, and a touched sphere."""
+    quarter_turn_rad = np.pi / 2
+    obstacles = [
         m.Obstacle(name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5),
-        m.Obstacle(name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=np.pi / 2, half_size_m=(0.1, 0.2, 0.3)),
+        m.Obstacle(
+            name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=quarter_turn_rad, half_size_m=(0.1, 0.2, 0.3)
+        ),
         m.Obstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True),
     ]
     world = m.World(
@@ -109,19 +113,32 @@ def test_obstacles_have_their_shapes() -> None:
         base_orientation_wxyz=(1, 0, 0, 0),
         base_confidence=1,
         contacts=[],
-        obstacles=known,
+        obstacles=obstacles,
     )
-    _, *shapes = read(
-        ros.MARKERS, ros.encode_markers(STAMP_NS, "odom", robot_in_ros.make_obstacle_markers(world))
-    ).markers
-    assert [shape.type for shape in shapes] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
-    sizes = [(shape.scale.x, shape.scale.y, shape.scale.z) for shape in shapes]
-    assert sizes == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
-    assert [(shape.pose.position.x, shape.pose.position.y) for shape in shapes] == [(1, 2), (3, 4), (5, 6)]
-    assert shapes[1].pose.orientation.z == pytest.approx(np.sqrt(0.5))
-    assert shapes[1].pose.orientation.x == 0
-    assert shapes[0].color.a == pytest.approx(0.6)
-    assert shapes[2].color.r > shapes[1].color.r
+    markers = robot_in_ros.make_obstacle_markers(world)
+    _, *shapes = read(ros.MARKERS, ros.encode_markers(STAMP_NS, "odom", markers)).markers
+    return shapes
+
+
+def test_ros_obstacle_markers_have_shape_size_and_pose() -> None:
+    markers = read_obstacle_markers()
+    assert [marker.type for marker in markers] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
+    sizes_m = [(marker.scale.x, marker.scale.y, marker.scale.z) for marker in markers]
+    assert sizes_m == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
+    assert [(marker.pose.position.x, marker.pose.position.y) for marker in markers] == [(1, 2), (3, 4), (5, 6)]
+    box_orientation = markers[1].pose.orientation
+    assert box_orientation.z == pytest.approx(np.sqrt(0.5))
+    assert box_orientation.x == 0
+
+
+def test_ros_obstacle_marker_of_uncertain_obstacle_is_translucent() -> None:
+    cylinder, _, _ = read_obstacle_markers()
+    assert cylinder.color.a == pytest.approx(0.6)  # of confidence 0.5
+
+
+def test_ros_obstacle_marker_of_touched_obstacle_is_redder() -> None:
+    _, box, sphere = read_obstacle_markers()
+    assert sphere.color.r > box.color.r
 
 
 def image(kind: type[Any], **more: Any) -> Any:
@@ -132,22 +149,26 @@ def image(kind: type[Any], **more: Any) -> Any:
     return kind(tick=0, timestamp_ns=0, link=1, **{**pose, **limits, **size, **pixels, **more})
 
 
-def test_depth_in_millimetres_or_metres() -> None:
-    seen = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "head_depth_optical_frame", image(m.DepthImage)))
-    assert seen.width == 4
-    assert seen.height == 3
-    assert seen.step == 8
-    assert seen.encoding == "16UC1"
-    assert seen.is_bigendian == 0
-    assert seen.header.frame_id == "head_depth_optical_frame"
-    assert at(seen.header.stamp) == STAMP_NS
-    assert np.array_equal(seen.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
-    coarse = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "f", image(m.DepthImage, scale_m=0.01)))
-    assert coarse.encoding == "32FC1"
-    assert coarse.step == 16
-    metres = np.frombuffer(coarse.data.tobytes(), "<f4")
-    assert np.isnan(metres[0])
-    assert np.allclose(metres[1:], 0.01 * np.arange(1, 12))
+def test_ros_depth_image_with_1_mm_scale_is_sent_as_it_is() -> None:
+    frame_id = "head_depth_optical_frame"
+    message = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, frame_id, image(m.DepthImage)))
+    assert message.header.frame_id == frame_id
+    assert at(message.header.stamp) == STAMP_NS
+    assert (message.width, message.height) == (4, 3)
+    assert message.encoding == "16UC1"
+    assert message.is_bigendian == 0
+    assert message.step == 4 * 2  # bytes in a row of 4 pixels
+    assert np.array_equal(message.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
+
+
+def test_ros_depth_image_with_other_scale_is_sent_in_meters() -> None:
+    coarse = image(m.DepthImage, scale_m=0.01)
+    message = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, "f", coarse))
+    assert message.encoding == "32FC1"
+    assert message.step == 4 * 4  # bytes in a row of 4 pixels
+    depth_m = np.frombuffer(message.data.tobytes(), "<f4")
+    assert np.isnan(depth_m[0])  # count 0: not measured
+    assert np.allclose(depth_m[1:], 0.01 * np.arange(1, 12))
 
 
 def test_ros_color_image_has_intrinsics() -> None:
@@ -180,26 +201,32 @@ def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
         assert np.array_equal(millimetres, np.arange(12).reshape(3, 4) * round(scale_m / 0.001))
 
 
-def test_an_imu_has_no_orientation() -> None:
-    sent = m.Imu(
+def read_imu_of_link_5() -> Any:
+    """Return the ROS message of the second of two IMUs."""
+    sample = m.Imu(
         tick=0,
         timestamp_ns=0,
         link=[3, 5],
         angular_velocity_rad_s=[(0, 0, 0), (1, 2, 3)],
         acceleration_m_s2=[(0, 0, 0), (4, 5, 6)],
     )
-    seen = read(ros.IMU, robot_in_ros.encode_imu(STAMP_NS, "link_5_imu_frame", sent, 1))
-    assert at(seen.header.stamp) == STAMP_NS
-    assert seen.header.frame_id == "link_5_imu_frame"
-    turn, push = seen.angular_velocity, seen.linear_acceleration
-    assert turn.x == 1
-    assert turn.y == 2
-    assert turn.z == 3
-    assert push.x == 4
-    assert push.y == 5
-    assert push.z == 6
-    assert seen.orientation_covariance[0] == -1
-    assert seen.linear_acceleration_covariance.tolist() == [0] * 9
+    return read(ros.IMU, robot_in_ros.encode_imu(STAMP_NS, "link_5_imu_frame", sample, 1))
+
+
+def test_ros_imu_message_has_rates_and_acceleration_of_its_link() -> None:
+    message = read_imu_of_link_5()
+    rate = message.angular_velocity
+    acceleration = message.linear_acceleration
+    assert at(message.header.stamp) == STAMP_NS
+    assert message.header.frame_id == "link_5_imu_frame"
+    assert (rate.x, rate.y, rate.z) == (1, 2, 3)
+    assert (acceleration.x, acceleration.y, acceleration.z) == (4, 5, 6)
+
+
+def test_ros_imu_message_marks_orientation_as_missing() -> None:
+    message = read_imu_of_link_5()
+    assert message.orientation_covariance[0] == -1  # ROS: the orientation is not measured
+    assert message.linear_acceleration_covariance.tolist() == [0] * 9  # ROS: unknown
 
 
 @FEW
