@@ -86,19 +86,26 @@ def check_python() -> Iterator[Finding]:
 
 
 def check_packages() -> Iterator[Finding]:
-    """Check the packages that SnakeSIM requires by its metadata; one finding for the core, and one for each extra."""
-    installed: dict[str, list[str]] = {}  # by extra; the core's extra is empty
-    missing: dict[str, list[str]] = {}
+    """Check whether the packages that SnakeSIM requires by its metadata are installed.
+
+    Yields:
+        One finding for the core, and one for each extra.
+    """
+    installed: dict[str, list[str]] = {}  # extra -> packages with their versions; the core's extra is empty
+    missing: dict[str, list[str]] = {}  # extra -> packages
     for requirement in importlib.metadata.requires("snakesim") or []:
-        name = re.split(r"[\[<>=!~; ]", requirement)[0]
-        if name == "snakesim":  # an extra that includes another extra
+        # Such as `numpy>=2; extra == "report"`.
+        package = re.split(r"[\[<>=!~; ]", requirement)[0]
+        if package == "snakesim":  # an extra that includes another extra
             continue
         marker = re.search(r"""extra == ['"]([^'"]+)""", requirement)
         extra = marker[1] if marker else ""
         try:
-            installed.setdefault(extra, []).append(f"{name} {importlib.metadata.version(name)}")
+            package_with_version = f"{package} {importlib.metadata.version(package)}"
         except importlib.metadata.PackageNotFoundError:
-            missing.setdefault(extra, []).append(name)
+            missing.setdefault(extra, []).append(package)
+        else:
+            installed.setdefault(extra, []).append(package_with_version)
     for extra in sorted({*installed, *missing}):
         if extra in missing:
             yield _report_missing_packages(extra, missing[extra])

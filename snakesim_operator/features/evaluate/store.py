@@ -125,7 +125,11 @@ def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Pat
 
 
 def _column_types() -> dict[str, Any]:
-    """Return name and Arrow type of each column: what identifies a case, then every plain field of a summary."""
+    """Return name and Arrow type of each column of the table of results.
+
+    The first columns identify a case. Then follow the fields of a run's summary that are plain values and do not
+    depend on the wall clock.
+    """
     columns = {
         "row": ARROW_TYPES[int],
         "setting": ARROW_TYPES[str],
@@ -136,9 +140,10 @@ def _column_types() -> dict[str, Any]:
         if name in WALL_CLOCK_NUMBERS:
             continue
         alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        not_none = [alternative for alternative in alternatives if alternative is not types.NoneType]
-        if len(not_none) == 1 and not_none[0] in ARROW_TYPES:
-            columns.setdefault(name, ARROW_TYPES[not_none[0]])
+        value_types = [alternative for alternative in alternatives if alternative is not types.NoneType]
+        is_plain = len(value_types) == 1 and value_types[0] in ARROW_TYPES
+        if is_plain:
+            columns.setdefault(name, ARROW_TYPES[value_types[0]])
     columns[GAVE_UP] = ARROW_TYPES[bool]
     columns["error"] = ARROW_TYPES[str]
     return columns
