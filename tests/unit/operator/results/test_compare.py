@@ -87,7 +87,9 @@ def describe_of(run: RunConfig):
 
 def shown(difference: Difference) -> tuple[str, str]:
     """Table and page; neither may show what is not a number. And for scripts, which get null."""
-    assert json.loads(msgspec.json.encode(for_scripts(difference)))["identical"] == difference.identical
+    values = json.loads(msgspec.json.encode(for_scripts(difference)))
+    assert values["identical"] == difference.identical
+    assert (values["divergence"] is None) == (difference.divergence is None)
     reported = "\n".join(table(difference)), page(difference, within(difference, 5))
     for text in reported:
         assert not re.search(
