@@ -63,7 +63,7 @@ class Motion:
 
 
 def measure_motion(record: RunRecord) -> Motion | None:
-    """Find the intervals in which the body stood still, from the measured path of its center of mass.
+    """Find the intervals in which the body was stationary, from the measured path of its center of mass.
 
     Args:
         record: The recorded run.

@@ -20,7 +20,7 @@ TOUCHING_M = 0.0005  # a smaller gap is a touch: the body's outline is that of i
 def why_empty(record: RunRecord) -> str:
     """Explain why push-points carried no force, in words for the report.
 
-    For each push-point that should push but carried less than EMPTY_N, the sentence tells apart three causes: no
+    For each push-point that should push but carried less than EMPTY_N, the sentence distinguishes three causes: no
     obstacle is near, the body does not touch the obstacle, or the body touches it without force.
 
     Returns:

@@ -130,7 +130,7 @@ def distance(record: RunRecord) -> Series | None:
         record: The recorded run.
 
     Returns:
-        The series, whose label says how it is measured; None if nothing is known of the advance.
+        The series, whose label names the measurement; None if nothing is known of the advance.
     """
     tick_count = len(record.time_s)
     if not tick_count:

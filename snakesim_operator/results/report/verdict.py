@@ -126,7 +126,7 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> V
 def _judge_motion(record: RunRecord, summary: RunSummary, motion: Motion) -> Verdict:
     """Judge a run that no fault stopped and whose pose is known, by the measured motion.
 
-    The run is poor if it did not locomote, if it jammed or stood still for long, or if it ended early or behind its
+    The run is poor if it did not locomote, if it jammed or was stationary for long, or if it ended early or behind its
     start. The controller's own report is added to the words, also where it contradicts the measurement.
 
     Args:
