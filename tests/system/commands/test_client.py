@@ -133,7 +133,7 @@ def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -
             raise ValueError("no idea")
     """
     ended = script(failing, waiting, tmp_path)
-    assert ended.out == "armed\n"
+    assert ended.out == "armed\n", ended.err
     assert "no idea" in ended.err
     with snakesim.Robot.connect(waiting.endpoint) as robot:
         assert robot.status.lifecycle == "disarmed", robot.status.reason

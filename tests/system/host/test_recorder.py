@@ -101,6 +101,7 @@ class Disk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
         self.space, self.hangs, self.goes_on = 2**30, False, Event()
+        self.is_hanging = Event()
         self._memory, self._pwrite = memory, os.pwrite
         monkeypatch.setattr(under_test.os, "pwrite", self.pwrite)
         monkeypatch.setattr(under_test, "PERIOD_S", 0.02)
@@ -111,6 +112,7 @@ class Disk:
         room = max(self.space - offset, 0)
         if room == 0 and content:
             if self.hangs:
+                self.is_hanging.set()
                 self.goes_on.wait(30)
             raise OSError(errno.ENOSPC, "No space left on device")
         return self._pwrite(handle, content[:room], offset)
@@ -179,6 +181,7 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
             disk.space, disk.hangs = len(layout.header()) + 6 * layout.row_bytes, True
             run.arm()
             wait_until(run.ended, "the end of the run")
+            assert disk.is_hanging.wait(5.0)
         assert not disk.goes_on.is_set()  # neither the run nor its recorder's end waited for it
         assert run.host.ended == "complete"
         assert not run.host.authority.faults
