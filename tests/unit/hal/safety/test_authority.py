@@ -418,3 +418,37 @@ def test_joint_state_with_nan_is_published_as_last_good() -> None:
     published = rig.authority.replace_unreadable(state(rig.robot, [0.2, float("nan"), 0.2]))
     assert published.angle_rad == [0.2, 0.1, 0.2]
     assert published.valid == [True, False, True]
+
+
+# --- single decisions that the model does not distinguish --------------------------------------------------------
+
+
+def test_reset_without_a_fault_is_refused_with_its_reason() -> None:
+    rig = armed()
+    answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    assert not answer.ok
+    assert answer.reason == "nothing to reset in state armed"
+
+
+def test_fault_that_reaches_nothing_is_recorded_and_stops_nothing() -> None:
+    rig = armed()
+    rig.authority.fault(Fault(tick=1, what="noted", cause="a test", reach="none"))
+    assert rig.authority.state == "armed"
+    assert [fault.what for fault in rig.authority.faults] == ["noted"]
+
+
+def test_command_with_a_sequence_number_again_is_a_replay() -> None:
+    rig = armed()
+    assert rig.send(0.1, sequence=50) is None
+    assert rig.send(0.1, sequence=50) == "replayed"
+
+
+@pytest.mark.parametrize("is_armed", [False, True], ids=["disarmed", "armed"])
+def test_angles_that_never_change_are_implausible_only_while_commanded_to_move(is_armed: bool) -> None:
+    """A robot that nothing commands may rest for as long as it likes."""
+    rig = armed() if is_armed else commanded()
+    for tick in range(1, 400):
+        rig.tick_with(0.1 + 0.001 * tick)
+        rig.authority.observe(state(rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS))
+        rig.authority.check_deadlines(rig.now_ns, rig.tick)
+    assert (rig.authority.state == "fault") == is_armed
