@@ -147,10 +147,10 @@ def find_unit(name: str, info: inspect.Type) -> str:
         return ""
     if unit or not _holds_numbers(info):
         return unit
-    return _unit_of_name(name)
+    return find_unit_in_name(name)
 
 
-def _unit_of_name(name: str) -> str:
+def find_unit_in_name(name: str) -> str:
     """Return the unit that a name ends with; empty if the end is only a part of a unit that is not in the table."""
     for suffix, unit in UNITS_BY_SUFFIX.items():
         if name.endswith(suffix):

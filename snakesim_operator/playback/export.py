@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import PrintLine, escape_invisible
+from snakesim_hal.model.field_words import find_unit_in_name
 from snakesim_hal.model.textfiles import exported
 from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_operator.playback.episodes import describe_gaps, read_episodes
@@ -29,19 +30,6 @@ from snakesim_operator.results.run_reader import find_recording
 
 MISSING = b"snakesim.missing"  # metadata of a Parquet file: JSON
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
-# The longer of two endings comes first.
-UNIT_OF_SUFFIX = {
-    "_rad_s": "rad/s",
-    "_m_s": "m/s",
-    "_rad": "rad",
-    "_nm": "N·m",
-    "_n": "N",
-    "_m": "m",
-    "_s": "s",
-    "_w": "W",
-    "_j": "J",
-    "_hz": "Hz",
-}
 UNITS = {
     "time_s": "s",
     "age_s": "s",
@@ -176,20 +164,12 @@ def unit_of(name: str, record: RunRecord) -> str:
     """
     signal = name.partition(".")[0]
     if name.endswith(f".{CONTROLLER}"):
-        return _unit_in_name(signal)
+        return find_unit_in_name(signal) or "1"
     units: dict[str, str] = {}
     for kind in find_custom_messages(record.description).values():
         units |= kind.units
     units |= UNITS  # the robot's own signals win
     return units[signal]
-
-
-def _unit_in_name(name: str) -> str:
-    """Return the unit in which a name ends, such as rad/s for `turn_rad_s`; "1" if there is none."""
-    for suffix, unit in UNIT_OF_SUFFIX.items():
-        if name.endswith(suffix):
-            return unit
-    return "1"
 
 
 def name_parts(signal: str, joints: Sequence[str]) -> Sequence[str]:

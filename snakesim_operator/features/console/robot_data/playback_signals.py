@@ -9,8 +9,7 @@ from snakesim_hal.wire import keys
 from snakesim_operator.features.console.robot_data.run_playback import RunPlayback, timestamp_s
 from snakesim_operator.features.console.robot_data.signals import (
     PREFIXED_MESSAGES,
-    field_of_signal,
-    find_units,
+    find_signal_unit,
     list_message_numbers,
 )
 from snakesim_operator.playback.export import table, unit_of
@@ -40,12 +39,11 @@ class PlaybackSignals:
         """Add the signals of the messages of one key."""
         robot = run.record.description
         timed_numbers = [(time_s, list_message_numbers(message, robot)) for time_s, message in messages]
-        units = find_units(PREFIXED_MESSAGES[key])
         for _, numbers in timed_numbers:
             for name in numbers:
                 if name not in self._message_numbers:
                     self._message_numbers[name] = timed_numbers
-                    self._units[name] = units[field_of_signal(name)]
+                    self._units[name] = find_signal_unit(name, PREFIXED_MESSAGES[key])
 
     def units(self) -> dict[str, str]:
         return self._units

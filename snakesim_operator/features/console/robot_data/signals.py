@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.field_words import find_unit_in_name
 from snakesim_hal.run_log.black_box import summarize_contacts
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.custom_sample import find_custom_messages
@@ -212,16 +213,21 @@ def collect_numbers(snapshot: RobotSnapshot) -> Numbers:
     for message in (snapshot.control, snapshot.power, snapshot.imu):
         if message is not None:
             message_numbers = list_message_numbers(message, snapshot.robot)
-            units = find_units(type(message))
             for name, value in message_numbers.items():
-                numbers.add(name, value, units[field_of_signal(name)])
+                numbers.add(name, value, find_signal_unit(name, type(message)))
     _add_sensor_numbers(numbers, snapshot)
     return numbers
 
 
-def field_of_signal(name: str) -> str:
-    """Return the field of a signal whose name begins with that of a message."""
-    return name.split(".")[1]
+def find_signal_unit(name: str, message_type: type[Message]) -> str:
+    """Return the unit of a signal whose name begins with that of a message, such as `control.propulsion_n`.
+
+    A number that a controller defined has the unit in which its name ends.
+    """
+    field_name = name.split(".")[1]
+    if field_name == "custom":
+        return find_unit_in_name(name) or "1"
+    return find_units(message_type)[field_name]
 
 
 def _add_joint_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
