@@ -5,6 +5,6 @@
 `worker_pool`, `dask_cluster`   processes that compute side by side, here or on a Dask cluster
 `console_port`   what the console listens on, opened before its processes start
 `page_origin`    which web pages may connect to a server of ours
-`byte_relay`     copies bytes between two connections
+`byte_relay`     relays bytes between two connections
 `png`            writes PNG images
 """

@@ -1,7 +1,9 @@
-"""Copies bytes between two connections, in both directions."""
+"""Relays what two connections receive, in both directions."""
 
 import asyncio
 import contextlib
+from collections.abc import Coroutine
+from typing import Any
 
 CHUNK_BYTES = 64 * 1024
 
@@ -10,16 +12,18 @@ Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 async def relay_bytes(one: Connection, other: Connection) -> None:
     """Copy bytes in both directions until either side closes its connection. The caller closes both."""
-    directions = [
-        asyncio.ensure_future(_copy(one[0], other[1])),
-        asyncio.ensure_future(_copy(other[0], one[1])),
-    ]
+    await run_until_one_ends(_copy(one[0], other[1]), _copy(other[0], one[1]))
+
+
+async def run_until_one_ends(*directions: Coroutine[Any, Any, None]) -> None:
+    """Run the directions of a relay until one of them ends, and cancel the others."""
+    tasks = [asyncio.ensure_future(direction) for direction in directions]
     try:
-        await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        for direction in directions:
-            direction.cancel()
-        await asyncio.gather(*directions, return_exceptions=True)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -211,17 +211,22 @@ class FrontServer:
             return
         self._open_pages += 1
         try:
+            await self._relay_to_pages(request.head, reader, writer)
+        finally:
+            self._open_pages -= 1
+
+    async def _relay_to_pages(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Pass the head of a request to the page server, and copy bytes until either side ends the connection."""
+        try:
             pages_reader, pages_writer = await asyncio.open_unix_connection(str(self._pages_path))
         except OSError as error:
             _respond(writer, 503, f"the console's pages do not answer: {error.strerror}; use snakesim estop to stop")
-            self._open_pages -= 1
             return
         try:
-            pages_writer.write(request.head)
+            pages_writer.write(head)
             await relay_bytes((reader, writer), (pages_reader, pages_writer))
         finally:
             pages_writer.close()
-            self._open_pages -= 1
 
 
 async def _wait_for_result(stopped: "Future[str]") -> tuple[int, str]:

@@ -15,6 +15,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from snakesim_operator.base.byte_relay import run_until_one_ends
 from snakesim_operator.features.console.web.browser import Browser
 from snakesim_operator.features.console.web.viser_server import PageServer
 
@@ -139,16 +140,9 @@ class BrowserRelay:
 
 async def _relay_messages(browser: Browser, connection: ServerConnection, to_viser: ClientConnection) -> None:
     """Relay messages in both directions until either side ends."""
-    directions = [
-        asyncio.ensure_future(_relay_to_viser(browser, connection, to_viser)),
-        asyncio.ensure_future(_relay_to_browser(to_viser, connection)),
-    ]
-    try:
-        await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for direction in directions:
-            direction.cancel()
-        await asyncio.gather(*directions, return_exceptions=True)
+    to_viser_direction = _relay_to_viser(browser, connection, to_viser)
+    to_browser_direction = _relay_to_browser(to_viser, connection)
+    await run_until_one_ends(to_viser_direction, to_browser_direction)
 
 
 async def _relay_to_viser(browser: Browser, connection: ServerConnection, to_viser: ClientConnection) -> None:
