@@ -43,6 +43,7 @@ SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 OUTPUTS = (*SERVICE_STREAMS, keys.CUSTOM_ALL)
 """What the host's black box does not have."""
 CONTROLLER = "controller"  # ends the names of columns with numbers that a controller defined
+SAME_TIME_S = 1e-9  # two times that differ by less are of one tick
 MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
 _TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
 _JOINT_COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm")  # of the messages at keys.JOINTS
@@ -264,7 +265,7 @@ class RecordingContents:
             samples = self._custom_samples(key, message_type)
             ticks = np.array(sorted(samples), dtype=np.int64)
             sampled_s = ticks * (robot.period_ns * 1e-9)
-            newest = np.searchsorted(sampled_s, time_s + 1e-9, side="right") - 1  # (n,); -1 before the first sample
+            newest = _find_newest(sampled_s, time_s)
             in_order = [samples[tick] for tick in ticks.tolist()]
 
             # The dictionary keeps the order in which the samples name their numbers.
@@ -358,12 +359,22 @@ def make_telemetry_columns(states: Sequence[ControlState], time_s: Floats) -> di
         time_s: (n,) robot time of each row.
     """
     sent_s = np.array([state.timestamp_ns * 1e-9 for state in states])
-    newest = np.searchsorted(sent_s, time_s + 1e-9, side="right") - 1
+    newest = _find_newest(sent_s, time_s)
     names = dict.fromkeys(name for state in states for name in state.custom)
     return {
         f"{name}.{CONTROLLER}": _values_at([state.custom.get(name, np.nan) for state in states], newest)
         for name in names
     }
+
+
+def _find_newest(sampled_s: NDArray[np.floating[Any]], time_s: Floats) -> NDArray[np.int64]:
+    """Return the index of the newest sample at each time, (n,); -1 before the first one.
+
+    Args:
+        sampled_s: Times of the samples, in order.
+        time_s: (n,) times of the rows.
+    """
+    return np.searchsorted(sampled_s, time_s + SAME_TIME_S, side="right") - 1
 
 
 def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.float64]:
