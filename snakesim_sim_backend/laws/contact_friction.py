@@ -25,6 +25,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.laws import find_normal_forces_n
 
 # Numbers per contact in `userdata`: its key, the link's body, the other body, the mass that the spring has to follow in
 # kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, and the contact point in the frame of the
@@ -182,11 +183,7 @@ class ContactFriction:
         self._memory[0] = 0.0
         self.friction_force_w = {}
         self.geom_pairs = self._contact.geom.tolist()
-        solver_forces = self._data.efc_force.tolist()
-        self.normal_force_n = [
-            solver_forces[row] if row >= 0 else 0.0  # a contact without a row has no force
-            for row in self._contact.efc_address.tolist()
-        ]
+        self.normal_force_n = find_normal_forces_n(self._data.efc_force, self._contact.efc_address)
         rough = self._find_rough_contacts()
         if rough:
             self._store_contacts(rough)

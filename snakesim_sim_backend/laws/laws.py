@@ -4,8 +4,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
+
+
+def find_normal_forces_n(solver_forces_n: Floats, solver_rows: NDArray[np.int32]) -> list[float]:
+    """Return the normal force of each contact. A contact without a row in the solver has no force.
+
+    Args:
+        solver_forces_n: MuJoCo's `efc_force`.
+        solver_rows: MuJoCo's `efc_address` of each contact; negative: the contact has no row.
+    """
+    forces_n = solver_forces_n.tolist()
+    return [forces_n[row] if row >= 0 else 0.0 for row in solver_rows.tolist()]
 
 
 class ContactForces(Protocol):

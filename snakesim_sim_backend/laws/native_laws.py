@@ -17,7 +17,7 @@ import mujoco
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.laws.laws import Laws
+from snakesim_sim_backend.laws.laws import Laws, find_normal_forces_n
 from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, load_library
 from snakesim_sim_backend.model.build import SimModel
 
@@ -54,22 +54,18 @@ class NativeContacts:
 
     @property
     def geom_pairs(self) -> list[list[int]]:
-        """Return the two geoms of each contact."""
         if not self._data.ncon:
             return []
         return self._contact.geom.tolist()
 
     @property
     def normal_force_n(self) -> list[float]:
-        """Return the normal force of each contact. A contact without a row in the solver has no force."""
         if not self._data.ncon:
             return []
-        solver_forces = self._data.efc_force.tolist()
-        return [solver_forces[row] if row >= 0 else 0.0 for row in self._contact.efc_address.tolist()]
+        return find_normal_forces_n(self._data.efc_force, self._contact.efc_address)
 
     @property
     def friction_force_w(self) -> dict[int, Vector]:
-        """Return the friction force on the link, in N, by the contact's number; only contacts that have friction."""
         count = int(self._memory[CONTACT_COUNT])
         if not count:
             return {}
@@ -105,27 +101,22 @@ class NativeLaws(Laws):
 
     @property
     def foot_forces_n(self) -> Floats | None:
-        """Return the normal force on each foot in the last step."""
         if not self._has_feet:
             return None
         return self._feet[:, FOOT_NORMAL_FORCE].copy()
 
     def set_min_friction(self, min_friction: float) -> None:
-        """Use at least this friction coefficient in every contact."""
         self._memory[MIN_FRICTION] = min_friction
 
     def begin(self) -> None:
-        """Take the feet as sticking where they are in the next `forward`, and forget all contacts."""
         self._memory[PLACED] = 0.0
         self._memory[CONTACT_COUNT] = 0.0
 
     def forward(self) -> None:
-        """Compute all quantities of the present state."""
         mujoco.mj_forward(self._model, self._data)
         self._advance(self._model._address, self._data._address)
 
     def step(self, count: int, after_step: Callable[[], None] | None) -> None:
-        """Make physics steps."""
         if after_step is None:
             mujoco.mj_step(self._model, self._data, count)
             return

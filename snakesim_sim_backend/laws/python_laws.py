@@ -42,26 +42,22 @@ class PythonLaws(Laws):
 
     @property
     def foot_forces_n(self) -> Floats | None:
-        """Return the normal force on each foot in the last step."""
         if self._ground is None:
             return None
         return self._ground.normal_force_n
 
     def set_min_friction(self, min_friction: float) -> None:
-        """Use at least this friction coefficient in every contact."""
         self._friction.min_friction = min_friction
         if self._ground is not None:
             self._ground.min_friction = min_friction
 
     def begin(self) -> None:
-        """Take the feet as sticking where they are now, and forget all contacts."""
         if self._ground is not None:
             mujoco.mj_kinematics(self._model, self._data)
             self._ground.begin()
         self._friction.begin()
 
     def forward(self) -> None:
-        """Compute all quantities of the present state."""
         mujoco.mj_forward(self._model, self._data)
         for apply in self._force_laws:
             apply()
@@ -69,7 +65,6 @@ class PythonLaws(Laws):
         self._friction.update_contacts()
 
     def step(self, count: int, after_step: Callable[[], None] | None) -> None:
-        """Make physics steps."""
         for _ in range(count):
             mujoco.mj_step1(self._model, self._data)
             for apply in self._force_laws:
