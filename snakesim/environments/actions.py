@@ -64,12 +64,7 @@ class Commands:
         Raises:
             ValueError: The action has another shape, or holds a number that is not finite.
         """
-        try:
-            values: Floats = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"action is {action!r:.60}, must be {self._describe_expected()}") from None
-        if values.shape != (len(self.names),):
-            raise ValueError(f"action has shape {values.shape}, must be {self._describe_expected()}")
+        values = _read_numbers("action", action, (len(self.names),), f"must be {self._describe_expected()}")
         self._check_finite(values, "action")
         return values
 
@@ -86,14 +81,8 @@ class Commands:
         Raises:
             ValueError: The actions have another shape, or hold a number that is not finite.
         """
-        try:
-            values: Floats = np.array(actions, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"actions is {actions!r:.60}, must have {count} rows, one for each environment") from None
-        if values.shape != (count, len(self.names)):
-            raise ValueError(
-                f"actions has shape {values.shape}, must have {count} rows, and each row {self._describe_expected()}"
-            )
+        expected = f"must have {count} rows, and each row {self._describe_expected()}"
+        values = _read_numbers("actions", actions, (count, len(self.names)), expected)
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values).all(axis=1)))
             self._check_finite(values[row], f"actions[{row}]")
@@ -111,6 +100,27 @@ class Commands:
         count = len(self.names)
         what = "a correction" if self.kind.startswith(RESIDUAL) else f"a {self.kind}"
         return f"({count},): {what} in {self.unit} for each joint, {self.names[0]} to {self.names[-1]}"
+
+
+def _read_numbers(name: str, given: Any, shape: tuple[int, ...], expected: str) -> Floats:
+    """Return an argument as a new array.
+
+    Args:
+        name: of the argument, for errors.
+        given: its value.
+        shape: that the array must have.
+        expected: what the argument must be, in words.
+
+    Raises:
+        ValueError: It is no array of numbers, or has another shape.
+    """
+    try:
+        values: Floats = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {given!r:.60}, {expected}") from None
+    if values.shape != shape:
+        raise ValueError(f"{name} has shape {values.shape}, {expected}")
+    return values
 
 
 def corrected_controller(kind: str) -> str | None:

@@ -155,15 +155,19 @@ class _ResumedAuthority(Authority):
         power: Power | None,
         applied: tuple[Applied, Applied],
     ) -> None:
+        """Continue an arm session. The arguments are those of `LimiterClient.resume`."""
         super().__init__(description)
+        # An armed robot with a lease, and without a stop that its motors have not received yet.
         self.state = "armed"
         self.reason = f"armed by {REQUESTER}"
         self.arm_session = 1
         self._stop_sent = True
         expires_ns = joints.timestamp_ns + description.lease_ns
         self.lease = Lease(holder=CONTROL, epoch=1, priority=LEASE_PRIORITY, expires_ns=expires_ns)
-        self._applied, last = applied
+        # `joints` were measured under the last setpoints but one, and the state that follows under the last ones.
+        applied_before, last_applied = applied
+        self._applied = applied_before
         self.observe(joints)
-        self._applied = last
+        self._applied = last_applied
         if power is not None:
             self.observe_power(power, joints.timestamp_ns)

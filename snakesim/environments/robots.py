@@ -18,10 +18,9 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, LifecycleState, Mode, Pose
+from snakesim_sim_backend.batch.sensors import NUMBERS_OF_POSE, NUMBERS_OF_VELOCITY
 
 NAMES_OR_NONE = np.array([name or None for name in LIMIT_NAMES], dtype=object)
-NUMBERS_OF_POSE = 7  # position and quaternion
-NUMBERS_OF_VELOCITY = 6  # linear and angular
 
 
 class Robots:

@@ -20,8 +20,8 @@ from snakesim_sim_backend.batch.samples import DelayedValues, DueTicks, Mask, Ti
 from snakesim_sim_backend.batch.simulations import NO_TOUCHES, Simulations, TouchArrays
 from snakesim_sim_backend.sensors.timing import round_to_ticks
 
-NUMBERS_OF_POSE = 7
-NUMBERS_OF_VELOCITY = 6
+NUMBERS_OF_POSE = 7  # position and quaternion
+NUMBERS_OF_VELOCITY = 6  # linear and angular
 NUMBERS_OF_RAW_POSE = 19  # those of pose and velocity, and 6 of noise
 NUMBERS_OF_CONTACT = 6  # of noise: of position and force
 ROUNDING_ERROR = 1e-9  # relative; more than that of the size of a force
