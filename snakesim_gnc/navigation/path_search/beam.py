@@ -33,9 +33,10 @@ from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_touched
 from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
 from snakesim_gnc.navigation.path_search.native_library import is_native_available
+from snakesim_gnc.navigation.path_search.path_growth import PathGrowth
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
 from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_body_arcs
-from snakesim_gnc.navigation.path_search.search_task import PathGrowth, SearchedPath, SearchTask
+from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
 from snakesim_hal.base.arrays import Floats
 
@@ -53,7 +54,7 @@ class BeamSearch:
         self,
         obstacles: ObstacleGrid,
         parameters: SearchParameters,
-        growth: type[SpecifiedGrowth] | type[NativeGrowth] | None = None,
+        growth: type[PathGrowth] | None = None,
     ) -> None:
         """Create a search on a map.
 
@@ -121,7 +122,7 @@ class BeamSearch:
 
     def _grow(self, start: NodeLayer, steps: int, task: SearchTask) -> PathSearch:
         """Expand layer after layer, and return the cheapest path."""
-        paths: PathGrowth = self._growth(self._obstacles, self._parameters, task, start, steps)
+        paths = self._growth(self._obstacles, self._parameters, task, start, steps)
         for _ in range(steps):
             yield paths.node_count
             if not paths.grow():

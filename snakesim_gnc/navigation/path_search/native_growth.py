@@ -24,6 +24,7 @@ from snakesim_gnc.navigation.path_search.native_library import (
     explain_absence,
     load_library,
 )
+from snakesim_gnc.navigation.path_search.path_growth import PathGrowth
 from snakesim_gnc.navigation.path_search.search_arcs import ArcTable
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
 from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_body_arcs
@@ -32,24 +33,17 @@ from snakesim_gnc.navigation.path_search.search_task import SearchedPath, Search
 Array = NDArray[Any]
 
 
-class NativeGrowth:
-    """Grows paths with the C library."""
+class NativeGrowth(PathGrowth):
+    """Grows paths with the C library.
+
+    Raises:
+        NativeGrowthError: by the constructor, if the C library is not installed or an array has a wrong size; by
+            `grow`, if there are as many layers as were requested.
+    """
 
     def __init__(
         self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
     ) -> None:
-        """Begin with the start nodes as the first layer.
-
-        Args:
-            obstacles: the map.
-            parameters: the robot, and the costs.
-            task: the search.
-            start: the nodes from which the paths grow.
-            steps: the largest number of arcs.
-
-        Raises:
-            NativeGrowthError: the C library is not installed, or an array has another size than it must have.
-        """
         library = load_library()
         if library is None:
             raise NativeGrowthError(f"there is no C library of the planner: {explain_absence()}")
@@ -68,22 +62,15 @@ class NativeGrowth:
 
     @property
     def node_count(self) -> int:
-        """Return the number of nodes in the newest layer."""
         return self._search.layers.node_count
 
     def grow(self) -> bool:
-        """Add the best children of the newest layer. Return False if none is free.
-
-        Raises:
-            NativeGrowthError: there are as many layers as were asked for already.
-        """
         added = self._expand(ctypes.byref(self._search))
         if added == NO_LAYER_ROOM:
             raise NativeGrowthError(f"the paths have {self._layer_room - 1} arcs already, as many as were asked for")
         return added > 0
 
     def trace_cheapest(self) -> SearchedPath | None:
-        """Follow the parents of the cheapest node of the newest layer back to the start."""
         layers = self._search.layers
         if layers.layer_count == 1:
             return None

@@ -4,7 +4,6 @@ Points are in the world frame.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -32,20 +31,3 @@ class SearchTask:
     lying_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
     max_sideways_m: float = np.inf  # how far the path may be from where the body lies
     failed_w: Floats | None = None  # (k, 2) points of paths on which the body got stuck here
-
-
-class PathGrowth(Protocol):
-    """The paths of one search, which grow by one arc at a time."""
-
-    @property
-    def node_count(self) -> int:
-        """Return the number of nodes in the newest layer."""
-        ...
-
-    def grow(self) -> bool:
-        """Expand the newest layer into the next one. Return False, and change nothing, if no arc is free."""
-        ...
-
-    def trace_cheapest(self) -> SearchedPath | None:
-        """Return the path to the cheapest node of the newest layer; None if nothing has grown."""
-        ...

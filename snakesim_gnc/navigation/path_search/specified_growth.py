@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from snakesim_gnc.geometry.planar import wrenches
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_touched
+from snakesim_gnc.navigation.path_search.path_growth import PathGrowth
 from snakesim_gnc.navigation.path_search.search_arcs import ArcTable, SearchArcs
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, count_earlier_in_cell, number_cells
 from snakesim_gnc.navigation.path_search.search_parameters import (
@@ -34,22 +35,13 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
 
-class SpecifiedGrowth:
+class SpecifiedGrowth(PathGrowth):
     """Grows paths with NumPy, in the words of the cost's equation in `beam`."""
 
     def __init__(
         self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
     ) -> None:
-        """Begin with the start nodes as the first layer.
-
-        Args:
-            obstacles: the map.
-            parameters: the robot, and the costs.
-            task: the search.
-            start: the nodes from which the paths grow.
-            steps: the largest number of arcs; not used here.
-        """
-        del steps
+        del steps  # memory is allocated layer by layer
         self._obstacles = obstacles
         self._parameters = parameters
         self._task = task
@@ -59,11 +51,9 @@ class SpecifiedGrowth:
 
     @property
     def node_count(self) -> int:
-        """Return the number of nodes in the newest layer."""
         return len(self._layers[-1].x_m)
 
     def grow(self) -> bool:
-        """Add the best children of the newest layer. Return False if none is free."""
         parents = self._layers[-1]
         arcs = self._arc_table.steer(parents)
         sideways_m = self._distance_from_lying(arcs, parents.s_m)
@@ -78,7 +68,6 @@ class SpecifiedGrowth:
         return True
 
     def trace_cheapest(self) -> SearchedPath | None:
-        """Follow the parents of the cheapest node of the newest layer back to the start."""
         if len(self._layers) == 1:
             return None
         newest = self._layers[-1]
