@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import snakesim
-from docs.site.api_pages import PAGES, Page
+from docs.site.api_contents import PAGES, Page
 
 RUNS = [page for page in PAGES if "snakesim.run" in page.example or "gymnasium" in page.example]
 

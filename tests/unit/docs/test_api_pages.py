@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from docs.site.api_pages import FOLDER, INTERNAL, PAGES, Page, find, find_undocumented, format_text, make_pages
+from docs.site.api_contents import INTERNAL, PAGES, Page
+from docs.site.api_pages import FOLDER, find, find_undocumented, format_text, make_pages
 from docs.site.python_source import parse_docstring, read_class
 from snakesim_hal.backend import Backend
 
