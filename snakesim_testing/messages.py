@@ -29,6 +29,10 @@ VARYING = (  # parts of texts that differ from run to run
     (re.compile(r"/dev/pts/\d+"), "/dev/pts/N"),
     # What Python's parsers report differs from version to version.
     (re.compile(r"(not valid (?:TOML|JSON|XML): )(?!nested).*?(?=; give| \[[a-z]+/|$)"), r"\1..."),
+    (
+        re.compile(r"ValueError: source code string cannot contain null bytes"),
+        "SyntaxError: ...",
+    ),  # before Python 3.11.4
     (re.compile(r"(SyntaxError: ).*?(?= \[[a-z]+/|$)"), r"\1..."),
     (re.compile(r"\(choose from [^)]*\)"), "(choose from ...)"),
 )
