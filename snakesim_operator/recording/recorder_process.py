@@ -11,7 +11,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import count
@@ -19,14 +19,15 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.process import on_stop_signal
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import Link, Session
 from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import ProcessOptions, process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
@@ -150,7 +151,7 @@ def record_to_file(
 
     Raises:
         ConfigError: The file exists or cannot be created.
-        NotConnectedError: There is no network at the link.
+        NotConnectedError: There was no network at the link until the end. The file is closed, without messages.
     """
     shown_as = None
     if not raw_only:
@@ -159,7 +160,7 @@ def record_to_file(
         recorder = Recorder(path, shown_as, show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
-    with open_session(link, connect_timeout_s=SERVICE_START_LIMIT_S) as session:
+    with _connect(link, recorder, goes_on) as session:
         tap = Tap(session)
         hosts = _watch_hosts(session)
         session.declare_alive(RECORDER)
@@ -176,6 +177,34 @@ def record_to_file(
     if failure:
         print_stderr(f"recording ended: {failure}")
     return recorder
+
+
+@contextlib.contextmanager
+def _connect(link: Link, recorder: Recorder, goes_on: Callable[[], bool]) -> Iterator[Session]:
+    """Connect as soon as there is a network, and close the empty file if the recording ends before.
+
+    The run may have ended while this process started. Its network is then gone for good.
+    """
+    give_up_s = time.monotonic() + SERVICE_START_LIMIT_S
+    is_stopped = False
+
+    def keeps_waiting() -> bool:
+        nonlocal is_stopped
+        is_stopped = not goes_on()
+        return not is_stopped and time.monotonic() < give_up_s
+
+    with contextlib.ExitStack() as stack:
+        try:
+            session = stack.enter_context(open_session_when_ready(link, keeps_waiting))
+        except NotConnectedError as error:
+            recorder.close({})
+            if not is_stopped:
+                raise
+            raise NotConnectedError(
+                f"nothing listened on {link.endpoint} until the recording was ended: {recorder.path} has no messages",
+                code="network/nothing-listens",
+            ) from error
+        yield session
 
 
 def _watch_hosts(session: Session) -> set[str]:
