@@ -6,10 +6,7 @@ from contextlib import ExitStack, contextmanager
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Link, Session, open_session
 
-# The time for one attempt to connect, which a stop signal has to wait for. It doubles with each attempt: the first ones
-# let a process end soon, and a busy computer needs the last ones.
-FIRST_ATTEMPT_S = 0.5
-MAX_ATTEMPT_S = 2.0
+ATTEMPT_S = 2.0  # for one attempt to connect: `keeps_waiting` is called so often
 
 
 @contextmanager
@@ -28,14 +25,12 @@ def open_session_when_ready(link: Link, keeps_waiting: Callable[[], bool]) -> It
     Raises:
         NotConnectedError: `keeps_waiting` returned False.
     """
-    attempt_s = FIRST_ATTEMPT_S
     with ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(link, connect_timeout_s=attempt_s))
+                session = stack.enter_context(open_session(link, connect_timeout_s=ATTEMPT_S))
                 break
             except NotConnectedError:
                 if not keeps_waiting():
                     raise
-                attempt_s = min(2 * attempt_s, MAX_ATTEMPT_S)
         yield session
