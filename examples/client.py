@@ -43,9 +43,9 @@ def command(turn_rad=0.0):
 with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
     robot = newest(session.get("hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY))
     number = [joint["name"] for joint in robot["joints"]].index(JOINT)
-    present = session.liveliness().declare_token("alive/control")  # a run waits for it
     joints = session.declare_subscriber("sensor/joints", zenoh.handlers.RingChannel(1))
     clocks = session.declare_subscriber("hal/clock", zenoh.handlers.RingChannel(1))
+    present = session.liveliness().declare_token("alive/control")  # last: from the next tick on, a run waits for it
     start = (state := newest(joints))["angle_rad"]
     lease = ask("hal/lease", "LeaseRequest", action="acquire", holder="control")
     rights = {"lease_epoch": lease["epoch"], "layout": robot["layout"], "valid_for_ns": robot["lease_ns"]}

@@ -140,7 +140,7 @@ class Client:
     # --- ticks -----------------------------------------------------------------------------------------------
 
     def announce(self) -> None:
-        """Declare the service's liveliness token. A lockstep run waits for the service from now on."""
+        """Declare the service's liveliness token. A lockstep run waits for its answers from the next tick on."""
         self.session.declare_alive(self.service)
 
     def ticks(self, silence_s: float | None = None, *, pauses: bool = False) -> Iterator[Clock | None]:

@@ -274,7 +274,7 @@ class Supervisor:
         self._print_last_output()
 
     def _note_loss(self, part: Part) -> None:
-        """Note what the record lacks because a part that the run does not need did not end in order."""
+        """Note what is missing from the record because a part that the run does not need did not end in order."""
         if _was_starting(part.child):
             self.lost[part.name] = f"{part.name} had not started when the run ended"
             self._print_text(f"warning: {self.lost[part.name]}: there is nothing of it")
