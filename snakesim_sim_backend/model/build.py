@@ -81,6 +81,7 @@ def build(
     motors: bool = True,
     laws: LawsVersion | None = None,
     keeps_touches: bool = False,
+    measures_force: bool = False,
 ) -> SimModel:
     """Compile the model of a run.
 
@@ -92,12 +93,15 @@ def build(
         laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
         keeps_touches: whether the C version writes the forces between links and obstacles into MuJoCo's state, for
             programs that see only the state.
+        measures_force: whether the simulation has a contact sensor, which `Physics.measure_force` is for.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
     """
     laws = laws or choose_laws()
-    blueprint = make_blueprint(config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches)
+    blueprint = make_blueprint(
+        config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches, measures_force=measures_force
+    )
     model = _compile(blueprint.spec, config.robot.name)
     links = config.robot.chain.modules + 1
     first_link_body = model.body("link_0").id
@@ -118,7 +122,13 @@ def build(
 
 
 def make_blueprint(
-    config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion, keeps_touches: bool = False
+    config: RunConfig,
+    settings: SimSettings,
+    *,
+    motors: bool,
+    laws: LawsVersion,
+    keeps_touches: bool = False,
+    measures_force: bool = False,
 ) -> Blueprint:
     """Return the model of a run before it is compiled.
 
@@ -151,7 +161,8 @@ def make_blueprint(
     friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
     for geom in spec.geoms:
         geom.friction[0] = friction_of.get(geom.name, 0.0)
-    add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
+    yielding_bodies = [geom_name(item) for item in yielding]
+    add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)
     return Blueprint(spec, steps_per_tick, yielding, laws)
 
 
