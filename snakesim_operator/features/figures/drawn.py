@@ -18,9 +18,9 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.features.figures.from_above import draw_paths
 from snakesim_operator.features.figures.lines import STYLE, Floats, plot_over_time
 from snakesim_operator.features.figures.paper import draw_paper_figures
-from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
 from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.signals import UNITS, arrays, table, unit_of
 from snakesim_operator.results.time_axis import zero_s
 
 FORMATS = (".pdf", ".svg", ".png")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.playback.export import arrays
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.signals import arrays
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
