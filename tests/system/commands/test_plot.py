@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.playback.export import arrays
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.signals import arrays
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -55,11 +55,12 @@ def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Pa
 
 @pytest.mark.slow
 def test_every_signal_of_a_run_is_drawn(run: Path) -> None:
-    from snakesim_operator.features.figures.drawn import draw_signals
+    from snakesim_operator.features.figures.run_groups import make_single_groups
+    from snakesim_operator.features.figures.signal_axes import draw_signals
 
     record = RunRecord.load(run)
     signals = [name for name in arrays(record) if name != "time_s"]
-    axes = draw_signals(record, signals, 3.5, (0.0, 3.0)).axes
+    axes = draw_signals(make_single_groups([record]), signals, 3.5, (0.0, 3.0)).axes
     empty = [name for name, ax in zip(signals, axes, strict=True) if not ax.lines]
     assert empty == []
 
