@@ -41,7 +41,14 @@ class SimBackend(Backend):
 
     @classmethod
     def check(cls, config: RunConfig, settings: SimSettings) -> tuple[ClockMode, ...]:
-        """Check that this backend can run a scenario, and return the clock modes that it supports: all of them.
+        """Check that this backend can run a scenario, before anything is started.
+
+        Args:
+            config: configuration of the run.
+            settings: settings of this backend, which are not needed here.
+
+        Returns:
+            The clock modes that the simulator supports, which are all of them.
 
         Raises:
             ConfigError: a gain, a sensor or an injected fault of the run is not possible here.

@@ -52,7 +52,10 @@ def find_touches(model: mujoco.MjModel) -> slice:
 
 
 def place(config: RunConfig) -> PlacedRobot:
-    """Build the scene, place the robot and let it come to rest, as `SimBackend` does.
+    """Build the scene of a run, place the robot at its start pose, and let it come to rest, as `SimBackend` does.
+
+    Args:
+        config: configuration of the run, with the settings of the simulator.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene.

@@ -249,11 +249,14 @@ def _compare_pair(card: Card, controller: str, other: Card, other_controller: st
     p-values are not corrected for multiple comparisons yet.
 
     Args:
-        card: The card of the first controller.
-        controller: Its name.
-        other: The card of the second controller.
-        other_controller: Its name.
-        label: How the second controller is shown.
+        card: The score card with the first controller.
+        controller: Name of the first controller.
+        other: The score card with the second controller.
+        other_controller: Name of the second controller.
+        label: Name under which the second controller is shown.
+
+    Returns:
+        One comparison for each row, in the order of the first card.
     """
     other_outcomes: dict[str, bool] = {}  # configuration without its controller -> whether it reached the goal
     for crossing in other.crossings:

@@ -52,10 +52,10 @@ class ResultStore:
 
 @contextmanager
 def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
-    """Open a folder's results for this process alone.
+    """Open the results in an evaluation's folder, and lock them for this process alone.
 
     Args:
-        folder: of the evaluation; it is made if it is missing.
+        folder: folder of the evaluation; it is made if it is missing.
         resume: whether the folder may hold results already.
 
     Raises:
@@ -103,9 +103,17 @@ def _read_results(path: Path, handle: int) -> Results:
 
 
 def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Path]:
-    """Write the results in the order of the cases, as Parquet and CSV, and return the paths.
+    """Write the results in the order of the cases, as Parquet and as CSV.
 
     No value depends on the wall clock, so two evaluations of the same cases give the same files.
+
+    Args:
+        folder: folder of the evaluation.
+        cases: all cases; those without a result are left out.
+        done: outcome of each finished case by its id.
+
+    Returns:
+        The paths of the two files.
     """
     columns = _column_types()
     rows: list[dict[str, Number]] = []

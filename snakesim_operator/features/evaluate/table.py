@@ -224,7 +224,11 @@ def _advance_fraction(outcome: CaseOutcome) -> float:
 
 
 def _describe_end(outcome: CaseOutcome) -> str:
-    """Return how far a run came, what its controller reported last, and how it ended."""
+    """Describe the end of one run: its advance, the last state that its controller reported, and how it ended.
+
+    Args:
+        outcome: the numbers of the run's summary, or the error of a case that could not run.
+    """
     if outcome.error is not None:
         return outcome.error
     numbers = outcome.numbers
