@@ -21,7 +21,7 @@ from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SILENCE_S = 2.0  # without a clock: the host has stalled
 LOCKSTEP_SILENCE_S = 15.0  # longer than a host waits for another service by default: `stall_limit_s` is 10 s
-LEASE_TIMEOUT_S = 10.0  # to get the lease
+LEASE_TIMEOUT_S = 20.0  # to get the lease, after at most one wait of the host for another service
 READABLE_KEYS = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 
@@ -62,7 +62,7 @@ class CommandingClient:
         self.turn_until(
             self._is_lease_shown,
             LEASE_TIMEOUT_S,
-            lambda: f"no right to command {robot.robot}: {self._commander.refusal}",
+            lambda: f"no right to command {robot.robot}: {self._commander.refusal or 'the host has not answered'}",
         )
 
     def wait(self) -> Clock:
