@@ -12,12 +12,13 @@ JOINT, TURN_RAD = "joint_3", 0.1
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
 LINK = {"mode": "client", "connect": {"endpoints": [ENDPOINT]}, "namespace": ROBOT, "scouting": QUIET}
 FORM = "application/msgpack;snakesim.{}/1"
+SILENCE_S = 15  # longer than the 10 s for which lockstep waits for another service
 BLOCK = zenoh.CongestionControl.BLOCK  # lose no command, so that lockstep goes on
 
 
 def newest(arrivals, meanwhile=lambda: time.sleep(0.0005), known=None):
-    """The newest arrival; if there is none, `known`, or what arrives within a second."""
-    give_up = time.monotonic() + 1.0
+    """The newest arrival; if there is none, `known`, or what arrives within SILENCE_S."""
+    give_up = time.monotonic() + SILENCE_S
     while (arrival := arrivals.try_recv()) is None:
         if known is not None:
             return known
