@@ -2,7 +2,6 @@
 
 import math
 
-from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -21,13 +20,12 @@ def place_legends(figure: Figure, all_axes: list[Axes], entries: list[list[str]]
     added_in = 0.0
     for axes, names in zip(all_axes, entries, strict=True):
         if names:
-            row_count = _place_legend(axes, names)
-            added_in += row_count * LINE_HEIGHT * rcParams["legend.fontsize"] / POINTS_PER_INCH
+            added_in += _place_legend(axes, names)
     figure.set_figheight(figure.get_figheight() + added_in)
 
 
-def _place_legend(axes: Axes, names: list[str]) -> int:
-    """Place a legend above axes, in as many columns as fit into their width, and return the number of its rows."""
+def _place_legend(axes: Axes, names: list[str]) -> float:
+    """Place a legend above axes, in as many columns as fit into their width, and return its height in inches."""
     handles_by_name = {str(line.get_label()): line for line in reversed(axes.lines)}
     handles = [handles_by_name[name] for name in names]
     column_count = len(names)
@@ -37,7 +35,8 @@ def _place_legend(axes: Axes, names: list[str]) -> int:
         )
         fits = legend.get_window_extent().width <= axes.get_window_extent().width
         if fits or column_count == 1:
-            return math.ceil(len(names) / column_count)
+            row_count = math.ceil(len(names) / column_count)
+            return row_count * LINE_HEIGHT * legend.get_texts()[0].get_fontsize() / POINTS_PER_INCH
         column_count -= 1
 
 

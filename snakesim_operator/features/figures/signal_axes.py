@@ -218,7 +218,7 @@ def _check_known(name: str, signals: Sequence[Sequence[RunSignals]]) -> None:
     wide = ", ".join(array for array in arrays(first) if array != "time_s")
     known: Mapping[str, Any] = {**arrays(first), **runs[0].columns}
     raise ConfigError(
-        f"no signal {shorten(name)!r}, and no run of this name; {suggest_word(name, list(known))}there are {wide}, and "
+        f"no signal {shorten(name)!r}; {suggest_word(name, list(known))}there are {wide}, and "
         f"columns of them such as angle_rad.{first.description.joints[0].name}",
         code="recording/unknown-signal",
     )
