@@ -211,7 +211,7 @@ class Client:
         """Store a clock, in Zenoh's thread. Wakes the service only for its due ticks."""
         self._last_clock_s = arrival.monotonic_ns * 1e-9
         try:
-            clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+            clock = arrival.decode(self._clock_decoder)
         except WireError as error:
             self.session.rejected[error.reason] += 1
             return
