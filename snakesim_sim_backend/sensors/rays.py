@@ -41,7 +41,7 @@ class Rays:
         self._lengths = np.zeros(len(rays_s))
 
     def cast(self) -> Floats:
-        """Return the distance of the nearest surface along each ray, in lengths of the ray, (n,); inf without one."""
+        """Return the distance of the nearest surface along each ray, in lengths of the ray, (n,). Inf without one."""
         origin_w, world_from_sensor = self._mount.place()
         rays_w = self._rays_s @ world_from_sensor.T
         below_m = origin_w[2] - self._ground_z_m

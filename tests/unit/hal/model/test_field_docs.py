@@ -72,7 +72,7 @@ def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
     assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
     exceptions: Any = JointExceptions
     described = describe_fields(exceptions)
-    assert described["torque_nm"] == "Maximum torque of the joint; none: as in the section for all."
+    assert described["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."
     assert described["rated_nm"].count("none:") == 1
 
 
