@@ -73,7 +73,7 @@ def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
     exceptions: Any = JointExceptions
     described = describe_fields(exceptions)
     assert described["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."
-    assert described["rated_nm"].count("none:") == 1
+    assert described["rated_nm"].count("None:") == 1
 
 
 def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.MonkeyPatch) -> None:
