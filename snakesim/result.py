@@ -31,7 +31,7 @@ SPAN_S = (0.0, math.inf)
 class Result:
     """The signals and the summary of a run that is over.
 
-    Every signal has a row for each tick since the first arming; NaN is unknown. `result["angle_rad"]` is
+    Every signal has a row for each tick since the first arming. NaN is unknown. `result["angle_rad"]` is
     (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,), `result["link_force_l_n"]` is (ticks, links, 3).
     `signal_names` lists all signals.
     """
@@ -56,7 +56,7 @@ class Result:
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """The SI unit of each signal by its name; "1" for plain numbers."""
+        """The SI unit of each signal by its name. "1" for plain numbers."""
         return {name: unit_of(name, self.record) for name in self.signal_names}
 
     @property
@@ -71,7 +71,7 @@ class Result:
 
     @cached_property
     def metrics(self) -> dict[str, float | bool | None]:
-        """The numbers of the summary by name. Units are in the names; None is unknown."""
+        """The numbers of the summary by name. Units are in the names. None is unknown."""
         metrics: dict[str, float | bool | None] = {}
         for name, value in msgspec.structs.asdict(self.summary).items():
             if value is None or isinstance(value, bool | int | float):
@@ -140,7 +140,7 @@ class Result:
         """Return a chart of signals over time, which a notebook shows.
 
         Args:
-            *signals: Names of signals, one figure each; without names, angles and torques.
+            *signals: Names of signals, one figure each. Without names, angles and torques.
 
         Raises:
             ConfigError: There is no such signal.

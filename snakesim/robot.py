@@ -60,7 +60,7 @@ POLL_INTERVAL_S = 0.0005
 
 
 class Robot:
-    """A connection to one robot. The first command takes the lease; the end of a `with` disarms what it has armed.
+    """A connection to one robot. The first command takes the lease. The end of a `with` disarms what it has armed.
 
         with snakesim.Robot.connect() as robot:
             robot.arm()
@@ -73,7 +73,7 @@ class Robot:
     """
 
     def __init__(self, link: Link) -> None:
-        """Open a session to a robot whose link is known; `connect` finds the link.
+        """Open a session to a robot whose link is known. `connect` finds the link.
 
         Args:
             link: Endpoint, namespace and session file of the robot.
@@ -111,7 +111,7 @@ class Robot:
         Args:
             endpoint: Zenoh endpoint of the robot's HAL host, such as "tcp/127.0.0.1:7447". None finds the only robot
                 that runs on this computer.
-            name: Namespace of the robot; needed where there are several robots.
+            name: Namespace of the robot. Needed where there are several robots.
             session: Path of the Zenoh session file of a lab. The file names the endpoint.
 
         Returns:
@@ -184,7 +184,7 @@ class Robot:
 
     @property
     def time_s(self) -> float:
-        """Robot time of the current tick in s; before the first command, of the newest tick."""
+        """Robot time of the current tick in s. Before the first command, of the newest tick."""
         return self._clock.timestamp_ns * 1e-9
 
     def age_s(self, message: Any) -> float:
@@ -266,7 +266,7 @@ class Robot:
         """Take the lease and arm the robot. It holds its pose until the first command.
 
         Args:
-            unchecked: Also arm a robot whose joints were not checked as they are now; see docs/hardware/calibration.md.
+            unchecked: Also arm a robot whose joints were not checked as they are now. See docs/hardware/calibration.md.
 
         Raises:
             RefusedError: The robot is not ready within ARM_TIMEOUT_S, or refuses, or disarms at once.
@@ -287,7 +287,7 @@ class Robot:
         self._armed = True
 
     def disarm(self) -> None:
-        """Disarm the robot; its joints become passive.
+        """Disarm the robot. Its joints become passive.
 
         Raises:
             RefusedError: The robot refuses, or does not confirm.

@@ -40,12 +40,12 @@ def run(
     Args:
         scenario: Name of a shipped scenario, or path of a scenario file or of a run's config.json.
         controller: A shipped name, a path "./file.py:Class", a controller class, or a function
-            f(time_s, joints) -> angles_rad; None takes the scenario's controller.
-        duration: Robot time in s; None takes the scenario's duration.
-        seed: Seed of all random numbers; None takes the scenario's seed.
-        backend: Name of a backend; None takes the scenario's backend.
+            f(time_s, joints) -> angles_rad. None takes the scenario's controller.
+        duration: Robot time in s. None takes the scenario's duration.
+        seed: Seed of all random numbers. None takes the scenario's seed.
+        backend: Name of a backend. None takes the scenario's backend.
         set: Other values of the scenario by their dotted keys, as in `snakesim run --set`.
-        out: Folder for the files that `snakesim run` writes; None keeps none.
+        out: Folder for the files that `snakesim run` writes. None keeps none.
         processes: Whether HAL host and services run in processes of their own, in any clock mode. A backend that
             moves a real robot needs this.
 
@@ -53,7 +53,7 @@ def run(
         The result, also of a run that ended with a fault: `Result.status` is how it ended.
 
     Raises:
-        ConfigError: An argument is wrong; nothing was run.
+        ConfigError: An argument is wrong. Nothing was run.
         ControllerError: The controller raised an exception, or returned something that is not allowed.
         SnakesimError: The run could not begin.
     """

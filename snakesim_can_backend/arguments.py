@@ -74,7 +74,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
         "log",
         type=Path,
         metavar="LOG",
-        help="log of its bus: .log (candump; backends.can.log of a run), .asc, .blf",
+        help="log of its bus: .log (of candump, or backends.can.log of a run), .asc, .blf",
     )
 
 
@@ -96,7 +96,7 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FAULT",
-        help="inject a fault, as KIND:JOINT@START[-END] in seconds; may be repeated",
+        help="inject a fault, as KIND:JOINT@START[-END] in seconds (may be repeated)",
     )
     parser.add_argument(
         "--interactive", action="store_true", help="read `KIND joint_N` and `KIND joint_N off` from the terminal"
@@ -104,9 +104,9 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep"
     )
-    add_pose(parser, f"or none; default: {DEFAULT_POSE}", DEFAULT_POSE)
+    add_pose(parser, f"or none, default: {DEFAULT_POSE}", DEFAULT_POSE)
     add_duration(parser, "end after this many seconds")
-    add_seed(parser, "of noise and serial numbers; default: the scenario's")
+    add_seed(parser, "of noise and serial numbers, default: the scenario's")
     parser.add_argument("--stats", action="store_true", help="print the load of every bus once a second")
     parser.add_argument("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
     add_parent(parser)

@@ -74,7 +74,7 @@ COMMANDS: Commands = (
     *DRIVE_NOUNS,
     Command(
         name="drive scan can",
-        help="List every joint module that answers; sends only identify, and nothing where others use the bus.",
+        help="List every joint module that answers. Sends only identify, and nothing where others use the bus.",
         add=options.add_scan,
         run=_scan_modules,
         details="Exit code: 0 a module answers, 1 none does, 2 wrong input.",

@@ -45,7 +45,7 @@ from snakesim_hal.wire.messages import ClockMode, Description, Fault, JointState
 
 @dataclass(frozen=True)
 class SafeSetpoints:
-    """Setpoints of all joints that have passed the limiter; they hold until the next ones.
+    """Setpoints of all joints that have passed the limiter. They hold until the next ones.
 
     Only the limiter creates them, so the type checker proves that no backend gets setpoints that were not limited.
     Controllers return `snakesim_hal.wire.setpoints.RequestedSetpoints` instead.
@@ -63,7 +63,7 @@ class Samples:
 
     joints: JointState  # in every tick
     others: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
-    encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # `others`; filled in by the host
+    encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # `others`, filled in by the host
 
 
 class Backend(ABC):
@@ -72,8 +72,8 @@ class Backend(ABC):
     The members above the constructor belong to the class: they are used before a run, when no backend is open.
     """
 
-    Settings: ClassVar[type[msgspec.Struct]]  # the scenario's `[backends.<name>]` section; may be an empty Struct
-    supported_modes: ClassVar[Collection[DriveMode] | None] = None  # of every joint; None: those of the robot file
+    Settings: ClassVar[type[msgspec.Struct]]  # the scenario's `[backends.<name>]` section, may be an empty Struct
+    supported_modes: ClassVar[Collection[DriveMode] | None] = None  # of every joint (None: those of the robot file)
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
@@ -114,7 +114,7 @@ class Backend(ABC):
         return with_modes(robot, cls.supported_modes)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:
-        """Open the robot; no motor is switched on. May take seconds or minutes.
+        """Open the robot. No motor is switched on. May take seconds or minutes.
 
         Args:
             config: The run that `check` has accepted, in one of the clock modes that it returned.
@@ -150,14 +150,14 @@ class Backend(ABC):
 
     @abstractmethod
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """Hand setpoints to the motors; they hold until the next call.
+        """Hand setpoints to the motors. They hold until the next call.
 
         The setpoints are safe in every state, so a simulator needs no more. A robot whose drives have states of their
         own makes them follow `lifecycle`.
 
         Args:
             setpoints: Setpoints within every limit. Isolated joints are passive in them.
-            lifecycle: "armed": drives may be switched on. "fault": drives that follow continue, to brake; no other is
+            lifecycle: "armed": drives may be switched on. "fault": drives that follow continue, to brake. No other is
                 switched on. "disarmed" and "estop": all drives are off.
 
         Raises:
@@ -175,8 +175,8 @@ class Backend(ABC):
     def faults(self) -> list[Fault]:
         """Return the faults that were detected since the last call, each once until the operator's reset.
 
-        A fault with `reach="joint"` isolates its joint if the robot file allows that; one with `reach="none"` is only
-        noted; any other stops the robot. The default is a robot that detects none.
+        A fault with `reach="joint"` isolates its joint if the robot file allows that. One with `reach="none"` is only
+        noted. Any other stops the robot. The default is a robot that detects none.
         """
         return []
 
@@ -203,6 +203,6 @@ class Backend(ABC):
     def close(self) -> None:
         """Switch off all motors, and release all resources. May take seconds.
 
-        Called once by the host, also after an error; a second call does nothing. Afterwards no call moves anything:
+        Called once by the host, also after an error. A second call does nothing. Afterwards no call moves anything:
         each returns or raises BackendError.
         """

@@ -49,8 +49,8 @@ class Task:
 class SensorSamples:
     """Samples as the sensors published them, and the task. Only for controllers with `uses_sensors = True`."""
 
-    newest: Mapping[str, Message]  # newest sample of `sensor/pose` and `sensor/contacts`, by key; absent: none yet
-    late: Mapping[str, str]  # key -> why its newest sample is too old to be used; fresh ones are left out
+    newest: Mapping[str, Message]  # newest sample of `sensor/pose` and `sensor/contacts`, by key (absent: none yet)
+    late: Mapping[str, str]  # key -> why its newest sample is too old to be used, fresh ones are left out
     task: Task  # where the robot started, and its goal
 
 
@@ -59,19 +59,19 @@ class Observation:
     """The inputs of a controller at one tick. All times are times of the robot, not of the computer."""
 
     tick: int  # number of the control cycle
-    time_s: float  # since arming; it continues when new parameters replace the controller during an arm session
+    time_s: float  # since arming, it continues when new parameters replace the controller during an arm session
     period_s: float  # of the control cycle
-    joints: JointState  # angles, velocities and torques, tail to head; always fresh
-    world: World | None  # pose, contacts and obstacles; None: there is none yet, or it is too old
-    trajectory: Trajectory | None  # path and speed; None: there is none yet, or it is too old
+    joints: JointState  # angles, velocities and torques, tail to head, always fresh
+    world: World | None  # pose, contacts and obstacles (None: there is none yet, or it is too old)
+    trajectory: Trajectory | None  # path and speed (None: there is none yet, or it is too old)
     sensor_samples: SensorSamples | None = None  # None: the controller does not declare `uses_sensors`
 
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What a controller reports of itself. All fields are optional; `control/state` and the run's report show them."""
+    """What a controller reports of itself. All fields are optional. `control/state` and the run's report show them."""
 
-    reason: str = ""  # what prevents motion, such as a jam; empty: nothing does
+    reason: str = ""  # what prevents motion, such as a jam (empty: nothing does)
     reason_if_stationary: str = ""  # the cause to report if the body turns out not to move
     usable_push_points: int | None = None  # None: this controller does not push off obstacles
     path_s_m: float | None = None  # arc length of the tail end on the path
@@ -152,7 +152,7 @@ class Controller(ABC, Generic[ParametersT]):
 
     On the command line, `--set control.PARAMETER=VALUE` sets one of them.
 
-    Each field needs a type; a default, bounds and a unit are recommended. `snakesim param` changes the values while the
+    Each field needs a type. A default, bounds and a unit are recommended. `snakesim param` changes the values while the
     controller runs. Derive it from `snakesim.Parameters`, which refuses unknown names.
     """
 
@@ -187,10 +187,10 @@ class Controller(ABC, Generic[ParametersT]):
 
         Args:
             robot: description of the robot.
-            parameters: the parameters as configured; their types and bounds are checked already.
+            parameters: the parameters as configured. Their types and bounds are checked already.
 
         Raises:
-            ConfigError: they do not agree; the text names the parameter, its value and what is allowed.
+            ConfigError: They do not agree. The text names the parameter, its value and what is allowed.
         """
 
     def __init__(self, robot: Description, parameters: ParametersT) -> None:
@@ -200,7 +200,7 @@ class Controller(ABC, Generic[ParametersT]):
         effects: control also constructs an object to test a change of parameters, and drops it again.
 
         Args:
-            robot: description of the robot; its joints are in the order tail to head.
+            robot: description of the robot. Its joints are in the order tail to head.
             parameters: an object of `Parameters`.
 
         Raises:
@@ -219,7 +219,7 @@ class Controller(ABC, Generic[ParametersT]):
         are too old, `update` is not called at all, and the robot is stopped when the command lease expires.
 
         It must return within `observation.period_s` in real time. The setpoints are limited after it, by the command
-        limiter of the HAL. An exception, or a command that cannot be sent, ends the run; the error names the class, the
+        limiter of the HAL. An exception, or a command that cannot be sent, ends the run. The error names the class, the
         field and the value.
 
         Args:

@@ -39,7 +39,7 @@ class Service(ABC):
 
     name: ClassVar[str] = ""  # of its section in a scenario, and the first part of the keys that it writes
     urgent: ClassVar[bool] = False  # True: the robot waits for this service in every tick, so it gets a high priority
-    too_slow: str = ""  # evidence that it is too slow for real time; empty: none
+    too_slow: str = ""  # evidence that it is too slow for real time (empty: none)
 
     def __init__(self, client: Client, config: RunConfig) -> None:
         """Subscribe to everything that the service will read. Called before the robot is known.
@@ -69,7 +69,7 @@ class Service(ABC):
             clock: The tick, with the robot's time and lifecycle.
 
         Returns:
-            Pairs of key and message; None while the service has no output yet, so that the robot is not armed.
+            Pairs of key and message. None while the service has no output yet, so that the robot is not armed.
         """
 
     def silence(self) -> list[tuple[str, Message]]:

@@ -41,7 +41,7 @@ COMMANDS: Commands = (
     *DRIVE_NOUNS,
     Command(
         name="drive scan dynamixel",
-        help="List every Dynamixel that answers; reads only, and moves nothing.",
+        help="List every Dynamixel that answers. Reads only, and moves nothing.",
         add=_add_scan,
         run=_scan,
         details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",

@@ -25,17 +25,17 @@ class Tether(FileStruct, frozen=True, kw_only=True):
     """Direction of the pull in the world frame, as [x, y] of any length but 0."""
 
     reel_in_m_s: Annotated[float, from_zero(10, "m/s")] = 0.0
-    """Speed at which a winch tows the snake; 0: the rope only holds it."""
+    """Speed at which a winch tows the snake. 0: the rope only holds it."""
 
 
 class SimSettings(FileStruct, frozen=True, kw_only=True):
     """Parameters of the physics. The defaults suit robots of centimeters to decimeters and of a few kilograms."""
 
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.002
-    """Longest physics step; it is shortened so that a control period is a multiple of it."""
+    """Longest physics step. It is shortened so that a control period is a multiple of it."""
 
     contact_time_s: Annotated[float, bounded(1e-4, 0.1, "s")] = 0.005
-    """Time constant with which a penetration is pushed out, at least two physics steps; longer: softer contacts, which
+    """Time constant with which a penetration is pushed out, at least two physics steps. Longer: softer contacts, which
     tolerate long steps.
     """
 
@@ -58,14 +58,14 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     """
 
     tether: Tether | None = None
-    """Rope to an anchor; none: there is no rope."""
+    """Rope to an anchor. None: there is no rope."""
 
 
 class PhysicsModelSettings(SimSettings, frozen=True, kw_only=True):
     """The same for the physics under emulated joint modules, whose firmware sets the clock mode: one step at a time."""
 
     timestep_s: Annotated[float, bounded(1e-5, 0.01, "s")] = 0.001
-    """Longest physics step; it is shortened so that a control period is a multiple of it."""
+    """Longest physics step. It is shortened so that a control period is a multiple of it."""
 
     def __post_init__(self) -> None:
         """Reject a gain scale: the motors belong to the firmware."""

@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="the picture, a PNG")
     parser.add_argument("--at", type=float, default=0.0, metavar="S", help="seconds into the recording")
     parser.add_argument("--after", type=float, default=8.0, metavar="S", help="seconds after the page was there")
-    parser.add_argument("--click", action="append", default=[], metavar="LABEL", help="in this order; may be repeated")
+    parser.add_argument("--click", action="append", default=[], metavar="LABEL", help="in this order (may be repeated)")
     parser.add_argument("--signals", default="", metavar="NAMES", help="in the tab Signals: plots are parted by ;")
     parser.add_argument("--commission", metavar="FILE", help="of a host: RUN is what follows `snakesim start host`")
     parser.add_argument("--scroll", type=int, default=0, metavar="DOTS", help="the panel, at last")

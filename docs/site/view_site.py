@@ -3,9 +3,10 @@
     make docs
     python -m docs.site.view_site                     # every page: light at 1400 pixels, and dark at 400
     python -m docs.site.view_site --every             # both schemes at both widths
+    python -m docs.site.view_site --whole             # each page down to its end, not only its top
     python -m docs.site.view_site docs/tutorials      # only pages below this folder
 
-It writes sheets of nine pages each to build/view and prints one line a problem. It ends with 1 if there is a problem.
+It writes sheets of nine tiles each to build/view and prints one line a problem. It ends with 1 if there is a problem.
 """
 
 import argparse
@@ -27,10 +28,11 @@ ROOT = Path(__file__).resolve().parents[2]
 SITE = ROOT / "build" / "docs"
 COPY = ROOT / "build" / "viewed"  # so that a build meanwhile changes nothing
 SHEETS = ROOT / "build" / "view"
-WIDTHS_PX = {1400: 1000, 400: 1800}  # width: how much of the page's height a sheet shows
+WIDTHS_PX = {1400: 1000, 400: 1800}  # width: how much of the page's height one tile shows
+MAX_TILES = 6  # of one page
 USUAL_VIEWS = ((1400, "light"), (400, "dark"))
 EVERY_VIEW = ((1400, "light"), (1400, "dark"), (400, "light"), (400, "dark"))
-PAGES_PER_SHEET = 9
+TILES_PER_SHEET = 9
 COLUMNS = {1400: 3, 400: 9}
 TILE_PX = {1400: 700, 400: 280}  # width of a page on a sheet
 MIN_CONTRAST = 3.0  # WCAG for large text; the theme's small gray text is near 4
@@ -86,6 +88,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("under", nargs="*", default=[""], help="only pages whose path begins like this")
     parser.add_argument("--every", action="store_true", help="both color schemes at both widths")
+    parser.add_argument("--whole", action="store_true", help="continue a long page in further tiles of its sheet")
     arguments = parser.parse_args()
     shutil.rmtree(COPY, ignore_errors=True)
     shutil.copytree(SITE, COPY)
@@ -106,12 +109,15 @@ def check(pages: list[Path], arguments: argparse.Namespace) -> Iterator[str]:
     for page in pages:
         yield from (f"{page}: {problem}" for problem in find_broken_links(page))
     views = EVERY_VIEW if arguments.every else USUAL_VIEWS
-    with chromium() as browser:
+    sheets = {each: Sheets(*each) for each in views}
+    with chromium(with_webgl=False) as browser:
         tab = browser.open("about:blank")
         tab.send("Network.enable")
         tab.send("Network.setBlockedURLs", urls=["*search_index.js*"])  # large, and not needed here
-        for first in range(0, len(pages), PAGES_PER_SHEET):
-            yield from view(tab, pages[first : first + PAGES_PER_SHEET], views, f"{first // PAGES_PER_SHEET:02}")
+        for page in pages:
+            yield from view(tab, page, sheets, max_tiles=MAX_TILES if arguments.whole else 1)
+    for each in sheets.values():
+        each.save()
 
 
 def list_pages() -> list[Path]:
@@ -135,25 +141,26 @@ def find_broken_links(page: Path) -> Iterator[str]:
                 yield f"broken anchor: {link}"
 
 
-def view(tab: Tab, pages: list[Path], views: tuple[tuple[int, str], ...], number: str) -> Iterator[str]:
-    """Yield the problems of some pages in every view, and write their contact sheets."""
-    tiles: dict[tuple[int, str], list[tuple[Path, bytes]]] = {each: [] for each in views}
-    for page in pages:
-        open_page(tab, page)
-        for width, scheme in views:
-            show(tab, width, scheme)
-            for problem in json.loads(tab.value(CHECK) or "[]"):
-                yield f"{page} ({width}, {scheme}): {problem}"
-            tiles[width, scheme].append((page, tab.picture()))
-        yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
-        tab.errors.clear()
-    for (width, scheme), pictures in tiles.items():
-        make_sheet(pictures, width).save(SHEETS / f"{width}-{scheme}-{number}.png")
+def view(tab: Tab, page: Path, sheets: dict[tuple[int, str], "Sheets"], max_tiles: int) -> Iterator[str]:
+    """Yield the problems of a page in every view, and put its pictures on the sheets."""
+    open_page(tab, page)
+    for (width, scheme), sheet in sheets.items():
+        show(tab, width, scheme)
+        for problem in json.loads(tab.value(CHECK) or "[]"):
+            yield f"{page} ({width}, {scheme}): {problem}"
+        tiles = 1
+        if max_tiles > 1:
+            page_height = int(tab.value("document.documentElement.scrollHeight"))
+            tiles = min(-(-page_height // WIDTHS_PX[width]), max_tiles)
+            show(tab, width, scheme, tiles)
+        sheet.add(page, tab.picture(), tiles)
+    yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
+    tab.errors.clear()
 
 
-def show(tab: Tab, width: int, scheme: str) -> None:
-    """Give the window a width, and the page a color scheme."""
-    tab.size(width, WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
+def show(tab: Tab, width: int, scheme: str, tiles: int = 1) -> None:
+    """Give the window a width and the height of some tiles, and the page a color scheme."""
+    tab.size(width, tiles * WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
     attribute = json.dumps("slate" if scheme == "dark" else "default")
     tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")  # as the theme's own button does
     time.sleep(0.2)  # until it is laid out
@@ -172,21 +179,44 @@ def open_page(tab: Tab, page: Path) -> None:
     time.sleep(0.15)  # the theme wraps tables and colors code
 
 
-def make_sheet(tiles: list[tuple[Path, bytes]], width: int) -> Image.Image:
-    """Return pictures side by side, each under its page's path."""
-    tile_width = TILE_PX[width]
-    tile_height = WIDTHS_PX[width] * tile_width // width
-    columns = COLUMNS[width]
-    rows = PAGES_PER_SHEET // columns
-    sheet = Image.new("RGB", (columns * (tile_width + 8), rows * (tile_height + 24)), "gray")
-    draw = ImageDraw.Draw(sheet)
-    for number, (page, picture) in enumerate(tiles):
-        left = number % columns * (tile_width + 8)
-        top = number // columns * (tile_height + 24)
-        draw.text((left + 4, top + 4), str(page), fill="white", font_size=14)
+class Sheets:
+    """The contact sheets of one view: tiles side by side, each under its page's path."""
+
+    def __init__(self, width: int, scheme: str) -> None:
+        self._width = width
+        self._name = f"{width}-{scheme}"
+        self._tile_width = TILE_PX[width]
+        self._tile_height = WIDTHS_PX[width] * self._tile_width // width
+        self._tiles: list[tuple[str, Image.Image]] = []
+        self._saved = 0
+
+    def add(self, page: Path, picture: bytes, tiles: int) -> None:
+        """Add a picture of a page as some tiles, from its top to its end."""
         with Image.open(io.BytesIO(picture)) as opened:
-            sheet.paste(opened.convert("RGB").crop((0, 0, tile_width, tile_height)), (left, top + 24))
-    return sheet
+            whole = opened.convert("RGB")
+        for number in range(tiles):
+            top = number * self._tile_height
+            title = str(page) if number == 0 else f"{page.stem}, part {number + 1}"
+            self._tiles.append((title, whole.crop((0, top, self._tile_width, top + self._tile_height))))
+            if len(self._tiles) == TILES_PER_SHEET:
+                self.save()
+
+    def save(self) -> None:
+        """Write the tiles added since the last sheet, if there are any."""
+        if not self._tiles:
+            return
+        columns = COLUMNS[self._width]
+        rows = TILES_PER_SHEET // columns
+        sheet = Image.new("RGB", (columns * (self._tile_width + 8), rows * (self._tile_height + 24)), "gray")
+        draw = ImageDraw.Draw(sheet)
+        for number, (title, tile) in enumerate(self._tiles):
+            left = number % columns * (self._tile_width + 8)
+            top = number // columns * (self._tile_height + 24)
+            draw.text((left + 4, top + 4), title, fill="white", font_size=14)
+            sheet.paste(tile, (left, top + 24))
+        sheet.save(SHEETS / f"{self._name}-{self._saved:03}.png")
+        self._tiles.clear()
+        self._saved += 1
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ STEPPED = np.ones(1, dtype=np.bool_)
 
 
 class SnakeEnv(gymnasium.Env[Any, Any]):
-    """A Gymnasium environment with one robot in one scenario; see `docs/how-to/environments.md`.
+    """A Gymnasium environment with one robot in one scenario. See `docs/how-to/environments.md`.
 
     It has the code of `SnakeVectorEnv`, with one environment.
 
@@ -53,11 +53,11 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             scenario: Shipped name of a scenario, or path of a scenario file.
             action: What an action is: "position" (rad), "velocity" (rad/s) or "torque" (N·m) of each joint, or
                 "residual:CONTROLLER" for corrections in rad to the position targets of that controller.
-            observe: Parts of the observation by name; None takes the default parts.
+            observe: Parts of the observation by name. None takes the default parts.
             flat: Whether an observation is one vector of all parts, rather than a dict of vectors.
             reward: Weights of reward terms that differ from the defaults in `rewards.TERMS`.
             frame_skip: Ticks of the robot in one step.
-            duration: Robot time in s until an episode is truncated; None takes the scenario's duration.
+            duration: Robot time in s until an episode is truncated. None takes the scenario's duration.
             set: Values by their dotted keys, as in `snakesim.run`.
             randomize: Dotted keys with two bounds each. Every seed has its own number between them.
             new_field: Whether each reset draws the scene's random fields again.
@@ -92,7 +92,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
     @property
     def config(self) -> RunConfig:
-        """The configuration of this episode; `snakesim run` takes it, written to a file."""
+        """The configuration of this episode. `snakesim run` takes it, written to a file."""
         return self._episodes.configs[ONLY]
 
     @property
@@ -107,14 +107,14 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         """Start an episode: make the robot in its scene, and arm it.
 
         Args:
-            seed: Seed of sensor noise and of random fields; None draws one from the environment's own generator.
+            seed: Seed of sensor noise and of random fields. None draws one from the environment's own generator.
             options: Not used.
 
         Returns:
             The first observation, and an info dict with `seed`, `time_s`, `advance_m` and `lifecycle`.
 
         Raises:
-            ConfigError: The obstacles of this seed's random field find no place; with `seed=None`, those of
+            ConfigError: The obstacles of this seed's random field find no place. With `seed=None`, those of
                 MAX_FIELD_ATTEMPTS fields.
         """
         super().reset(seed=seed)

@@ -97,11 +97,11 @@ class Episodes:
 
         Args:
             environment: its row.
-            seed: seed of sensor noise and of random fields; None draws one.
+            seed: seed of sensor noise and of random fields. None draws one.
             random: draws seeds.
 
         Raises:
-            ConfigError: The obstacles of this seed's random field find no place; with `seed=None`, those of
+            ConfigError: The obstacles of this seed's random field find no place. With `seed=None`, those of
                 MAX_FIELD_ATTEMPTS fields.
         """
         self.close(environment)

@@ -41,7 +41,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             num_envs: Number of environments.
-            threads: Number of threads that step the physics; None takes one for each processor that this process may
+            threads: Number of threads that step the physics. None takes one for each processor that this process may
                 use. The results do not depend on it.
             autoreset_mode: When an environment whose episode is over is reset: in the next step, in the same step, or
                 ("Disabled") only by `reset` with the option `reset_mask`.
@@ -98,8 +98,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         """Reset all environments, or some of them.
 
         Args:
-            seed: Seed of the first environment, the next ones count up; or one seed for each environment.
-            options: `reset_mask`: (num_envs,), the environments that are reset; without it all are. Nothing else is
+            seed: Seed of the first environment, the next ones count up. Or one seed for each environment.
+            options: `reset_mask`: (num_envs,), the environments that are reset. Without it all are. Nothing else is
                 read.
 
         Returns:
@@ -126,10 +126,10 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             actions: (num_envs, joints) actions, a row for each environment.
 
         Returns:
-            Stacked observations; rewards, terminated and truncated, each (num_envs,); and merged info dicts.
+            Stacked observations. Rewards, terminated and truncated, each (num_envs,). And merged info dicts.
 
         Raises:
-            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example; or
+            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example. Or
                 an episode is over, and the autoreset mode is "Disabled".
             ValueError: The number of rows is wrong, or a row is no action. No environment has taken a step then.
         """
@@ -164,7 +164,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         )
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return a picture of each environment; None without a `render_mode`.
+        """Return a picture of each environment. None without a `render_mode`.
 
         Raises:
             gymnasium.error.ResetNeeded: There are no robots before the first `reset`, nor after `close`.

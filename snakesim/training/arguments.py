@@ -27,7 +27,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     _add_number(parser, "--population", 4, 12, "policies in a generation")
     add_fields(parser, "for each policy, anew in each generation (default: 4)", 4)
     _add_number(parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked")
-    add_seed(parser, "of the search; default: 1", 1)
+    add_seed(parser, "of the search (default: 1)", 1)
     parser.add_argument(
         "--init", dest="begin", metavar="POLICY", help="begin at its numbers: a shipped policy, or policy.onnx"
     )
@@ -40,7 +40,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     )
     add_duration(parser, "seconds of an episode (default: the scenario's)", number_type(0.1, 3600.0, "s"))
     parser.add_argument(
-        "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002; may be repeated"
+        "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002 (may be repeated)"
     )
     add_set(parser)
     parser.add_argument(
@@ -48,7 +48,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=LOW:HIGH",
-        help="a number for each field; may be repeated",
+        help="a number for each field (may be repeated)",
     )
     add_workers(parser)
     add_out(parser, "folder of what comes of it", required=True)
@@ -129,11 +129,11 @@ COMMANDS: Commands = (
     Noun(name="policy", heading="runs and studies", help="Train policies, and show what a policy file describes."),
     Command(
         name="policy train",
-        help="Search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE.",
+        help="Search a policy for a scenario on random fields. An ONNX file for --controller policy:FILE.",
         add=_add_train,
         run=_train,
         details="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers "
-        "give the same policy for any --workers. Exit code: 0; 2 wrong input; 130 stopped by Ctrl-C; continue with "
+        "give the same policy for any --workers. Exit code: 0, 2 wrong input, 130 stopped by Ctrl-C. Continue with "
         "--resume.",
         examples=(
             "policy train surveyed_clutter --out runs/policy",

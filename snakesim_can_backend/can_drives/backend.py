@@ -28,7 +28,7 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
     """Settings that every driver type on CAN has."""
 
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
-    """CAN buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can; empty: emulated drives in this
+    """CAN buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: emulated drives in this
     process.
     """
 
@@ -36,7 +36,7 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
     """Bit rate of the buses, for which loads are computed and to which adapters are set."""
 
     log: str = ""
-    """Candump file of all frames; empty: no file is written."""
+    """Candump file of all frames. Empty: no file is written."""
 
     @property
     def fd_rate(self) -> int | None:

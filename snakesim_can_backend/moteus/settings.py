@@ -14,12 +14,12 @@ class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
     """Bit rate of the data of a CAN FD frame."""
 
     kp_nm_per_turn: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "N·m/turn"})] | None = None
-    """Gain `servo.pid_position.kp` of all controllers, as fractions of which the robot file's gains are sent; none:
+    """Gain `servo.pid_position.kp` of all controllers, as fractions of which the robot file's gains are sent. None:
     emulated controllers have the gain that the robot file needs.
     """
 
     kd_nm_s_per_turn: Annotated[float, Meta(gt=0, le=1e4, extra_json_schema={"unit": "N·m·s/turn"})] | None = None
-    """Gain `servo.pid_position.kd` of all controllers, as fractions of which the robot file's gains are sent; none:
+    """Gain `servo.pid_position.kd` of all controllers, as fractions of which the robot file's gains are sent. None:
     emulated controllers have the gain that the robot file needs.
     """
 

@@ -17,13 +17,13 @@ class MountedAxis(Mounted, frozen=True, kw_only=True):
     """How an emulated axis is mounted and configured, where that is not what the robot file needs."""
 
     current_soft_max_a: Amperes | None = None
-    """Current limit that the emulated axis is configured with; none: what the robot file needs."""
+    """Current limit that the emulated axis is configured with. None: what the robot file needs."""
 
     watchdog_timeout_s: Seconds | None = None
-    """Time of the axis's watchdog; 0: it is off; none: `watchdog_s` of the backend."""
+    """Time of the axis's watchdog. 0: it is off. None: `watchdog_s` of the backend."""
 
     vel_limit_turns_s: TurnsPerSecond | None = None
-    """Speed limit that the emulated axis is configured with; none: what the robot file needs."""
+    """Speed limit that the emulated axis is configured with. None: what the robot file needs."""
 
 
 class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
@@ -32,11 +32,11 @@ class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
     endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
     """Files flat_endpoints.json, which ODrive publishes with each firmware: one for each firmware on the bus.
 
-    With them the driver reads watchdog, current and speed limits of every axis at the start; empty: they are unknown.
+    With them the driver reads watchdog, current and speed limits of every axis at the start. Empty: they are unknown.
     """
 
     max_current_a: Amperes | None = None
-    """Current limit above which the driver never sets an axis; none: what each axis is configured for, or 1 A where
+    """Current limit above which the driver never sets an axis. None: what each axis is configured for, or 1 A where
     that is unknown.
     """
 

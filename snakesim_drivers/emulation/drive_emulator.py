@@ -63,7 +63,7 @@ class DriveEmulator(ABC, Generic[BusEndT]):
 
         Args:
             body: The body that these drives move.
-            bus_ends: The drives' end of every drive's bus; drives of one bus have the same object. `close` closes them.
+            bus_ends: The drives' end of every drive's bus. Drives of one bus have the same object. `close` closes them.
             clock_ns: A steady time, with any origin.
         """
         self.body = body

@@ -144,7 +144,7 @@ class EmulatedBody:
         return self._joint_indices[i] in self._shared.duplicated
 
     def start_boot(self, i: int) -> None:
-        """Let a drive restart; until it has, it neither receives nor sends."""
+        """Let a drive restart. Until it has, it neither receives nor sends."""
         self._shared.boots_until_us[self._joint_indices[i]] = self.now_us + BOOT_US
 
     def inject(self, injection: Injection, *, begins: bool) -> int | None:
@@ -155,7 +155,7 @@ class EmulatedBody:
             begins: True to begin it, False to end it.
 
         Returns:
-            The index of the drive if it restarts now; otherwise None.
+            The index of the drive if it restarts now. Otherwise None.
 
         Raises:
             ConfigError: There is no such fault, or no such joint.

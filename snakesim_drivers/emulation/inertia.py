@@ -29,7 +29,7 @@ class InertiaSettings(FileStruct, frozen=True, kw_only=True):
     """Time step, and friction of gears and ground."""
 
     timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
-    """Longest time step; it is shortened so that a control period is a multiple of it."""
+    """Longest time step. It is shortened so that a control period is a multiple of it."""
 
     drag_nm: Annotated[float, from_zero(100, "N·m")] = 0.1
     """Dry friction of every joint, in addition to the robot file's, so that a released joint comes to rest."""

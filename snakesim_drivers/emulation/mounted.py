@@ -37,31 +37,31 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """
 
     sign: Sign | None = None
-    """1 or -1, whether the emulated drive rotates with or against the joint; none: as in the robot file."""
+    """1 or -1, whether the emulated drive rotates with or against the joint. None: as in the robot file."""
 
     zero_rad: Zero | None = None
-    """Angle that the emulated drive measures at the joint's zero; none: as in the robot file."""
+    """Angle that the emulated drive measures at the joint's zero. None: as in the robot file."""
 
     gear: Gear | None = None
-    """Revolutions of the drive's shaft for each revolution of the joint; none: as in the robot file."""
+    """Revolutions of the drive's shaft for each revolution of the joint. None: as in the robot file."""
 
     friction_nm: Friction | None = None
-    """Coulomb friction of motor and gear; none: as in the robot file."""
+    """Coulomb friction of motor and gear. None: as in the robot file."""
 
     viscous_nm_s_per_rad: Viscosity | None = None
-    """Viscous friction of motor and gear; none: as in the robot file."""
+    """Viscous friction of motor and gear. None: as in the robot file."""
 
     armature_kg_m2: RotorInertia | None = None
-    """Inertia of the rotor, as seen at the joint; none: as in the robot file."""
+    """Inertia of the rotor, as seen at the joint. None: as in the robot file."""
 
     response_time_s: Lag | None = None
-    """Time constant with which the torque follows its command; none: as in the robot file."""
+    """Time constant with which the torque follows its command. None: as in the robot file."""
 
     torque_constant_nm_per_a: TorqueConstant | None = None
-    """Torque for each ampere at the drive's shaft; none: as in the robot file."""
+    """Torque for each ampere at the drive's shaft. None: as in the robot file."""
 
     backlash_rad: Backlash | None = None
-    """Whole backlash of the gear, between the encoder on the motor and the link; none: no backlash."""
+    """Whole backlash of the gear, between the encoder on the motor and the link. None: no backlash."""
 
 
 def build_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:

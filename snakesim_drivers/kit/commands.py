@@ -7,7 +7,7 @@ from snakesim_hal.programs.commands import Commands, Noun
 
 DRIVE_NOUNS: Commands = (
     Noun(name="drive", heading="robot", help="Scan, emulate and examine the drives of a robot, by driver type."),
-    Noun(name="drive scan", help="List the drives that answer on a bus; it moves nothing."),
+    Noun(name="drive scan", help="List the drives that answer on a bus. It moves nothing."),
     Noun(name="drive emulate", help="Emulate the drives of a robot, as a process on a bus."),
     Noun(name="drive load", help="Print how much of a bus the drives of a scenario use."),
     Noun(name="drive replay", help="Read the log of a bus as the driver does."),
@@ -16,7 +16,7 @@ DRIVE_NOUNS: Commands = (
 
 def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
     """Add `--channel`, the bus of emulated drives. about: for the help."""
-    parser.add_argument("--channel", action="append", metavar="CHANNEL", help=f"{about}; may be repeated")
+    parser.add_argument("--channel", action="append", metavar="CHANNEL", help=f"{about} (may be repeated)")
 
 
 def add_channels(parser: argparse.ArgumentParser, about: str) -> None:

@@ -26,7 +26,7 @@ class BodySettings(FileStruct, frozen=True, kw_only=True):
     """Settings that concern a robot as a whole, whatever its drives."""
 
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None
-    """UDP address HOST:PORT at which the pose from motion capture arrives; none: there is no motion capture."""
+    """UDP address HOST:PORT at which the pose from motion capture arrives. None: there is no motion capture."""
 
     physics_model: str = "mujoco"
     """Body that emulated drives move: `mujoco`, `inertia`, or another installed physics model."""
@@ -39,7 +39,7 @@ class BodySettings(FileStruct, frozen=True, kw_only=True):
 
 
 class DriveSettings(BodySettings, frozen=True, kw_only=True):
-    """Settings that every driver type has; a driver type adds its ports."""
+    """Settings that every driver type has. A driver type adds its ports."""
 
     watchdog_s: Annotated[float, Meta(ge=0.02, le=1, extra_json_schema={"unit": "s"})] = 0.1
     """Time without a setpoint after which a drive stops by itself."""

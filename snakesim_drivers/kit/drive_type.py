@@ -55,7 +55,7 @@ class DriverTypeContext:
     settings: Any  # an instance of the driver type's own `Settings`
     joints: Mapping[int, Joint]  # those that it drives, by their indices in the robot
     clock: DriverClock  # the time of the robot
-    body: EmulatedBody | None  # moved by these joints' drives if they are emulated here; None: they are on a bus
+    body: EmulatedBody | None  # moved by these joints' drives if they are emulated here (None: they are on a bus)
 
 
 class BusesBackend(DriveBackend):
@@ -151,7 +151,7 @@ class BusesBackend(DriveBackend):
 class DriverTypeBackend(BusesBackend):
     """A driver type, and the backend on its drives, real or emulated.
 
-    Derive from it; see docs/hardware/write-a-driver.md.
+    Derive from it. See docs/hardware/write-a-driver.md.
 
     A driver type sets `name`, `Settings`, a subclass of `DriveSettings`, and perhaps `supported_modes`, and implements
     the four abstract class methods. The host's thread calls all of them, before the backend is opened or while it is.
@@ -161,12 +161,12 @@ class DriverTypeBackend(BusesBackend):
     @classmethod
     @abstractmethod
     def list_ports(cls, settings: Any) -> Sequence[str]:
-        """Return the names of the buses in the settings; empty: the drives are emulated in this process."""
+        """Return the names of the buses in the settings. Empty: the drives are emulated in this process."""
 
     @classmethod
     @abstractmethod
     def list_bus_faults(cls, settings: Any) -> Collection[str]:
-        """Return the kinds of faults that `Drives.inject` can inject into the buses; empty: none."""
+        """Return the kinds of faults that `Drives.inject` can inject into the buses. Empty: none."""
 
     @classmethod
     @abstractmethod
@@ -185,7 +185,7 @@ class DriverTypeBackend(BusesBackend):
     @classmethod
     @abstractmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-        """Return the buses that have some of the joints; `BusSpec.open` opens each of them later.
+        """Return the buses that have some of the joints. `BusSpec.open` opens each of them later.
 
         `group_by_port` makes them for drives on named ports.
         """

@@ -15,7 +15,7 @@ Threads
 
 Time
     `bring_up` may take `bring_up_limit_s` of the settings, 10 s by default, and `close` 2 s for all buses together. All
-    other calls of a cycle together may take one control period times the `decimation` of the bus; `read` should wait
+    other calls of a cycle together may take one control period times the `decimation` of the bus. `read` should wait
     at most `drive_settings.answer_limit_s` for answers, half of that time. A bus that is slower delays neither the host
     nor other buses: its joint states become older, and after one lease they are invalid.
 
@@ -25,7 +25,7 @@ Errors
 
 All drives are numbered by their place on this bus, from tail to head. All values are those at the shafts of the drives,
 in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure is stored in the
-`DriveReadings` that the driver type gets when the bus is opened; a value that is not finite counts as not measured.
+`DriveReadings` that the driver type gets when the bus is opened. A value that is not finite counts as not measured.
 """
 
 from abc import ABC, abstractmethod
@@ -40,18 +40,18 @@ from snakesim_hal.wire.messages import Mode
 class BusCommand(NamedTuple):
     """What all drives of a bus are to do until the next command."""
 
-    following: frozenset[int]  # the drives that get setpoints; all others are switched off
+    following: frozenset[int]  # the drives that get setpoints, all others are switched off
     modes: list[Mode]  # of every drive
-    targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive; 0 for passive drives
+    targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive, 0 for passive drives
     limits_nm: Floats  # (n_drives,) torque limits, not negative
-    may_enable: bool  # True: the robot is armed; False: a drive that is off stays off
+    may_enable: bool  # True: the robot is armed (False: a drive that is off stays off)
     emergency: bool  # True: drives stop by their own emergency stop, where they have one
 
 
 class Drives(ABC):
     """The drives of one driver type on one bus. Derive from it, and implement the abstract methods."""
 
-    emulated: bool = False  # True: no real motor moves; set by the constructor
+    emulated: bool = False  # True: no real motor moves, set by the constructor
 
     @abstractmethod
     def bring_up(self) -> None:
@@ -109,7 +109,7 @@ class Drives(ABC):
         """
 
     def findings(self) -> list[Finding]:
-        """Return what is wrong now with the drives and their bus; the caller reports each finding once.
+        """Return what is wrong now with the drives and their bus. The caller reports each finding once.
 
         Drives that do not answer need not be included: the caller counts the requests that they left unanswered.
         """

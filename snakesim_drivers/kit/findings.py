@@ -14,7 +14,7 @@ class Finding:
 
     what: str  # its kind, such as drive_silent
     cause: str  # for the operator
-    joint: int | None = None  # index, tail to head; None: the bus
+    joint: int | None = None  # index, tail to head (None: the bus)
     alone: bool = False  # True: the other joints are not affected
 
     @property

@@ -59,7 +59,7 @@ class DriveReadings:
     # --- called by the driver when it sends and receives ------------------------------------------------------
 
     def set_identity(self, i: int, *, serial: str = "", firmware: str = "") -> None:
-        """Store the serial number and the firmware version of a drive; empty values change nothing.
+        """Store the serial number and the firmware version of a drive. Empty values change nothing.
 
         Args:
             i: Index of the drive.
@@ -223,7 +223,7 @@ class DriveReadings:
         )
 
     def power(self, tick: int, timestamp_ns: int, max_age_ns: int) -> Power:
-        """Return supply and temperatures; values older than `max_age_ns` are invalid.
+        """Return supply and temperatures. Values older than `max_age_ns` are invalid.
 
         Args:
             tick: Number of the control cycle.

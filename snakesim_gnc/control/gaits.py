@@ -90,13 +90,13 @@ def _explain_missing_joints(yaw: list[int], pitch: list[int]) -> str:
 
 
 class SidewindingParameters(GaitParameters, frozen=True, kw_only=True):
-    """Two waves, a quarter of a period apart; a negative `pitch_rad` travels to the other side."""
+    """Two waves, a quarter of a period apart. A negative `pitch_rad` travels to the other side."""
 
     yaw_rad: Swing = 0.6
     """Amplitude of the joints that turn left and right."""
 
     pitch_rad: Swing = 0.2
-    """Amplitude of the joints that turn up and down; negative: the robot travels to the other side."""
+    """Amplitude of the joints that turn up and down. Negative: the robot travels to the other side."""
 
     lag_rad: Lag = 0.45
     """Phase of a joint behind the one ahead of it."""
@@ -128,10 +128,10 @@ class Sidewinding(_Gait[SidewindingParameters]):
 
 
 class RollingParameters(GaitParameters, frozen=True, kw_only=True):
-    """The arc; a negative `bend_rad` of the pitch joints rolls to the other side."""
+    """The arc. A negative `bend_rad` of the pitch joints rolls to the other side."""
 
     bend_rad: Swing = 0.25
-    """Bend of every joint; negative: the robot rolls to the other side."""
+    """Bend of every joint. Negative: the robot rolls to the other side."""
 
     period_s: Seconds = 2.0
     """Time of one revolution."""

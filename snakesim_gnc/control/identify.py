@@ -45,7 +45,7 @@ class IdentifyParameters(FileStruct, frozen=True):
     """Maximum of the sum of all tones."""
 
     shake_to_hz: Annotated[float, bounded(0.5, 50.0, "Hz")] = 6.0
-    """Frequency of the highest tone; that of the lowest is a tenth of it."""
+    """Frequency of the highest tone. That of the lowest is a tenth of it."""
 
     shake_after_s: Annotated[float, bounded(0.0, 600.0, "s")] = 6.0
     """Time with the slow motion alone, before the shaking."""

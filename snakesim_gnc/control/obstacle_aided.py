@@ -75,7 +75,7 @@ class PushSnapshot:
 
 
 class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
-    """Parameters; the bound of the look-ahead limits how hard the shape pushes."""
+    """Parameters. The bound of the look-ahead limits how hard the shape pushes."""
 
     speed_kp_s: Annotated[float, from_zero(5, "s")] = 0.2
     """Look-ahead of the shape for each m/s that the speed is too low."""
@@ -84,16 +84,16 @@ class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
     """Rate at which the look-ahead grows while the speed stays too low."""
 
     max_look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.05
-    """Maximum look-ahead of the shape along its path; it limits how hard the shape pushes."""
+    """Maximum look-ahead of the shape along its path. It limits how hard the shape pushes."""
 
     fresh_look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.01
     """Look-ahead at the start of a new path."""
 
     push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0
-    """Factor of both pushing terms, for control experiments; negative: backward."""
+    """Factor of both pushing terms, for control experiments. Negative: backward."""
 
     push_sign_s: Annotated[float, from_zero(100, "s")] = 0.0
-    """Time after which the sign of the push is drawn at random again, for control experiments; 0: never."""
+    """Time after which the sign of the push is drawn at random again, for control experiments. 0: never."""
 
     speed_kp_n_s_per_m: Annotated[float, from_zero(1000, "N*s/m")] = 25.0
     """Push on obstacles for each m/s that the speed is too low."""
@@ -123,7 +123,7 @@ class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
     """Time constant of the filter of the pushing torques."""
 
     search_after_s: Annotated[float, from_zero(1000, "s")] = 1.2
-    """Time with less than 2 cm of advance after which the body searches for contacts by a wave; 0: never."""
+    """Time with less than 2 cm of advance after which the body searches for contacts by a wave. 0: never."""
 
     search_s: Annotated[float, above(1000, "s")] = 30.0
     """Duration of a search, after which the body tries its path again."""
@@ -132,13 +132,13 @@ class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
     speed_filter_s: SpeedFilter = 0.05
-    """Time constant of the filter of the speed along the path; 0: no filter."""
+    """Time constant of the filter of the speed along the path. 0: no filter."""
 
     no_contact_cost: Annotated[float, from_zero(1000, "1")] = 10.0
-    """Additional cost of a force on an obstacle without measured contact; 0: it costs as much as on others."""
+    """Additional cost of a force on an obstacle without measured contact. 0: it costs as much as on others."""
 
     shape_nm_per_rad: Annotated[float, from_zero(1000, "N*m/rad")] = 1.5
-    """Stiffness of the shape in torque mode; 0: always position mode, as stiff as the drives are."""
+    """Stiffness of the shape in torque mode. 0: always position mode, as stiff as the drives are."""
 
     shape_nm_s_per_rad: Annotated[float, from_zero(1000, "N*m*s/rad")] = 0.1
     """Damping of the shape in torque mode."""

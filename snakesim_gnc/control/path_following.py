@@ -22,7 +22,7 @@ from snakesim_hal.wire.quantities import from_zero
 
 
 class PathFollowingParameters(FileStruct, frozen=True, kw_only=True):
-    """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
+    """Too little look-ahead does not overcome the drag. Too much wedges the body between tight obstacles."""
 
     look_ahead_m: Annotated[float, from_zero(1, "m")] = 0.03
     """Maximum look-ahead of the shape along its path."""
@@ -31,7 +31,7 @@ class PathFollowingParameters(FileStruct, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
     speed_filter_s: SpeedFilter = 0.03
-    """Time constant of the filter of the speed along the path; 0: no filter."""
+    """Time constant of the filter of the speed along the path. 0: no filter."""
 
 
 class PathFollowing(Controller[PathFollowingParameters]):

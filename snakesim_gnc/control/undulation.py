@@ -50,10 +50,10 @@ class LateralUndulationParameters(FileStruct, frozen=True, kw_only=True):
     """Period of the wave."""
 
     lag_rad: Annotated[float, bounded(-3.2, 3.2, "rad")] = 0.9
-    """Phase of a joint behind the one ahead of it; negative: the wave travels to the head."""
+    """Phase of a joint behind the one ahead of it. Negative: the wave travels to the head."""
 
     steering: Steering = 0.0
-    """Bend of all joints for each radian that the path leads aside; 0: no steering."""
+    """Bend of all joints for each radian that the path leads aside. 0: no steering."""
 
     blend_s: Blend = 1.0
     """Time over which the command changes smoothly to a new reference."""
@@ -132,7 +132,7 @@ class HeadSteeredUndulationParameters(LateralUndulationParameters, frozen=True, 
     """Parameters of lateral undulation, with steering."""
 
     steering: Steering = 0.8
-    """Bend of all joints for each radian that the path leads aside; 0: no steering."""
+    """Bend of all joints for each radian that the path leads aside. 0: no steering."""
 
 
 class HeadSteeredUndulation(LateralUndulation):
@@ -151,7 +151,7 @@ class CompliantUndulationParameters(HeadSteeredUndulationParameters, frozen=True
     """Time constant with which the amplitude yields."""
 
     jam_after_s: Annotated[float, from_zero(1000, "s")] = 0.0
-    """Time with less than 2 cm of advance after which the wave travels the other way; 0: never."""
+    """Time with less than 2 cm of advance after which the wave travels the other way. 0: never."""
 
     back_s: Annotated[float, above(1000, "s")] = 1.0
     """Time for which the wave then travels the other way."""

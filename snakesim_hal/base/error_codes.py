@@ -116,7 +116,7 @@ ERROR_CODES = {
     "python/invalid-argument": ErrorCode(
         "A function of the Python API got an argument that is not allowed.",
         "A wrong type, a wrong number of values, or an object where a class is needed.",
-        "Pass what the message names; see docs/how-to/python.md and docs/how-to/environments.md.",
+        "Pass what the message names. See docs/how-to/python.md and docs/how-to/environments.md.",
     ),
     # --- plug-ins and extras
     "extra/not-installed": ErrorCode(
@@ -160,7 +160,7 @@ ERROR_CODES = {
     "injection/unknown-fault": ErrorCode(
         "A fault to inject is written wrongly, or does not exist.",
         "The kind is misspelled, the target cannot have this fault, or its amount is outside the range.",
-        "Write it as the message shows; docs/how-to/inject-faults.md lists all kinds.",
+        "Write it as the message shows. Docs/how-to/inject-faults.md lists all kinds.",
     ),
     "injection/unknown-target": ErrorCode(
         "The target of a fault does not exist in this run.",
@@ -175,7 +175,7 @@ ERROR_CODES = {
     "injection/not-allowed": ErrorCode(
         "This robot does not allow injected faults.",
         "Something real moves, or the run was started without permission.",
-        "Allow them explicitly, as the message explains; see docs/how-to/inject-faults.md.",
+        "Allow them explicitly, as the message explains. See docs/how-to/inject-faults.md.",
     ),
     # --- buses and drives
     "bus/not-available": ErrorCode(
@@ -248,7 +248,7 @@ ERROR_CODES = {
     ),
     "emulator/not-started": ErrorCode(
         "The emulated joint modules did not start.",
-        "Their process failed; its output is above the message.",
+        "Their process failed. Its output is above the message.",
         "Correct the cause in that output.",
     ),
     # --- simulator and backends
@@ -286,7 +286,7 @@ ERROR_CODES = {
     ),
     "backend/wrong-clock-mode": ErrorCode(
         "The backend cannot keep this clock mode.",
-        "Real hardware runs in real time only; runs in one process are in lockstep.",
+        "Real hardware runs in real time only. Runs in one process are in lockstep.",
         "Use a clock mode that the message names.",
     ),
     # --- network and certificates
@@ -341,7 +341,7 @@ ERROR_CODES = {
     "network/session-file": ErrorCode(
         "A session or router file is not usable.",
         "A setting is missing, or makes the session something else than a client.",
-        "Set the key that the message names; docs/how-to/lab.md shows how to generate correct files.",
+        "Set the key that the message names. Docs/how-to/lab.md shows how to generate correct files.",
     ),
     "network/unknown-key": ErrorCode(
         "There is no such key on the network.",
@@ -357,7 +357,7 @@ ERROR_CODES = {
     "certificate/expired": ErrorCode(
         "The certificate authority has expired.",
         "It is older than its period of validity.",
-        "Make a new authority, and install the new files on every machine; see docs/how-to/lab.md.",
+        "Make a new authority, and install the new files on every machine. See docs/how-to/lab.md.",
         page="troubleshooting/certificate-rejected.md",
     ),
     "certificate/invalid-authority": ErrorCode(
@@ -374,7 +374,7 @@ ERROR_CODES = {
     ),
     "robot/not-ready": ErrorCode(
         "The robot cannot be armed now.",
-        "A condition for arming is not met; the message lists what is missing.",
+        "A condition for arming is not met. The message lists what is missing.",
         "Correct it, and arm again.",
         page="troubleshooting/not-armed.md",
     ),
@@ -397,7 +397,7 @@ ERROR_CODES = {
     "robot/request-refused": ErrorCode(
         "The robot refused a request.",
         "The message has the reason of the host.",
-        "Correct what the reason names; see also `snakesim status`.",
+        "Correct what the reason names. See also `snakesim status`.",
         page="troubleshooting/not-armed.md",
     ),
     "robot/not-confirmed": ErrorCode(
@@ -439,7 +439,7 @@ ERROR_CODES = {
     "policy/invalid": ErrorCode(
         "A policy does not fit this robot or this version.",
         "The ONNX file has other inputs, outputs or metadata than expected.",
-        "Export it again, or correct its metadata; see docs/tutorials/train-a-policy.md.",
+        "Export it again, or correct its metadata. See docs/tutorials/train-a-policy.md.",
     ),
     "service/failed": ErrorCode(
         "A service raised an exception, or published an invalid message.",
@@ -471,7 +471,7 @@ ERROR_CODES = {
     "recording/not-readable": ErrorCode(
         "A recording is damaged, or is a file of another kind.",
         "The file was cut off or changed, or its name is wrong.",
-        "Name another file, or recover what is readable; see docs/how-to/recordings.md.",
+        "Name another file, or recover what is readable. See docs/how-to/recordings.md.",
         page="troubleshooting/recording-incomplete.md",
     ),
     "recording/missing-data": ErrorCode(
@@ -508,7 +508,7 @@ ERROR_CODES = {
     "lab/invalid-file": ErrorCode(
         "A lab file contradicts itself.",
         "A robot, machine, router or bus is missing or is used twice.",
-        "Correct the entry that the message names; see docs/how-to/lab.md.",
+        "Correct the entry that the message names. See docs/how-to/lab.md.",
     ),
     "urdf/invalid": ErrorCode(
         "A URDF file or a mesh cannot be imported.",

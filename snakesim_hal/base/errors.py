@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 
 class SnakesimError(Exception):
-    """Base of all errors of SnakeSIM; the message explains what is wrong, and what to do next."""
+    """Base of all errors of SnakeSIM. The message explains what is wrong, and what to do next."""
 
     code = "run/failed"  # stable; a class has its default, and a raise site may give a more specific one
 
@@ -17,7 +17,7 @@ class SnakesimError(Exception):
 
         Args:
             lines: The message. Each is printed as one line, whatever it quotes from file or network.
-            code: One of `error_codes.ERROR_CODES`; None for the default of the class.
+            code: One of `error_codes.ERROR_CODES`. None for the default of the class.
         """
         super().__init__("\n".join(lines))
         self.lines = lines
@@ -34,7 +34,7 @@ class ConfigError(SnakesimError, ValueError):
 class WireError(SnakesimError, ValueError):
     """A sample from the network is rejected: malformed, out of bounds, or of an unknown version.
 
-    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`; or, if the sample does not
+    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`. Or, if the sample does not
     fit the robot, `wrong_length`, `no_rotation`, `no_path`. `detail` has the values.
     """
 

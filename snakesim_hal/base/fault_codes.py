@@ -26,7 +26,7 @@ FAULT_CODES = {
         "The network accepts no messages.", "It is congested, or under attack.", "Check the network and its clients."
     ),
     "injection_refused": ErrorCode(
-        "A planned fault could not be injected.", "The backend refused it.", "Correct the plan; see the cause."
+        "A planned fault could not be injected.", "The backend refused it.", "Correct the plan. See the cause."
     ),
     "backend_failed": ErrorCode(
         "The backend cannot continue.", "Its cause is in the fault: a bus, a device or the simulation.", "See host.log."

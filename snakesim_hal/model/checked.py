@@ -33,22 +33,22 @@ class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
     """Date of the check."""
 
     joints: Words
-    """Digest of how the joints were mounted at the check; if it differs now, the record is not valid."""
+    """Digest of how the joints were mounted at the check. If it differs now, the record is not valid."""
 
     backend: Words
     """Backend that the robot was checked with."""
 
     hardware: Words = ""
-    """Hardware of that backend, as it reports it; empty: it does not report it."""
+    """Hardware of that backend, as it reports it. Empty: it does not report it."""
 
     serials: JointNames = []
-    """Serial numbers of the drives, tail to head; empty: the drives do not report them."""
+    """Serial numbers of the drives, tail to head. Empty: the drives do not report them."""
 
     confirmed: Annotated[list[JointProperty], Meta(max_length=len(PROPERTIES))] = []
-    """Properties that are confirmed for every joint; a robot can be armed only if all of them are."""
+    """Properties that are confirmed for every joint. A robot can be armed only if all of them are."""
 
     by_hand: Annotated[dict[JointProperty, JointNames], Meta(max_length=len(PROPERTIES))] = {}
-    """For each property, the joints for which a person confirmed it; for the others the check did."""
+    """For each property, the joints for which a person confirmed it. For the others the check did."""
 
     straight: bool = False
     """True: a person laid the robot straight, and the zeros were judged from that pose."""

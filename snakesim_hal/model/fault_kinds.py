@@ -92,7 +92,7 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
         "freeze": Kind(
             "repeats its last sample, whose age grows",
             ("module", "samples"),
-            in_module="its main loop hangs: repeats its last joint state, no heartbeat; passive after its watchdog",
+            in_module="its main loop hangs: repeats its last joint state, no heartbeat, passive after its watchdog",
         ),
         "wrong": Kind("its angle is wrong", ("samples",), Amount("offset", "rad", 0.5, -6.3, 6.3)),
         "nan": Kind("its angle is NaN", ("samples",)),
@@ -105,7 +105,7 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
             in_module="a second module or drive with the same id and another serial number is on the bus",
         ),
         "overheat": Kind(
-            "its winding is heated to 5 °C above `stop_at_c`; it stays there until the end of the fault, if one is set",
+            "its winding is heated to 5 °C above `stop_at_c`, until the end of the fault if one is set",
             ("module",),
         ),
         "leak": Kind("detects water inside", ("module",)),

@@ -98,8 +98,8 @@ def _describe_exceptions(section: type[msgspec.Struct]) -> dict[str, str]:
     """Return the descriptions of a section for all as they are for an exception to it: None has another meaning."""
     descriptions: dict[str, str] = {}
     for name, description in describe_fields(section).items():
-        meaning, _, _ = description.partition("; none:")
-        descriptions[name] = f"{meaning.removesuffix('.')}; none: as in the section for all."
+        meaning, _, _ = description.partition(" None:")
+        descriptions[name] = f"{meaning.removesuffix('.')}. None: as in the section for all."
     return descriptions
 
 

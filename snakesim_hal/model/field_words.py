@@ -125,7 +125,7 @@ def _describe_limits(option: inspect.Type) -> str:
 def _join_limits(limits: str, item_type: inspect.Type) -> str:
     """Return the limits of a container, followed by those of its items."""
     of_each = describe_range(item_type)
-    return "; each ".join(part for part in (limits, of_each) if part)
+    return ", each ".join(part for part in (limits, of_each) if part)
 
 
 def _describe_length(minimum: int | None, maximum: int | None, noun: str) -> str:

@@ -35,23 +35,23 @@ Backlash = Annotated[float, from_zero(0.5, "rad")]
 
 
 class Limits(FileStruct, frozen=True, kw_only=True):
-    """Limits of a joint; enforced by the limiter and by the motor."""
+    """Limits of a joint. Enforced by the limiter and by the motor."""
 
     angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]
     """Maximum angle of the joint to either side of its zero."""
 
     angle_min_rad: Side | None = None
-    """Lowest angle, if it is not minus `angle_rad`; none: minus `angle_rad`."""
+    """Lowest angle, if it is not minus `angle_rad`. None: minus `angle_rad`."""
 
     angle_max_rad: Side | None = None
-    """Highest angle, if it is not `angle_rad`; none: `angle_rad`."""
+    """Highest angle, if it is not `angle_rad`. None: `angle_rad`."""
 
     cable_turns: Annotated[float, above(100, "turns")] | None = None
-    """Revolutions to either side that the cable of a joint without end stops can take; none: the joint has end stops.
+    """Revolutions to either side that the cable of a joint without end stops can take. None: the joint has end stops.
     """
 
     cable_unwound: Text = ""
-    """Date at which the cable was unwound with the joint at its zero; empty: unknown.
+    """Date at which the cable was unwound with the joint at its zero. Empty: unknown.
 
     `snakesim robot calibrate zero` writes it.
     """
@@ -126,7 +126,7 @@ class Motor(FileStruct, frozen=True, kw_only=True):
 
     # Dynamics.
     response_time_s: Lag
-    """Time constant with which the torque follows its command; 0: at once."""
+    """Time constant with which the torque follows its command. 0: at once."""
 
     armature_kg_m2: RotorInertia
     """Inertia of the rotor, as seen at the joint."""
@@ -139,13 +139,13 @@ class Motor(FileStruct, frozen=True, kw_only=True):
 
     # Torque.
     torque_constant_nm_per_a: TorqueConstant | None = None
-    """Torque for each ampere at the drive's shaft, before a `gear`; none: unknown."""
+    """Torque for each ampere at the drive's shaft, before a `gear`. None: unknown."""
 
     rated_nm: Torque | None = None
-    """Torque for which [heat] gives temperatures and losses; none: `limits.torque_nm`."""
+    """Torque for which [heat] gives temperatures and losses. None: `limits.torque_nm`."""
 
     peak_nm: Torque | None = None
-    """Torque that no torque limit may exceed; none: unknown."""
+    """Torque that no torque limit may exceed. None: unknown."""
 
 
 DriveMode = Literal["position", "velocity", "torque"]
@@ -158,10 +158,10 @@ class Drive(FileStruct, frozen=True, kw_only=True):
 
     # Connection.
     driver: Text = ""
-    """Driver type, such as `dynamixel`; empty: the only driver type of the backend."""
+    """Driver type, such as `dynamixel`. Empty: the only driver type of the backend."""
 
     port: Text = ""
-    """Bus or serial port, such as can0; empty: joints are distributed evenly over those in the backend's settings."""
+    """Bus or serial port, such as can0. Empty: joints are distributed evenly over those in the backend's settings."""
 
     # Mounting.
     sign: Sign = 1
@@ -175,7 +175,7 @@ class Drive(FileStruct, frozen=True, kw_only=True):
 
     # Abilities: control modes, and what it measures beside the angle.
     modes: Modes = msgspec.field(default_factory=lambda: ["position", "velocity", "torque"])
-    """Control modes that the drive supports; `position` must be one of them."""
+    """Control modes that the drive supports. `position` must be one of them."""
 
     measures: Measures = msgspec.field(default_factory=lambda: ["torque", "temperature", "voltage"])
     """Quantities that the drive measures beside its angle."""
@@ -190,7 +190,7 @@ class Drive(FileStruct, frozen=True, kw_only=True):
 
 
 class Heat(FileStruct, frozen=True, kw_only=True):
-    """How a motor warms up. The defaults are typical of a small geared servo; none was measured.
+    """How a motor warms up. The defaults are typical of a small geared servo. None was measured.
 
     Together they give 5 K/W from winding to water, a guess of the right order for a housing of 100 mm.
     """
@@ -208,7 +208,7 @@ class Heat(FileStruct, frozen=True, kw_only=True):
     """Copper loss at the rated torque."""
 
     board_fraction: Annotated[float, from_zero(1, "1")] = 0.3
-    """Temperature rise of the electronics as a fraction of the winding's rise; the default is a guess."""
+    """Temperature rise of the electronics as a fraction of the winding's rise. The default is a guess."""
 
 
 class Supply(FileStruct, frozen=True, kw_only=True):
@@ -223,7 +223,7 @@ class Supply(FileStruct, frozen=True, kw_only=True):
 
 class _Id(FileStruct, frozen=True, kw_only=True):
     id: Annotated[int, Meta(ge=0, lt=MAX_ID)] | None = None
-    """Id of the drive on its bus; none: the joint's number, from 1 at the tail."""
+    """Id of the drive on its bus. None: the joint's number, from 1 at the tail."""
 
 
 # Every field of the sections for all joints is an optional field of the exceptions of one joint. Only the ambient

@@ -14,7 +14,7 @@ Inertia = tuple[Moment, Moment, Moment, Moment, Moment, Moment]
 
 
 class Link(FileStruct, frozen=True, kw_only=True):
-    """A rigid link. It extends along x from the joint at its rear to the next joint; tail and head, to their ends.
+    """A rigid link. It extends along x from the joint at its rear to the next joint. Tail and head, to their ends.
 
     Its outline is a capsule of that length and of the modules' radius.
     """
@@ -26,10 +26,10 @@ class Link(FileStruct, frozen=True, kw_only=True):
     """Mass of the link."""
 
     center_m: tuple[Offset, Offset, Offset] | None = None
-    """Center of mass in the link's frame, from the joint at its rear; none: the middle of the link."""
+    """Center of mass in the link's frame, from the joint at its rear. None: the middle of the link."""
 
     inertia_kg_m2: Inertia | None = None
-    """Moments of inertia ixx, iyy, izz, ixy, ixz, iyz about the center of mass, along the link's axes; none: those of a
+    """Moments of inertia ixx, iyy, izz, ixy, ixz, iyz about the center of mass, along the link's axes. None: those of a
     solid capsule.
     """
 

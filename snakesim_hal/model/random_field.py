@@ -23,7 +23,7 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
-    """Seed of the positions, sizes and leans; the same seed gives the same obstacles."""
+    """Seed of the positions, sizes and leans. The same seed gives the same obstacles."""
 
     min_corner_m: Point
     """Corner with the smallest coordinates of the rectangle that contains the centers of all obstacles, as [x, y]."""
@@ -39,7 +39,7 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Minimum and maximum of the radius of a peg."""
 
     box_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    """Mean fraction of blocks among the obstacles; the others are pegs."""
+    """Mean fraction of blocks among the obstacles. The others are pegs."""
 
     box_size_m: tuple[Size, Size] = (0.06, 0.18)
     """Minimum and maximum of the length and of the width of a block."""
@@ -48,13 +48,13 @@ class RandomField(Solid, frozen=True, kw_only=True):
     """Minimum gap between the surfaces of two obstacles."""
 
     route_clearance_m: Clearance | None = None
-    """Minimum gap between the route and the surface of an obstacle; none: no such gap."""
+    """Minimum gap between the route and the surface of an obstacle. None: no such gap."""
 
     height_m: Size = 0.2
     """Height of every obstacle."""
 
     lean_up_to_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
-    """Maximum angle by which an obstacle leans, in a random direction; 0: all are upright."""
+    """Maximum angle by which an obstacle leans, in a random direction. 0: all are upright."""
 
     @property
     def target_count(self) -> int:

@@ -13,7 +13,7 @@ from snakesim_hal.model.scenario import Override
 
 
 class Randomization(FileStruct, frozen=True, kw_only=True):
-    """A uniform distribution of one value, which all keys in `set` get; the number of a random scene decides it."""
+    """A uniform distribution of one value, which all keys in `set` get. The number of a random scene decides it."""
 
     set: Annotated[list[str], Meta(min_length=1)]
     """Dotted keys that all get the same random value, such as `scene.ground.friction`."""

@@ -39,7 +39,7 @@ class Chain(FileStruct, frozen=True, kw_only=True):
     """Number of modules, and axes of their joints."""
 
     modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
-    """Number of joint modules, and so of joints; the robot has one link more."""
+    """Number of joint modules, and so of joints. The robot has one link more."""
 
     axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]
     """Axes of the joints, `yaw` (left and right) or `pitch` (up and down), as a pattern that is repeated from tail to
@@ -69,7 +69,7 @@ class Safety(FileStruct, frozen=True, kw_only=True):
     """
 
     max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35
-    """Maximum difference between a position target and the measured angle; the command limiter clips targets beyond it.
+    """Maximum difference between a position target and the measured angle. The command limiter clips targets beyond it.
     """
 
     max_isolated_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0
@@ -93,7 +93,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     """Size and mass of one module."""
 
     links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []
-    """Every link, tail to head, for a robot whose links differ; empty: the links follow from the modules."""
+    """Every link, tail to head, for a robot whose links differ. Empty: the links follow from the modules."""
 
     # All joints.
     limits: Limits
@@ -113,7 +113,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
 
     # What differs in single joints, by name.
     joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}
-    """Values that differ in single joints, as sections such as `[joints.joint_3]`; joint_1 is at the tail."""
+    """Values that differ in single joints, as sections such as `[joints.joint_3]`. `joint_1` is at the tail."""
 
     safety: Safety = Safety()
     """Stop mode, and limits of commands."""
@@ -122,7 +122,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     """Sensors of the robot."""
 
     checked: StartCheckRecord | None = None
-    """Record of the last start check, which `snakesim robot check` writes; none: the robot was never checked."""
+    """Record of the last start check, which `snakesim robot check` writes. None: the robot was never checked."""
 
     def __post_init__(self) -> None:
         """Check joints, links and sensors against each other. Raises ValueError, which the file reader explains."""

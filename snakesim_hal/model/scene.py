@@ -30,7 +30,7 @@ class Heightfield(FileStruct, frozen=True, kw_only=True):
     """Edge length of the square around the origin that has hills."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
-    """Seed of the random hills; the same seed gives the same hills."""
+    """Seed of the random hills. The same seed gives the same hills."""
 
 
 class Ground(FileStruct, frozen=True, kw_only=True):
@@ -40,7 +40,7 @@ class Ground(FileStruct, frozen=True, kw_only=True):
     """Coulomb friction between the ground and the snake."""
 
     heightfield: Heightfield | None = None
-    """Random hills; none: the ground is flat."""
+    """Random hills. None: the ground is flat."""
 
 
 class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="kind"):
@@ -57,7 +57,7 @@ class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="ki
 
 
 class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
-    """Straight lines between points; use many points for a smooth curve."""
+    """Straight lines between points. Use many points for a smooth curve."""
 
     points_m: Annotated[list[Point], Meta(min_length=2, max_length=20000)]
     """Points of the route in the world frame, as [x, y], from its start to its end."""
@@ -76,7 +76,7 @@ class Cylinder(Upright, frozen=True, kw_only=True):
     """Height of the peg."""
 
     name: Name | None = None
-    """Name, which no other obstacle has; none: `cylinder_` with its number in the file."""
+    """Name, which no other obstacle has. None: `cylinder_` with its number in the file."""
 
 
 class Box(Upright, frozen=True, kw_only=True):
@@ -89,14 +89,14 @@ class Box(Upright, frozen=True, kw_only=True):
     """Length, width and height of the block."""
 
     yaw_rad: Heading = 0.0
-    """Rotation about the vertical; 0: its length is along x."""
+    """Rotation about the vertical. 0: its length is along x."""
 
     name: Name | None = None
-    """Name, which no other obstacle has; none: `box_` with its number in the file."""
+    """Name, which no other obstacle has. None: `box_` with its number in the file."""
 
 
 class Sphere(Solid, frozen=True, kw_only=True):
-    """A ball; one that slides does not roll."""
+    """A ball. One that slides does not roll."""
 
     position_m: Point
     """Center in the world frame, as [x, y]."""
@@ -108,7 +108,7 @@ class Sphere(Solid, frozen=True, kw_only=True):
     """Height of the center above the ground."""
 
     name: Name | None = None
-    """Name, which no other obstacle has; none: `sphere_` with its number in the file."""
+    """Name, which no other obstacle has. None: `sphere_` with its number in the file."""
 
 
 class Wall(Upright, frozen=True, kw_only=True):
@@ -127,7 +127,7 @@ class Wall(Upright, frozen=True, kw_only=True):
     """Height of the wall."""
 
     name: Name | None = None
-    """Name, which no other obstacle has; none: `wall_` with its number in the file."""
+    """Name, which no other obstacle has. None: `wall_` with its number in the file."""
 
 
 class Step(FileStruct, frozen=True, kw_only=True):
@@ -143,13 +143,13 @@ class Step(FileStruct, frozen=True, kw_only=True):
     """Height of the platform."""
 
     yaw_rad: Heading = 0.0
-    """Rotation about the vertical; 0: its length is along x."""
+    """Rotation about the vertical. 0: its length is along x."""
 
     friction: Friction = 0.5
     """Coulomb friction between the platform and the snake."""
 
     name: Name | None = None
-    """Name, which no other obstacle has; none: `step_` with its number in the file."""
+    """Name, which no other obstacle has. None: `step_` with its number in the file."""
 
 
 class PegsAlongRoute(Upright, frozen=True, kw_only=True):
@@ -176,7 +176,7 @@ class PegsAlongRoute(Upright, frozen=True, kw_only=True):
 
 
 class ReferenceRobot(FileStruct, frozen=True, kw_only=True):
-    """The body that a scene was laid out for; for another robot the scene is scaled in proportion, see fitting.py."""
+    """The body that a scene was laid out for. For another robot the scene is scaled in proportion, see fitting.py."""
 
     spacing_m: Size
     """Longest distance between two neighboring yaw joints."""
@@ -198,12 +198,12 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     """The ground, and its friction."""
 
     reference_robot: ReferenceRobot | None = None
-    """Body that the scene was laid out for, and in proportion to which it is scaled; none: it is the same for every
+    """Body that the scene was laid out for, and in proportion to which it is scaled. None: it is the same for every
     robot.
     """
 
     route: SineRoute | WaypointRoute | None = None
-    """Route of the snake, `kind` = "sine" or "waypoints"; none: the scene has no route."""
+    """Route of the snake, `kind` = "sine" or "waypoints". None: the scene has no route."""
 
     # Obstacles.
     cylinder: list[Cylinder] = []

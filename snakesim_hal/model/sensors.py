@@ -50,7 +50,7 @@ class JointSensor(FileStruct, frozen=True, kw_only=True):
 
 class _Sampled(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
-    """Number of samples per second; at most the rate of the control cycle."""
+    """Number of samples per second. At most the rate of the control cycle."""
 
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
     """Time from the measurement to its arrival at the host."""
@@ -93,7 +93,7 @@ class PowerSensor(FileStruct, frozen=True, kw_only=True):
     """Supply, temperatures and leaks of every joint module. Modules on a bus report them at their own rate."""
 
     rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
-    """Number of samples per second; modules on a bus report at a rate that their firmware sets."""
+    """Number of samples per second. Modules on a bus report at a rate that their firmware sets."""
 
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
     """Time from the measurement to its arrival at the host."""
@@ -106,26 +106,26 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
-    """Name of the sensor, which ends its key; it differs from those of all sensors of the same kind."""
+    """Name of the sensor, which ends its key. It differs from those of all sensors of the same kind."""
 
     link: LinkName = "head"
     """Link that carries the sensor: `head`, `tail`, or the number of a link from 0 at the tail."""
 
     position_m: tuple[Offset, Offset, Offset] | None = None
-    """Position of the sensor in the link's frame; none: the tip of the head."""
+    """Position of the sensor in the link's frame. None: the tip of the head."""
 
     yaw_rad: Angle = 0.0
-    """Rotation of the viewing direction, the link's x axis, about z; positive: to the left."""
+    """Rotation of the viewing direction, the link's x axis, about z. Positive: to the left."""
 
     pitch_rad: Angle = 0.0
-    """Rotation of the viewing direction about y, after the yaw; positive: downwards."""
+    """Rotation of the viewing direction about y, after the yaw. Positive: downwards."""
 
     # Time.
     rate_hz: Annotated[float, above(1000, "Hz")] = 20.0
-    """Number of samples per second; at most the rate of the control cycle."""
+    """Number of samples per second. At most the rate of the control cycle."""
 
     delay_s: Annotated[float, from_zero(1, "s")] = 0.03
-    """Time from the measurement to its arrival at the host; at least one control period."""
+    """Time from the measurement to its arrival at the host. At least one control period."""
 
     settings: dict[str, Any] = {}
     """Settings of the sensor's model, which checks them."""
@@ -181,13 +181,13 @@ class DepthCamera(DistanceSensor, frozen=True, kw_only=True):
 
 
 class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
-    """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
+    """Distances along beams in a plane: a 2-D lidar. Or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
     """Number of beams, evenly distributed over the field of view."""
 
     fov_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0
-    """Field of view, from the first beam on the right to the last beam; 0 for a single beam."""
+    """Field of view, from the first beam on the right to the last beam. 0 for a single beam."""
 
     range_min_m: Annotated[float, from_zero(1000, "m")] = 0.02
     """Shortest distance that is measured."""
@@ -223,22 +223,22 @@ AnySensor = BodySensor | AnyMounted
 
 
 class Sensors(FileStruct, frozen=True, kw_only=True):
-    """The sensors of the robot; without its section a sensor is absent."""
+    """The sensors of the robot. Without its section a sensor is absent."""
 
     joints: JointSensor = JointSensor()
     """Angle, velocity and torque of every joint, in every control cycle."""
 
     contacts: ContactSensor | None = None
-    """Contacts of the links with obstacles; none: they are not measured."""
+    """Contacts of the links with obstacles. None: they are not measured."""
 
     imu: ImuSensor | None = None
-    """Angular velocity and acceleration of every link; none: they are not measured."""
+    """Angular velocity and acceleration of every link. None: they are not measured."""
 
     pose: PoseSensor | None = None
-    """Pose of the base from motion capture; none: it is not measured."""
+    """Pose of the base from motion capture. None: it is not measured."""
 
     power: PowerSensor | None = None
-    """Supply, temperatures and leaks of the joint modules; none: they are not measured."""
+    """Supply, temperatures and leaks of the joint modules. None: they are not measured."""
 
     depth: Annotated[list[DepthCamera], Meta(max_length=MAX_MOUNTED)] = []
     """Depth cameras, each an entry `[[sensors.depth]]`."""

@@ -21,10 +21,10 @@ class Solid(FileStruct, frozen=True, kw_only=True):
     """Coulomb friction between the obstacle and the snake."""
 
     stiffness_n_per_m: Annotated[float, Meta(ge=10, le=1e6, extra_json_schema={"unit": "N/m"})] | None = None
-    """Stiffness of the spring that holds the obstacle at its position, or where it has slid to; none: it is rigid."""
+    """Stiffness of the spring that holds the obstacle at its position, or where it has slid to. None: it is rigid."""
 
     mass_kg: Annotated[float, Meta(ge=0.01, le=1000, extra_json_schema={"unit": "kg"})] | None = None
-    """Mass of an obstacle that slides on the ground when it is pushed; none: it is fixed to the ground."""
+    """Mass of an obstacle that slides on the ground when it is pushed. None: it is fixed to the ground."""
 
     base_friction: Friction = BASE_FRICTION
     """Coulomb friction between the obstacle and the ground on which it slides."""
@@ -49,7 +49,7 @@ class Upright(Solid, frozen=True, kw_only=True):
     """Angle by which its axis leans from the vertical, about the middle of its foot."""
 
     lean_towards_rad: Heading = 0.0
-    """Direction in which its top leans, seen from above; 0: along x."""
+    """Direction in which its top leans, seen from above. 0: along x."""
 
 
 def material_fields(solid: Solid) -> dict[str, Any]:

@@ -109,7 +109,7 @@ class Client:
         return robot
 
     def new_description(self) -> Description | None:
-        """Return the robot's description if another HAL host may drive it than at the last call; else None.
+        """Return the robot's description if another HAL host may drive it than at the last call. Else None.
 
         Robot time that starts over is a sign of another host. So is the lost liveliness token of the old one, if this
         service was disconnected while the host was replaced.
@@ -147,8 +147,8 @@ class Client:
         """Iterate over the robot's clock, without an end.
 
         Args:
-            silence_s: how long to wait for a clock before None is yielded instead; None: wait without a limit.
-            pauses: also yield the clocks of a paused simulator (`Clock.paused`). They are no ticks; do not answer them.
+            silence_s: how long to wait for a clock before None is yielded instead. None: wait without a limit.
+            pauses: also yield the clocks of a paused simulator (`Clock.paused`). They are no ticks. Do not answer them.
 
         Yields:
             Every due tick in lockstep, and the newest due tick otherwise. None after each `silence_s` without a clock.
@@ -201,7 +201,7 @@ class Client:
         return clock
 
     def wait_for_clock(self, timeout_s: float) -> Clock | None:
-        """Return the newest clock, due or not. Waits for the first one; returns None if none arrives in time."""
+        """Return the newest clock, due or not. Waits for the first one. Returns None if none arrives in time."""
         deadline = time.monotonic() + timeout_s
         while self.newest_clock is None and time.monotonic() < deadline:
             time.sleep(CLOCK_POLL_S)
@@ -239,7 +239,7 @@ class Client:
         return feed
 
     def read(self, feed: Feed[MessageT]) -> MessageT | None:
-        """Return the sample of a feed that is valid at this tick; None if there is none (yet).
+        """Return the sample of a feed that is valid at this tick. None if there is none (yet).
 
         In real time this is the newest sample. In lockstep it is exactly the sample that the clock names, and an armed
         robot waits for it: a run must not depend on which process was faster.
@@ -300,7 +300,7 @@ class Client:
             message: A message of this key's class.
 
         Raises:
-            WireError: no reader would accept the message; nothing is sent.
+            WireError: no reader would accept the message. Nothing is sent.
         """
         try:
             payload = self._encode_for_robot(key, message)

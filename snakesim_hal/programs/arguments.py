@@ -61,7 +61,7 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY",
-        help="remove an optional key, such as robot.sensors.contacts; may be repeated",
+        help="remove an optional key, such as robot.sensors.contacts (may be repeated)",
     )
 
 
@@ -76,7 +76,7 @@ def add_scenario_name(parser: argparse.ArgumentParser) -> None:
 
 def add_set(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
     """Add `--set`. about: for the help."""
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about}; may be repeated")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about} (may be repeated)")
 
 
 def add_seed(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:

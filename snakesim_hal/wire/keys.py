@@ -78,14 +78,14 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
     KeyRow(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "setpoints that the motors got, and limits applied"),
     KeyRow(
-        LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"
+        LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command. Replies Answer"
     ),
-    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, reset, finish; replies Answer"),
-    KeyRow(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
+    KeyRow(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, reset, finish. Replies Answer"),
+    KeyRow(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched. Replies Answer"),
     KeyRow(
-        SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator; replies Answer"
+        SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator. Replies Answer"
     ),
-    KeyRow(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed; replies Answer"),
+    KeyRow(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed. Replies Answer"),
     KeyRow(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
     KeyRow(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
     KeyRow(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
@@ -93,15 +93,22 @@ SPACE: tuple[KeyRow, ...] = (
         CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"
     ),
     KeyRow(
-        PARAMETERS, m.ParametersRequest, "any", "query", _ASKED, "other parameters for the running controller; Answer"
+        PARAMETERS,
+        m.ParametersRequest,
+        "any",
+        "query",
+        _ASKED,
+        "other parameters for the running controller. Replies Answer",
     ),
     KeyRow(
         PARAMETERS_IN_FORCE, m.ControlParameters, "control", "latched", "on a change", "the controller's parameters now"
     ),
     KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "the requested speed and direction"),
     KeyRow(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
-    KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
-    KeyRow(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
+    KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings, and its token"),
+    KeyRow(
+        HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process, and a robot must have only one"
+    ),
 )
 
 ROW_AT: dict[str, KeyRow] = {row.key: row for row in SPACE if row.message is not None}

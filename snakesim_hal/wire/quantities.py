@@ -30,7 +30,7 @@ def bounded(low: float, high: float, unit: str) -> Meta:
     Args:
         low: The smallest number that is allowed.
         high: The largest number that is allowed.
-        unit: Unit, such as "rad"; "1" for a plain number.
+        unit: Unit, such as "rad". "1" for a plain number.
     """
     return Meta(ge=_normalize(low), le=_normalize(high), extra_json_schema={"unit": unit})
 
@@ -40,7 +40,7 @@ def above(high: float, unit: str) -> Meta:
 
     Args:
         high: The largest number that is allowed.
-        unit: Unit, such as "rad"; "1" for a plain number.
+        unit: Unit, such as "rad". "1" for a plain number.
     """
     return Meta(gt=0, le=_normalize(high), extra_json_schema={"unit": unit})
 
@@ -50,7 +50,7 @@ def from_zero(high: float, unit: str) -> Meta:
 
     Args:
         high: The largest number that is allowed.
-        unit: Unit, such as "rad"; "1" for a plain number.
+        unit: Unit, such as "rad". "1" for a plain number.
     """
     return Meta(ge=0, le=_normalize(high), extra_json_schema={"unit": unit})
 

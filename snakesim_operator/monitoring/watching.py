@@ -23,7 +23,7 @@ def _add_topic_list(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_echo(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("key", metavar="KEY", help="such as sensor/joints or sensor/*; `snakesim topic list` has all")
+    parser.add_argument("key", metavar="KEY", help="such as sensor/joints or sensor/* (`snakesim topic list` has all)")
     _add_count(parser, "end after this many messages")
     add_network(parser)
 
@@ -31,7 +31,7 @@ def _add_echo(parser: argparse.ArgumentParser) -> None:
 def _add_rate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("key", nargs="?", metavar="KEY", help="only this key, such as sensor/joints or sensor/*")
     parser.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
-    _add_count(parser, "end after this many seconds; with KEY")
+    _add_count(parser, "end after this many seconds, with KEY")
     add_network(parser)
     add_json(parser)
 
@@ -66,7 +66,7 @@ def _add_record(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="ORIGIN",
-        help="a web page that may read the robot there, such as https://app.foxglove.dev; may be repeated",
+        help="a web page that may read the robot there, such as https://app.foxglove.dev (may be repeated)",
     )
     add_network(parser)
 

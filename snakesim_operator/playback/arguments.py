@@ -31,7 +31,7 @@ def _add_speed(parser: argparse.ArgumentParser, limits: tuple[float, float]) -> 
         type=number_type(*limits),
         default=1.0,
         metavar="X",
-        help="robot time over wall time; 2: twice as fast as it was (default: 1)",
+        help="robot time over wall time, such as 2 for twice as fast as it was (default: 1)",
     )
 
 
@@ -50,7 +50,7 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_compare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of a run; percentages refer to this one")
+    parser.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of the run that percentages refer to")
     parser.add_argument(
         "run_b", type=Path, metavar="RUN_B", help="folder of the other run, of a robot with the same joints"
     )
@@ -232,8 +232,8 @@ COMMANDS: Commands = (
         help="Play a recording on Zenoh, or its sensors into guidance, navigation and control.",
         add=_add_replay,
         run=_replay,
-        details="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed; 1 "
-        "otherwise. 3: done, but something is missing in the recording.",
+        details="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed, 1 "
+        "otherwise, 3 done, but something is missing in the recording.",
         examples=(
             "replay runs/demo --speed 0.5",
             "replay runs/demo --control --set control.speed_kp_s=0.3 --out runs/again",

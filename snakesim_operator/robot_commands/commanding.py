@@ -34,7 +34,7 @@ def _add_teleop(parser: argparse.ArgumentParser) -> None:
         type=Path,
         const=Path(),
         metavar="DEVICE",
-        help="such as /dev/input/event5; or the first",
+        help="such as /dev/input/event5 (default: the first)",
     )
     parser.add_argument(
         "--max-speed", type=float, default=0.3, metavar="M/S", help="speed at full deflection (default: 0.3)"
@@ -63,7 +63,7 @@ def _add_fault_list(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_fault_inject(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", metavar="KIND", help="such as mute; `snakesim fault list` explains all of them")
+    parser.add_argument("kind", metavar="KIND", help="such as mute (`snakesim fault list` explains all of them)")
     parser.add_argument("target", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
     add_duration(parser, "seconds of robot time until it ends (default: until --end)")
     parser.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
@@ -148,7 +148,7 @@ COMMANDS: Commands = (
     Command(
         name="teleop",
         heading="daily work",
-        help="Drive a robot by keys or with a joystick; letting go stops it.",
+        help="Drive a robot by keys or with a joystick. Letting go stops it.",
         add=_add_teleop,
         run=_teleop,
         examples=("teleop", "teleop --joystick --max-speed 0.2"),
@@ -165,11 +165,11 @@ COMMANDS: Commands = (
     Noun(
         name="robot",
         heading="robot",
-        help="Arm, disarm and reset a robot; calibrate and check its joints; convert robot files.",
+        help="Arm, disarm and reset a robot. Calibrate and check its joints. Convert robot files.",
     ),
     Command(
         name="robot arm",
-        help="Allow a robot to move; names robot and backend, to avoid mix-ups.",
+        help="Allow a robot to move. Names robot and backend, to avoid mix-ups.",
         add=_add_arm,
         run=_arm,
         details=(
@@ -187,7 +187,7 @@ COMMANDS: Commands = (
     ),
     Command(
         name="robot reset",
-        help="Reset a fault or an emergency stop; the robot is disarmed then.",
+        help="Reset a fault or an emergency stop. The robot is disarmed then.",
         add=add_network,
         run=_reset,
         examples=("robot reset", "robot reset --namespace planar13"),
@@ -209,7 +209,7 @@ COMMANDS: Commands = (
     ),
     Command(
         name="param set",
-        help="Change parameters, all or none; the controller continues with them, and they are recorded.",
+        help="Change parameters, all or none. The controller continues with them, and they are recorded.",
         add=_add_param_set,
         run=_param_set,
         examples=("param set control.speed_kp_s=0.3", "param set control.speed_kp_s=0.3 --namespace planar13"),

@@ -50,7 +50,7 @@ class Parameter:
     value: Any  # the value in force
     unit: str = ""  # empty: it has none
     description: str = ""  # the meaning
-    choices: tuple[str, ...] = ()  # the values that are allowed; empty: any within the range
+    choices: tuple[str, ...] = ()  # the values that are allowed (empty: any within the range)
     minimum: float | None = None  # None: there is none
     maximum: float | None = None  # None: there is none
     excludes_minimum: bool = False  # True: `minimum` itself is not allowed

@@ -102,7 +102,7 @@ SIMULATOR_COMMANDS: Commands = (
     ),
     Command(
         name="sim reset",
-        help="Set a simulator back to its start; the robot is disarmed then.",
+        help="Set a simulator back to its start. The robot is disarmed then.",
         add=add_network,
         run=_reset,
         examples=("sim reset", "sim reset --namespace planar13"),

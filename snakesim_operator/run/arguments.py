@@ -33,8 +33,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         "--fault",
         action="append",
         metavar="FAULT",
-        help="inject a fault, as KIND:TARGET@START[-END][=AMOUNT] in seconds after arming; replaces the scenario's "
-        "faults; may be repeated",
+        help="inject a fault, as KIND:TARGET@START[-END][=AMOUNT] in seconds after arming, instead of the scenario's "
+        "faults (may be repeated)",
     )
     parser.add_argument(
         "--stay", action="store_true", help="faults do not end the run: processes restart, you reset and arm"
@@ -44,7 +44,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--in-process",
         action="store_true",
-        help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
+        help="run in one process, without a network: lockstep, and faster, where nothing can connect, arm or stop it",
     )
     parser.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
     parser.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
@@ -136,8 +136,8 @@ COMMANDS: Commands = (
         help="Run a scenario: backend, guidance, navigation and control.",
         add=_add_run,
         run=_run,
-        details="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
-        "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
+        details="Exit code: 0 complete, armed for all of the requested time, 1 a fault, or ended before that, 2 wrong "
+        "input, nothing was started, 3 complete, but the record has gaps, 130 interrupted. 1 and 130 take precedence.",
         examples=(
             "run triplet --console",
             "run peg_row --controller obstacle_aided --duration 10 --out runs/demo",

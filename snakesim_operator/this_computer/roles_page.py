@@ -8,13 +8,13 @@ INTRODUCTION = """\
 # Roles
 
 Made by `make schemas` from `snakesim_hal/wire/roles.py`, as are the access rules that `snakesim lab render` writes
-for a lab's routers. A certificate gives a process one role for one robot; keys are below that robot's namespace. What
+for a lab's routers. A certificate gives a process one role for one robot. Keys are below that robot's namespace. What
 no cell grants is denied: other keys, other robots, `delete`, a query where a stream is, a wildcard that covers a key
 where no wildcard is granted. [docs/how-to/lab.md](../docs/how-to/lab.md) shows how a lab is set up.
 """
 NOTES = """\
 A `gnc` publishes, declares and answers at `*` only under the names of its own services, as the lab file lists them, and
-a recorder under the name `recorder`; at `process/*` these names are followed by `-` and an id.
+a recorder under the name `recorder`. At `process/*` these names are followed by `-` and an id.
 Fault injection is granted only for a robot with `faults = true` in the lab file. An administrator may also query the
 routers' own state (`@/**`), read-only. Subscribing is granted for any pattern within the robot's namespace: what is
 then delivered is decided key by key.

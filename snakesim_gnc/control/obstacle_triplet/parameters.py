@@ -12,7 +12,7 @@ class TripletParameters(FileStruct, frozen=True, kw_only=True):
 
     # Propulsion. Its rate is limited because a body that starts and stops in jerks would shake the command.
     propulsion_n: Annotated[float, above(1e4, "N")] = 35.0
-    """Maximum propulsion force f_s; it fades to zero as the snake reaches the mission's speed."""
+    """Maximum propulsion force f_s. It fades to zero as the snake reaches the mission's speed."""
 
     propulsion_rate_n_s: Annotated[float, above(1e6, "N/s")] = 700.0
     """Maximum rate at which the propulsion force changes."""
@@ -20,7 +20,7 @@ class TripletParameters(FileStruct, frozen=True, kw_only=True):
     # Load compensation. A servo gives way under a load; with its target ahead by load / stiffness, the joint stays
     # where it was planned.
     load_ratio: Annotated[float, from_zero(1, "1")] = 0.0
-    """Fraction of its planned load / stiffness by which a servo's target leads; 0: the servo gives way under the load.
+    """Fraction of its planned load / stiffness by which a servo's target leads. 0: the servo gives way under the load.
     """
 
     load_filter_s: Annotated[float, above(60, "s")] = 0.3
@@ -54,7 +54,7 @@ class TripletParameters(FileStruct, frozen=True, kw_only=True):
     """Time over which one propulsion joint hands over to the next while the body is stationary."""
 
     hold_on_m: Annotated[float, from_zero(0.1, "m")] = 0.003
-    """Distance past o_2 at which the joint behind takes over; it exceeds the noise of the arc length."""
+    """Distance past o_2 at which the joint behind takes over. It exceeds the noise of the arc length."""
 
     # The swing of the propulsion joint: it swings out until its contacts carry the load. Damping and a fading
     # propulsion keep it from racing.
@@ -62,7 +62,7 @@ class TripletParameters(FileStruct, frozen=True, kw_only=True):
     """Damping of the propulsion joint, which limits its speed."""
 
     angle_fade_rad: Annotated[float, above(3.2, "rad")] = 0.2
-    """Angle off its reference from which the propulsion fades; at twice this angle it is zero."""
+    """Angle off its reference from which the propulsion fades. At twice this angle it is zero."""
 
     angle_guard_rad: Annotated[float, above(3.2, "rad")] = 0.7
     """Angle off its reference at which a propulsion joint returns to position mode."""
@@ -102,4 +102,4 @@ class TripletParameters(FileStruct, frozen=True, kw_only=True):
     """Maximum distance of that arc length behind the body."""
 
     speed_filter_s: SpeedFilter = 0.03
-    """Time constant of the filter of the speed along the path; 0: no filter."""
+    """Time constant of the filter of the speed along the path. 0: no filter."""

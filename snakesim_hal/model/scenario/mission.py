@@ -12,23 +12,23 @@ class Start(FileStruct, frozen=True, kw_only=True):
     """Start pose of the snake: along the scene's route, or straight at a pose."""
 
     on_route: bool = True
-    """True: the snake lies along the scene's route; false: it lies straight at a pose."""
+    """True: the snake lies along the scene's route. False: it lies straight at a pose."""
 
     tail_s_m: Annotated[float, Meta(ge=-100, le=1000, extra_json_schema={"unit": "m"})] = 0.0
-    """Arc length of the tail end along the route; used if `on_route` is true."""
+    """Arc length of the tail end along the route. Used if `on_route` is true."""
 
     position_m: Point = (0.0, 0.0)
-    """Position of the tail end in the world frame, as [x, y]; used if `on_route` is false."""
+    """Position of the tail end in the world frame, as [x, y]. Used if `on_route` is false."""
 
     yaw_rad: Heading = 0.0
-    """Direction from the tail to the head in the world frame; used if `on_route` is false."""
+    """Direction from the tail to the head in the world frame. Used if `on_route` is false."""
 
 
 class HeadingGoal(FileStruct, frozen=True, kw_only=True, tag="heading", tag_field="kind"):
     """Advance the whole body in one direction."""
 
     heading_rad: Heading = 0.0
-    """Direction of the advance in the world frame; 0: along x."""
+    """Direction of the advance in the world frame. 0: along x."""
 
     distance_m: Size = 3.0
     """Distance of the goal from the start pose."""
@@ -51,17 +51,17 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     """Speed along the path that navigation asks for."""
 
     goal: HeadingGoal | WaypointGoal | None = None
-    """Goal to which navigation plans a path, `kind` = "heading" or "waypoints"; none: the end of the scene's route."""
+    """Goal to which navigation plans a path, `kind` = "heading" or "waypoints". None: the end of the scene's route."""
 
     until_goal: bool = False
     """True: the run ends when the goal is reached, even before `duration_s`."""
 
     map: Literal["known", "perceived"] = "known"
-    """`known`: navigation has the obstacles of the scene, as from a survey; `perceived`: only what the sensors measure.
+    """`known`: navigation has the obstacles of the scene, as from a survey. `perceived`: only what the sensors measure.
     """
 
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
-    """Standard deviation of each obstacle's position in a known map; the errors follow from the run's seed."""
+    """Standard deviation of each obstacle's position in a known map. The errors follow from the run's seed."""
 
     assumed_obstacle_friction: Annotated[
         float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})
@@ -72,7 +72,7 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     """Height of the highest `step` of a known map that a robot with pitch joints climbs."""
 
     localization: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
-    """`pose_sensor`: the pose comes from the pose sensor if there is one; `dead_reckoning`: from joints, IMU, contacts
+    """`pose_sensor`: the pose comes from the pose sensor if there is one. `dead_reckoning`: from joints, IMU, contacts
     and the map alone.
     """
 

@@ -46,16 +46,16 @@ class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
     """Control cycles from the input of the service to the cycle in which its output is used, in lockstep."""
 
     restart: bool = True
-    """With `snakesim run --stay`, true: the run starts the process again when it ends; false: the run ends with it."""
+    """With `snakesim run --stay`, true: the run starts the process again when it ends. False: the run ends with it."""
 
     external: bool = False
     """True: the run waits for the process of the service, but does not start it."""
 
     process: Literal["own", "host"] = "own"
-    """`own`: the service has a process of its own; `host`: it is a thread in the process of the HAL host."""
+    """`own`: the service has a process of its own. `host`: it is a thread in the process of the HAL host."""
 
     plugin: str = ""
-    """Name of an installed service, or ./file.py:Class; empty: the installed service of the section's name."""
+    """Name of an installed service, or ./file.py:Class. Empty: the installed service of the section's name."""
 
     def used_output_tick(self, tick: int) -> int:
         """Return the newest tick whose output is used at `tick`; at the start, the output of tick 0 is used early."""
@@ -64,37 +64,37 @@ class ServiceSchedule(FileStruct, frozen=True, kw_only=True):
 
 
 class MaxAge(FileStruct, frozen=True, kw_only=True):
-    """Maximum age of the inputs of control, in robot time; the defaults follow from rates, delays and schedules.
+    """Maximum age of the inputs of control, in robot time. The defaults follow from rates, delays and schedules.
 
     If the joint states are older, control sends no command, so the lease ends and the robot stops. If a pose, contacts,
     an image, a world or a trajectory is older, the controller holds, and resumes when the stream is back.
     """
 
     joints_s: Seconds | None = None
-    """Maximum age of the joint states; none: it follows from rates, delays and schedules."""
+    """Maximum age of the joint states. None: it follows from rates, delays and schedules."""
 
     pose_s: Seconds | None = None
-    """Maximum age of the pose; none: it follows from rates, delays and schedules."""
+    """Maximum age of the pose. None: it follows from rates, delays and schedules."""
 
     contacts_s: Seconds | None = None
-    """Maximum age of the contacts; none: it follows from rates, delays and schedules."""
+    """Maximum age of the contacts. None: it follows from rates, delays and schedules."""
 
     depth_s: Seconds | None = None
-    """Maximum age of the newest image or ranges in a perceived map; none: it follows from rates, delays and schedules.
+    """Maximum age of the newest image or ranges in a perceived map. None: it follows from rates, delays and schedules.
     """
 
     world_s: Seconds | None = None
-    """Maximum age of the world that guidance publishes; none: it follows from rates, delays and schedules."""
+    """Maximum age of the world that guidance publishes. None: it follows from rates, delays and schedules."""
 
     trajectory_s: Seconds | None = None
-    """Maximum age of the trajectory that navigation publishes; none: it follows from rates, delays and schedules."""
+    """Maximum age of the trajectory that navigation publishes. None: it follows from rates, delays and schedules."""
 
 
 class RunConfig(FileStruct, frozen=True, kw_only=True):
     """The whole configuration of a run."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
-    """Name of the scenario; a file may leave it out, and has its file name then."""
+    """Name of the scenario. A file may leave it out, and has its file name then."""
 
     title: str = ""
     """Description in one line, which lists of scenarios show."""
@@ -114,7 +114,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     # Time.
     clock_mode: ClockMode = "lockstep"
-    """How robot time passes. `realtime`: by the wall clock; `lockstep`: the host waits for the services in every cycle;
+    """How robot time passes. `realtime`: by the wall clock. `lockstep`: the host waits for the services in every cycle.
     `free`: as fast as possible.
     """
 
@@ -128,7 +128,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     """Seed of all random numbers of the run."""
 
     faults: list[str] = []
-    """Faults to inject, at times since the first arming, such as "kill:control@2"; see docs/how-to/inject-faults.md."""
+    """Faults to inject, at times since the first arming, such as "kill:control@2". See docs/how-to/inject-faults.md."""
 
     allow_fault_injection: bool = False
     """True: faults may be injected also on a robot whose motors really move."""

@@ -19,11 +19,11 @@ class Obstacle(Message, frozen=True, kw_only=True):
     radius_m: Annotated[q.Length, about("of a cylinder or sphere")] = 0.0
     half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
     height_m: q.Length = 0.0
-    confidence: Annotated[q.Fraction, about("1: measured; less: estimated")] = 1.0
-    position_sd_m: Annotated[q.Distance, about("standard deviation of `position_w`, horizontally; 0: exact")] = 0.0
-    size_sd_m: Annotated[q.Distance, about("standard deviation of `radius_m` or `half_size_m`; 0: exact")] = 0.0
+    confidence: Annotated[q.Fraction, about("1: measured (less: estimated)")] = 1.0
+    position_sd_m: Annotated[q.Distance, about("standard deviation of `position_w`, horizontally (0: exact)")] = 0.0
+    size_sd_m: Annotated[q.Distance, about("standard deviation of `radius_m` or `half_size_m` (0: exact)")] = 0.0
     last_seen_ns: Annotated[
-        q.Stamp | None, about("stamp of the newest measurement of it; null: from a map, not from a sensor")
+        q.Stamp | None, about("stamp of the newest measurement of it (null: from a map, not from a sensor)")
     ] = None
     touched: Annotated[bool, about("the body has touched it")] = False
 
@@ -32,13 +32,13 @@ class WorldContact(Message, frozen=True, kw_only=True):
     """A contact in the world frame, with its position along the body."""
 
     link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
-    obstacle: Annotated[q.Name | None, about("touched obstacle; null: unknown")]
+    obstacle: Annotated[q.Name | None, about("touched obstacle (null: unknown)")]
     body_s_m: Annotated[q.Length, about("arc length from the tail end along the chain")]
     position_w: Annotated[q.Vector, about("where the body touches the obstacle")]
     normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
     tangent_w: Annotated[q.UnitVector, about("across the normal, towards the head")]
     force_w: Annotated[q.ForceVector, about("on the body")]
-    confidence: Annotated[q.Fraction, about("1: measured; less: estimated")] = 1.0
+    confidence: Annotated[q.Fraction, about("1: measured (less: estimated)")] = 1.0
 
 
 class World(Message, frozen=True, kw_only=True):
@@ -51,35 +51,31 @@ class World(Message, frozen=True, kw_only=True):
     base_confidence: Annotated[q.Fraction, about("of the base's pose")]
     contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")]
     obstacles: Annotated[list[Obstacle], Meta(max_length=4096), about("in the neighborhood of the body")]
-    pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
+    pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it (null: unknown)")] = None
     contacts_timestamp_ns: Annotated[
-        q.Stamp | None, about("of the contacts in it; null: no sample yet, and no estimate")
+        q.Stamp | None, about("of the contacts in it (null: no sample yet, and no estimate)")
     ] = None
-    center_w: Annotated[q.Vector | None, about("center of mass of the body; null: unknown")] = None
+    center_w: Annotated[q.Vector | None, about("center of mass of the body (null: unknown)")] = None
     base_position_sd_m: Annotated[
         q.Distance | None,
         about(
-            "standard deviation of `base_position_w`, horizontally; null: not estimated. If it is, the base's pose is "
+            "standard deviation of `base_position_w`, horizontally (null: not estimated). If it is, the base's pose is "
             "of `timestamp_ns`, by dead reckoning since `pose_timestamp_ns`"
         ),
     ] = None
     base_yaw_sd_rad: Annotated[
-        q.Angle | None, about("standard deviation of the base's heading; null: not estimated")
+        q.Angle | None, about("standard deviation of the base's heading (null: not estimated)")
     ] = None
     depth_timestamp_ns: Annotated[
-        q.Stamp | None, about("of the newest image or ranges in `obstacles`; null: none, or a map that is known")
+        q.Stamp | None, about("of the newest image or ranges in `obstacles` (null: none, or a map that is known)")
     ] = None
     pose_from: Annotated[
         Literal["sensor", "dead_reckoning"] | None,
-        about(
-            "present source of the base's pose; its age is that of `pose_timestamp_ns` or `timestamp_ns`; null: unknown"
-        ),
+        about("present source of the base's pose, measured at `pose_timestamp_ns` or `timestamp_ns` (null: unknown)"),
     ] = None
     contacts_from: Annotated[
         Literal["sensor", "joint_torques"] | None,
-        about(
-            "what `contacts` are of: measured, or estimated; their age is that of `contacts_timestamp_ns`; null: none"
-        ),
+        about("what `contacts` are of: measured, or estimated, at `contacts_timestamp_ns` (null: none)"),
     ] = None
 
 
@@ -95,29 +91,29 @@ class Trajectory(Message, frozen=True, kw_only=True):
     """`navigation/trajectory`: path, speed, and the push-points expected along it."""
 
     tick: Annotated[q.Tick, about("of the clock that navigation acted on")]
-    timestamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from; null: without one")]
+    timestamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from (null: without one)")]
     path_id: Annotated[q.Count, about("changes when `path_w` does")]
     path_w: Annotated[list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")]
-    speed_m_s: Annotated[q.Velocity, about("along the path; 0: stop")]
+    speed_m_s: Annotated[q.Velocity, about("along the path (0: stop)")]
     push_points: Annotated[
         list[q.Name], Meta(max_length=512), about("obstacles within reach of the path, in the order along it")
     ]
     finished: Annotated[bool, about("the end of the path is reached")]
-    reason: Annotated[q.Reason, about("why the speed is not that of the mission; empty: it is")] = ""
+    reason: Annotated[q.Reason, about("why the speed is not that of the mission (empty: it is)")] = ""
     searching: Annotated[
-        q.Reason, about("why another path is being searched, while this one is followed; empty: none is")
+        q.Reason, about("why another path is being searched, while this one is followed (empty: none is)")
     ] = ""
     searched_nodes: Annotated[q.Count, about("nodes that this search expanded since the last message")] = 0
     assumed_obstacle_friction: Annotated[
         float, q.from_zero(2, "1 (Coulomb coefficient)"), about("of the obstacles, as the path is planned with it")
     ] = 0.0
     goal_w: Annotated[
-        tuple[q.Length, q.Length] | None, about("x and y to which the mission leads the head; null: along the path")
+        tuple[q.Length, q.Length] | None, about("x and y to which the mission leads the head (null: along the path)")
     ] = None
     rises: Annotated[
         list[Rise],
         Meta(max_length=64),
-        about("where the path leads over platforms of a map; elsewhere ground is level"),
+        about("where the path leads over platforms of a map (elsewhere ground is level)"),
     ] = []
 
 
@@ -132,9 +128,9 @@ class ControlState(Message, frozen=True, kw_only=True):
     controller: q.Name
     state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: not armed, or the speed is to be 0")]
     reason: q.Reason
-    path_s_m: Annotated[q.Length | None, about("arc length of the tail along the path; null: unknown")] = None
-    propulsion_joint: Annotated[q.Name | None, about("the joint that pushes; null: none does")] = None
-    propulsion_n: Annotated[q.Force | None, about("commanded force along the path; null: none")] = None
+    path_s_m: Annotated[q.Length | None, about("arc length of the tail along the path (null: unknown)")] = None
+    propulsion_joint: Annotated[q.Name | None, about("the joint that pushes (null: none does)")] = None
+    propulsion_n: Annotated[q.Force | None, about("commanded force along the path (null: none)")] = None
     push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")] = []
     desired_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
     measured_force_n: Annotated[
@@ -145,17 +141,19 @@ class ControlState(Message, frozen=True, kw_only=True):
             "sensor of contacts"
         ),
     ] = []
-    propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint`; null: none pushes")] = None
+    propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint` (null: none pushes)")] = None
     bending_torque_nm: Annotated[q.Torques, about("of every joint, for the solved forces; or empty")] = []
     reference_rad: Annotated[q.Angles, about("of every joint, from the path; or empty")] = []
-    condition: Annotated[q.Scalar | None, about("condition number of the equations; null: none were solved")] = None
-    torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push; null: none pushes")] = None
+    condition: Annotated[q.Scalar | None, about("condition number of the equations (null: none were solved)")] = None
+    torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push (null: none pushes)")] = (
+        None
+    )
     saturated: Annotated[bool, about("the push is at its torque limit")] = False
     jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
     custom: Annotated[dict[q.Name, q.Scalar], Meta(max_length=32), about("numbers that the controller defines")] = {}
     failed: Annotated[bool, about("the last message of a controller that cannot continue; `reason` is why")] = False
     too_slow: Annotated[
-        q.Reason, about("in real time: what shows that the controller misses its deadlines; empty: nothing does")
+        q.Reason, about("in real time: what shows that the controller misses its deadlines (empty: nothing does)")
     ] = ""
 
 
@@ -179,7 +177,7 @@ class ControlParameters(Message, frozen=True, kw_only=True):
     controller: q.Name
     parameters: Annotated[str, Meta(max_length=q.MAX_PARAMETERS_JSON), about("all of them, as a JSON object")]
     schema: Annotated[str, Meta(max_length=q.MAX_SCHEMA), about("JSON Schema of `parameters`, with bounds and units")]
-    requester: Annotated[q.Name | None, about("name of the requester of them; null: the configuration of the run")] = (
+    requester: Annotated[q.Name | None, about("name of the requester of them (null: the configuration of the run)")] = (
         None
     )
     changes: Annotated[q.Count, about("how often they have been changed since control started")] = 0
@@ -200,5 +198,5 @@ class Intent(Message, frozen=True, kw_only=True):
         1_000_000_000
     )
     heading_w_rad: Annotated[
-        q.Angle | None, about("direction of travel in the world, from its x axis; null: the mission's own goal")
+        q.Angle | None, about("direction of travel in the world, from its x axis (null: the mission's own goal)")
     ] = None

@@ -15,7 +15,7 @@ class MountedSample(Message, frozen=True, kw_only=True):
     """Base of the samples of sensors that are mounted on a link."""
 
     tick: q.Tick
-    timestamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
+    timestamp_ns: Annotated[q.Stamp, about("of the measurement (`tick` is later by the delay)")]
     link: Annotated[q.LinkIndex, about("that carries the sensor, from 0 at the tail")]
     position_l: Annotated[q.Vector, about("of the sensor")]
     orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]

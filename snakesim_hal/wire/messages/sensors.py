@@ -18,7 +18,7 @@ class JointState(Message, frozen=True, kw_only=True):
     velocity_rad_s: Annotated[q.AngularVelocities, about(ONE_PER_JOINT)]
     torque_nm: Annotated[
         q.Torques,
-        about("of the motor; positive turns towards positive angles; 0 of a joint that does not measure it"),
+        about("of the motor, positive towards positive angles (0 of a joint that does not measure it)"),
     ]
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]

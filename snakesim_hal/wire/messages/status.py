@@ -31,7 +31,7 @@ class Clock(Message, frozen=True, kw_only=True):
     arm_session: Annotated[
         q.Count, about("how often the robot has been armed since its host started; a new number: reset the controller")
     ]
-    lease_epoch: Annotated[q.Count, about("of the live lease; 0: there is none")]
+    lease_epoch: Annotated[q.Count, about("of the live lease (0: there is none)")]
     newest: Annotated[
         dict[q.Name, q.Tick],
         Meta(max_length=64),
@@ -51,7 +51,7 @@ class Fault(Message, frozen=True, kw_only=True):
     joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
     reach: Annotated[
         Reach,
-        about("joint: no other is affected, and the robot may continue if its file allows it; none: it stops nothing"),
+        about("joint: no other is affected, and the robot may continue if its file allows it (none: it stops nothing)"),
     ] = "robot"
 
 
@@ -109,11 +109,11 @@ class Status(Message, frozen=True, kw_only=True):
     ] = []
     host: Annotated[q.Name | None, ABOUT_HOST] = None
     faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
-    paused_by: Annotated[q.Name | None, about("client that paused the simulator; null: it is not paused")] = None
+    paused_by: Annotated[q.Name | None, about("client that paused the simulator (null: it is not paused)")] = None
     speed: Annotated[q.Speed, about("requested speed in real time: robot time per wall time")] = 1.0
     real_time_factor: Annotated[
         Annotated[float, q.from_zero(1e6, "1")] | None,
-        about("robot time per wall time over the last second; null: not measured, such as in a pause"),
+        about("robot time per wall time over the last second (null: not measured, such as in a pause)"),
     ] = None
     tick_times: Annotated[
         dict[q.Name, Timing],
@@ -125,7 +125,9 @@ class Status(Message, frozen=True, kw_only=True):
     ] = {}
     unchecked: Annotated[
         q.Reason,
-        about("why arming needs the flag `unchecked`: its joints were not checked as they are now; empty: it does not"),
+        about(
+            "why arming needs the flag `unchecked`: its joints were not checked as they are now (empty: it does not)"
+        ),
     ] = ""
     held_up: Annotated[
         q.Reason, about("which answer to which tick lockstep has been waiting for, if longer than half a second")
@@ -150,12 +152,12 @@ class Process(Message, frozen=True, kw_only=True):
     settings: Annotated[
         dict[q.Name, q.Name],
         Meta(max_length=q.MAX_SHARED_SETTINGS),
-        about("settings that host and services must share: values, and hashes of long ones; empty: it uses none"),
+        about("settings that host and services must share: values, and hashes of long ones (empty: it uses none)"),
     ] = {}
     messages: Annotated[
         dict[q.Name, Annotated[q.Count, about("version of that message")]],
         Meta(max_length=64),
-        about("messages that it knows; empty: unknown"),
+        about("messages that it knows (empty: unknown)"),
     ] = {}
     waits_for: Annotated[
         list[q.Name], Meta(max_length=16), about("keys whose first message it waits for; it publishes nothing before")

@@ -8,7 +8,7 @@ from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
-FILE = "the robot file that the host was started with; the values are written into it"
+FILE = "the robot file that the host was started with, into which the values are written"
 
 
 def add_write(parser: argparse.ArgumentParser, about: str) -> None:
@@ -24,7 +24,7 @@ def _add_robot_file(parser: argparse.ArgumentParser) -> None:
 
 def _add_joint_names(parser: argparse.ArgumentParser) -> None:
     _add_robot_file(parser)
-    parser.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+    parser.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3 (default: all joints)")
 
 
 def _add_zero(parser: argparse.ArgumentParser) -> None:
@@ -144,7 +144,7 @@ def _identify(arguments: argparse.Namespace) -> int:
 COMMANDS: Commands = (
     Noun(
         name="robot calibrate",
-        help="Find zeros, directions, limits and gears of joints by hand, and write them down; the motors stay off.",
+        help="Find zeros, directions, limits and gears of joints by hand, and write them down. The motors stay off.",
     ),
     Command(
         name="robot calibrate zero",

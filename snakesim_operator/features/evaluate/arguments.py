@@ -45,7 +45,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _add_sweep(parser: argparse.ArgumentParser) -> None:
     add_scenario_name(parser)
-    _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B]; may be repeated")
+    _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B] (may be repeated)")
     _add_seeds(parser, "runs for each value (default: 1)")
     add_set(parser)
     _add_shared(parser)
@@ -56,10 +56,10 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
-        help="name of a shipped scenario, or path of its file; with --rows, of a suite",
+        help="name of a shipped scenario, or path of its file, or of a suite with --rows",
     )
     _add_rows(parser, "on these rows of a suite, with what it draws")
-    _add_vary(parser, "range of a key: KEY=LOW:HIGH; may be repeated")
+    _add_vary(parser, "range of a key: KEY=LOW:HIGH (may be repeated)")
     parser.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
     parser.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
     parser.add_argument(
@@ -70,7 +70,7 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
         "--storage",
         type=Path,
         metavar="FILE",
-        help="SQLite file; an existing one is continued (default: a new one in runs/)",
+        help="SQLite file, which is continued if it exists (default: a new one in runs/)",
     )
     add_set(parser)
     _add_study_seed(parser)
@@ -98,7 +98,10 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_study_seed(parser: argparse.ArgumentParser) -> None:
-    add_seed(parser, "of the first field; the next one has SEED + 1; default: 1, or drawn by the suite")
+    add_seed(
+        parser,
+        "of the first field, of which each following field has the next number (default: 1, or drawn by the suite)",
+    )
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -261,11 +264,11 @@ def _check_extra() -> None:
 COMMANDS: Commands = (
     Command(
         name="study evaluate",
-        help="Run controllers on many fields; writes a table with confidence intervals, and a page.",
+        help="Run controllers on many fields. Writes a table with confidence intervals, and a page.",
         add=_add_evaluate,
         run=_evaluate,
-        details="Exit code: 0 all cases ran, also if their runs failed; 1 some could not; 2 wrong input, nothing was "
-        "run; 130 stopped by Ctrl-C; continue with --resume.",
+        details="Exit code: 0 all cases ran, also if their runs failed, 1 some could not, 2 wrong input, nothing was "
+        "run, 130 stopped by Ctrl-C. Continue with --resume.",
         examples=(
             "study evaluate clutter --controllers obstacle_aided,hold --fields 20",
             "study evaluate ./suite.toml --out runs/suite --resume",

@@ -75,12 +75,12 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     """Scenario that all cases begin with: the name of a shipped one, or a path."""
 
     fields: Count = 20
-    """Number of fields for each row and controller, unless `--fields` gives another; a field is the seed of a run and
+    """Number of fields for each row and controller, unless `--fields` gives another. A field is the seed of a run and
     of its random scene.
     """
 
     controllers: list[str] = []
-    """Controllers to try, unless `--controllers` gives others; empty: that of the scenario."""
+    """Controllers to try, unless `--controllers` gives others. Empty: that of the scenario."""
 
     give_up_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 12.0
     """Robot time without 3 cm of advance after which a run is ended as stuck."""
@@ -95,18 +95,18 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     """Optional keys that every row removes."""
 
     vary: dict[str, list[Any] | str] = {}
-    """For each key its values, as a list or as "LOW:HIGH:COUNT"; every combination of the values is a row."""
+    """For each key its values, as a list or as "LOW:HIGH:COUNT". Every combination of the values is a row."""
 
     row: list[SuiteRow] = []
-    """Rows with a name, each an entry `[[row]]`, combined with every combination of `vary`; empty: only these
+    """Rows with a name, each an entry `[[row]]`, combined with every combination of `vary`. Empty: only these
     combinations.
     """
 
     randomize: list[Randomization] = []
-    """Random values, each an entry `[[randomize]]`; a value is the same for every row and controller of one field."""
+    """Random values, each an entry `[[randomize]]`. A value is the same for every row and controller of one field."""
 
     fresh: bool = False
-    """True: every evaluation has new fields, unless `--seed` gives the first one; false: fields begin at the same
+    """True: every evaluation has new fields, unless `--seed` gives the first one. False: fields begin at the same
     number.
     """
 

@@ -26,7 +26,7 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     instead.add_argument(
         "--paper", action="store_true", help="instead: the paper's Figures 8 to 13, of this run, one file each"
     )
-    add_out(parser, "FILE.pdf, .svg or .png; with --paper a folder (default: in RUN)")
+    add_out(parser, "FILE.pdf, .svg or .png, or a folder with --paper (default: in RUN)")
     parser.add_argument(
         "--width-in",
         type=number_type(1.0, 40.0, "inches"),
@@ -67,8 +67,8 @@ COMMANDS: Commands = (
         add=_add_plot,
         run=_plot,
         details="Signals are named as in `snakesim recording export`. A comma puts several of one unit on one pair of "
-        "axes: angle_rad.joint_7,target.joint_7. Several runs are overlaid, each in its color. Exit code: 0; 2 wrong "
-        "input; 3 made, but something is missing in a recording.",
+        "axes: angle_rad.joint_7,target.joint_7. Several runs are overlaid, each in its color. Exit code: 0, 2 wrong "
+        "input, 3 made, but something is missing in a recording.",
         examples=(
             "recording plot runs/demo angle_rad.joint_7,target.joint_7 torque_nm --from 2 --to 6",
             "recording plot runs/a runs/b runs/c velocity_b_m_s.x --mean --out speed.png",

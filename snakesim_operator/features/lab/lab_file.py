@@ -29,7 +29,7 @@ class Machine(FileStruct, frozen=True, kw_only=True):
     """A computer of the lab."""
 
     address: Address | None = None
-    """Address at which other machines reach this one; a router's machine needs one."""
+    """Address at which other machines reach this one. A router's machine needs one."""
 
     folder: Folder = "/etc/snakesim"
     """Folder in which its rendered files are installed."""
@@ -64,10 +64,10 @@ class Grant(FileStruct, frozen=True, kw_only=True):
     """Role of the machine: what it may publish, read and ask, see schemas/roles.md."""
 
     robot: Name
-    """Robot that the role is for, or `all`; a gnc has one robot."""
+    """Robot that the role is for, or `all`. A gnc has one robot."""
 
     services: list[Name] = msgspec.field(default_factory=lambda: list(GNC_SERVICES))
-    """Services that a gnc runs; other roles ignore it."""
+    """Services that a gnc runs. Other roles ignore it."""
 
 
 class LabFile(FileStruct, frozen=True, kw_only=True):
@@ -77,7 +77,7 @@ class LabFile(FileStruct, frozen=True, kw_only=True):
     """Name of the lab, which its certificates contain."""
 
     certificate_days: Days = 30
-    """Lifetime of a machine's certificate; short, because certificates are not revoked."""
+    """Lifetime of a machine's certificate. Short, because certificates are not revoked."""
 
     authority_days: Annotated[float, from_zero(7300, "days")] = 1825
     """Lifetime of the lab's certificate authority."""
@@ -86,7 +86,7 @@ class LabFile(FileStruct, frozen=True, kw_only=True):
     """Computers by name, as sections such as `[machines.bench]`."""
 
     routers: dict[Name, Router]
-    """Zenoh routers by name, as sections such as `[routers.main]`; a lab has at least one."""
+    """Zenoh routers by name, as sections such as `[routers.main]`. A lab has at least one."""
 
     robots: dict[Name, LabRobot]
     """Robots by name, as sections such as `[robots.snake]`."""

@@ -19,7 +19,11 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
         help="axis of the root link that points up (default: z)",
     )
     parser.add_argument(
-        "--scale", type=float, default=1.0, metavar="M", help="meters per unit of length; 0.001 for mm (default: 1)"
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="M",
+        help="meters per unit of length, such as 0.001 for mm (default: 1)",
     )
     parser.add_argument(
         "--like",
@@ -52,7 +56,7 @@ def _export(arguments: argparse.Namespace) -> int:
 COMMANDS: Commands = (
     Command(
         name="robot import",
-        help="Make a robot file from a URDF; reports what cannot be carried over.",
+        help="Make a robot file from a URDF. Reports what cannot be carried over.",
         add=_add_import,
         run=_import,
         examples=("robot import snake.urdf", "robot import snake.urdf --out snake.toml --scale 0.001 --json"),

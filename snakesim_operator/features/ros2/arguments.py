@@ -37,7 +37,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stamps",
         choices=["robot", "wall"],
-        help="robot: robot time, with /clock; wall: wall-clock time (default: robot if nothing real moves, else wall)",
+        help="robot: robot time, with /clock, wall: wall-clock time (default: robot if nothing real moves, else wall)",
     )
     add_network(parser)
 
@@ -79,7 +79,7 @@ def check(arguments: argparse.Namespace) -> None:
 COMMANDS: Commands = (
     Command(
         name="start ros2",
-        help="Start a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS.",
+        help="Start a ROS 2 node for a robot, through the router of rmw_zenoh. Needs no ROS.",
         add=_add_arguments,
         run=_run,
         details="Publishes joint states, transforms, markers, images, IMUs, scans, the robot's URDF, diagnostics and "

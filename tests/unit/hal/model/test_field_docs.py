@@ -72,8 +72,8 @@ def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
     assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
     exceptions: Any = JointExceptions
     described = describe_fields(exceptions)
-    assert described["torque_nm"] == "Maximum torque of the joint; none: as in the section for all."
-    assert described["rated_nm"].count("none:") == 1
+    assert described["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."
+    assert described["rated_nm"].count("None:") == 1
 
 
 def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.MonkeyPatch) -> None:
