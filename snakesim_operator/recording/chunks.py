@@ -55,7 +55,7 @@ def read_chunk_length(head: bytes) -> int:
 
 
 def unpack_chunk(content: bytes) -> bytearray:
-    """Decompress an MCAP chunk.
+    """Decompress a chunk of an MCAP file, and check its lengths and its checksum.
 
     Args:
         content: Content of the chunk's record: a header, the name of the compression, and the compressed records.

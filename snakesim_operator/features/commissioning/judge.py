@@ -281,7 +281,7 @@ def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_ba
 
 
 def _judge_zero(run: CheckMeasurements, joint: int, *, straight: bool) -> PropertyFinding:
-    """Judge the zero of a joint's angle.
+    """Judge whether the zero of a joint's angle in the robot file is right.
 
     If accelerometers measure the joint's angle by gravity, the encoder is compared with it. Otherwise it is compared
     with zero, if the robot was laid straight.
@@ -290,6 +290,9 @@ def _judge_zero(run: CheckMeasurements, joint: int, *, straight: bool) -> Proper
         run: Measurements of the check.
         joint: Index of the joint.
         straight: Whether a person states that the robot lay straight at the start.
+
+    Returns:
+        Confirmed, wrong with the zero to write into the robot file, or unknown with the reason.
     """
     at_rest = run.at_rest()
     before_motion = run.before_motion()
