@@ -149,6 +149,12 @@ class Hosted:
     """Runs host and controller in threads until `close`, each with its own session, and observes them."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
+        """Start a host with a backend, and a controller, in two threads that communicate over a loopback network.
+
+        Args:
+            backend: the backend under test, whose calls are recorded.
+            config: configuration of the run.
+        """
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
