@@ -143,7 +143,7 @@ def parse_chunk(data: bytearray) -> Iterator[McapRecord]:
 
 
 def parse_record(opcode: int, content: memoryview) -> McapRecord:
-    """Decode the content of one MCAP record.
+    """Decode the content of one MCAP record, and check that its length is right.
 
     Args:
         opcode: Kind of the record: a message, channel, header, metadata, schema or statistics.

@@ -119,6 +119,13 @@ class _JointJudge:
     """Judges the joints of one run, with what all of their motions tell together."""
 
     def __init__(self, run: CheckMeasurements, *, straight: bool, allowed_backlash_rad: float) -> None:
+        """Measure the motion of the links for each joint, and find modules whose ids are swapped.
+
+        Args:
+            run: measurements of the joint check.
+            straight: whether a person states that the robot lay straight at the start.
+            allowed_backlash_rad: largest backlash that is not judged as wrong.
+        """
         self._run = run
         self._straight = straight
         self._allowed_backlash_rad = allowed_backlash_rad
