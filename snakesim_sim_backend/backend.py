@@ -91,7 +91,8 @@ class SimBackend(Backend):
         self._period_s = config.period_ns * 1e-9
 
         # Physics and motors, with the snake at rest.
-        self._sim = build(config, settings, laws=laws)
+        has_contact_sensor = config.robot.sensors.contacts is not None
+        self._sim = build(config, settings, laws=laws, measures_force=has_contact_sensor)
         self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)
@@ -237,5 +238,5 @@ class SimBackend(Backend):
             angles_rad=angles_rad.copy(),
             velocities_rad_s=velocities_rad_s.copy(),
             torques_nm=self._motors.applied_nm().copy(),
-            contacts=list(TouchReader(self._sim, data, self._physics).read()),
+            contacts=list(TouchReader(self._sim, data, self._physics.contacts).read()),
         )

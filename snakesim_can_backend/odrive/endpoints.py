@@ -76,7 +76,7 @@ def read_endpoints(path: str) -> Endpoints:
         The ids, with the firmware and the hardware that the file is for.
 
     Raises:
-        ConfigError: the file cannot be read, or does not list a setting.
+        ConfigError: the file cannot be read, or a setting is missing.
     """
     where = "`backends.odrive.endpoints`"
     advice = "take the flat_endpoints.json that ODrive publishes with the axes' firmware"

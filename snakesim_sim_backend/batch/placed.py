@@ -72,7 +72,7 @@ def place(config: RunConfig) -> PlacedRobot:
     # MuJoCo's own sensors are the IMUs, which no environment observes.
     sim.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     touch_memory = data.plugin_state[find_touches(sim.model)] if sim.laws == "c" else None
-    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics), touch_memory)
+    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics.contacts), touch_memory)
 
 
 def read_rotations(robot: PlacedRobot) -> np.ndarray:

@@ -81,6 +81,7 @@ def build(
     motors: bool = True,
     laws: LawsVersion | None = None,
     keeps_touches: bool = False,
+    measures_force: bool = False,
 ) -> SimModel:
     """Compile the MuJoCo model of a run: robot, obstacles, ground, motors, sensors and friction.
 
@@ -92,6 +93,7 @@ def build(
         laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
         keeps_touches: whether the C version writes the forces between links and obstacles into MuJoCo's state, for
             programs that see only the state.
+        measures_force: whether the simulation has a contact sensor, which `Physics.measure_force` is for.
 
     Returns:
         The model, with the indices by which other modules find links, feet and obstacles in it.
@@ -100,7 +102,9 @@ def build(
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
     """
     laws = laws or choose_laws()
-    blueprint = make_blueprint(config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches)
+    blueprint = make_blueprint(
+        config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches, measures_force=measures_force
+    )
     model = _compile(blueprint.spec, config.robot.name)
     links = config.robot.chain.modules + 1
     first_link_body = model.body("link_0").id
@@ -121,7 +125,13 @@ def build(
 
 
 def make_blueprint(
-    config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion, keeps_touches: bool = False
+    config: RunConfig,
+    settings: SimSettings,
+    *,
+    motors: bool,
+    laws: LawsVersion,
+    keeps_touches: bool = False,
+    measures_force: bool = False,
 ) -> Blueprint:
     """Assemble the model of a run before it is compiled: bodies, geoms, motors, and the friction of each geom.
 
@@ -164,7 +174,8 @@ def make_blueprint(
     friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
     for geom in spec.geoms:
         geom.friction[0] = friction_of.get(geom.name, 0.0)
-    add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
+    yielding_bodies = [geom_name(item) for item in yielding]
+    add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)
     return Blueprint(spec, steps_per_tick, yielding, laws)
 
 

@@ -44,7 +44,7 @@ class Rays:
         """Find the nearest surface along each ray from the present place of the sensor, flat ground included.
 
         Returns:
-            (n,) distances in lengths of the ray; inf without one.
+            (n,) distances in lengths of the ray; inf for a ray that reaches no surface.
         """
         origin_w, world_from_sensor = self._mount.place()
         rays_w = self._rays_s @ world_from_sensor.T

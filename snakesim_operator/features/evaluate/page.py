@@ -37,6 +37,8 @@ def render_page(title: str, source: str, rows: Sequence[ResultRow], failures: Se
             _draw_figure("Speed, m/s", rows, controllers, _quartiles_of("advance_m_s", of_crossed=True)),
             _draw_figure("Energy, J/m", rows, controllers, _quartiles_of("energy_j_per_m", of_crossed=True)),
             _draw_figure("Advance, m", rows, controllers, _quartiles_of("advance_m")),
+            _draw_figure("Net speed, m/s", rows, controllers, _quartiles_of("displacement_m_s")),
+            _draw_figure("Net energy, J/m", rows, controllers, _quartiles_of("displacement_energy_j_per_m")),
             _draw_figure("Stalled time, s", rows, controllers, _quartiles_of("stalled_s")),
         ],
         goals=any(row.crossed is not None for row in rows),

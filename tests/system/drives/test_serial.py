@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_hal.network.free_ports import find_free_port
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snakesim
 from snakesim_testing.harness.endpoint import free_endpoint
@@ -30,9 +31,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pose(folder: Path) -> Iterator[str]:
     """Servos on `./servos`; where they send the pose."""
-    address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
-    said, first = folder / "servos.printed", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
-    with said.open("wb") as file:
+    address = f"127.0.0.1:{find_free_port()}"
+    output, first = folder / "servos.log", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
+    with output.open("wb") as file:
         servos = subprocess.Popen(
             [*first, *SNAKESIM, "drive", "emulate", "dynamixel", "triplet", "--channel", "servos", "--pose", address],
             cwd=folder,
@@ -41,7 +42,7 @@ def pose(folder: Path) -> Iterator[str]:
             stderr=file,
         )
     try:
-        wait_until(lambda: "servos ready: 13" in said.read_text(), "the servos")
+        wait_until(lambda: "servos ready: 13" in output.read_text(), "the servos")
         yield address
     finally:
         servos.terminate()
