@@ -97,7 +97,7 @@ def build_wheel(processor: Processor, compiled: Path, folder: Path) -> Path:
 
 
 def check_wheel(wheel: Path, processor: Processor) -> None:
-    """Exit if a library in the wheel is for another processor, or needs a newer C library than its tag says."""
+    """Exit if a library in the wheel is for another processor, or needs a newer C library than its tag states."""
     with zipfile.ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if name.endswith(".so")]
         if not names:

@@ -27,7 +27,7 @@ HEADINGS = ("daily work", "robot", "runs and studies", "files and computers")  #
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command of `snakesim`, and report its errors on stderr.
 
     Args:
         argv: the arguments; None for those of this process, which runs nothing but this command then.

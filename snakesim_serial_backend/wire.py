@@ -231,7 +231,7 @@ class SerialWire:
                 return b""
             _, event = events[0]
             if event & GONE:
-                raise OSError("hung up")
+                raise OSError("disconnected")
             data = os.read(descriptor, READ_BYTES)
             if data:
                 return data

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Brings a CAN interface up, until the next restart of the machine; --help says how.
+# Brings a CAN interface up, until the next restart of the machine; --help explains how.
 set -eu
 
 bitrate=1000000

@@ -80,7 +80,7 @@ def module_name(path: str) -> str:
 
 
 def dependencies(module: bytes) -> list[str]:
-    """What a module says it depends on, in its section `.modinfo`."""
+    """Return the modules on which a module depends, as its section `.modinfo` lists them."""
     found = re.search(rb"\0depends=([^\0]*)\0", module)
     return found[1].decode().replace("-", "_").split(",") if found and found[1] else []
 

@@ -1,4 +1,4 @@
-"""Boots a guest, runs one command in it, and passes on what the command says.
+"""Boots a guest, runs one command in it, and passes on the output of the command.
 
 The guest's root is the host's file system, read-only; what the guest writes stays in its memory, except in the
 folders that it may write. It keeps what it has read: a file that the host changes meanwhile may be seen or not.

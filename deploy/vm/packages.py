@@ -13,7 +13,7 @@ APT_LIMIT_S = 900
 
 
 class PreparationError(RuntimeError):
-    """Something that the guest needs is missing; the message says what to do."""
+    """Something that the guest needs is missing; the message explains what to do."""
 
 
 def find_tool(name: str) -> str | None:

@@ -5,7 +5,7 @@
 
 A kernel with CAN gets a network namespace of its own, in which nothing of the host is touched. Where the kernel has no
 CAN, the command runs in a guest that has the host's files: this checkout may be written, any other change stays in the
-guest. SNAKESIM_VCAN tells the command which: native or guest. Needs Debian or Ubuntu on x86-64 for the guest.
+guest. SNAKESIM_VCAN is set to it: native or guest. Needs Debian or Ubuntu on x86-64 for the guest.
 
 Why not virtme-ng: 1.42 boots the same kernel without KVM, but wants its modules and kmod installed on the host. It does
 not load Debian's virtio_console, so output and exit code of the command were lost ("cannot find script I/O ports"), and
@@ -135,7 +135,7 @@ def _parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--channels", type=names, default=["vcan0"], help="default: vcan0; or vcan0,vcan1,...")
     parser.add_argument("--guest", action="store_true", help="use a guest even if this kernel has CAN")
-    parser.add_argument("--verbose", action="store_true", help="show what the guest's kernel says")
+    parser.add_argument("--verbose", action="store_true", help="show the messages of the guest's kernel")
     guest = parser.add_argument_group("in the guest only")
     guest.add_argument("--controllers", action="store_true", help="two emulated controllers, can0 and can1, on one bus")
     guest.add_argument("--forward", type=ports, action="append", default=[], metavar="HOSTPORT:GUESTPORT")

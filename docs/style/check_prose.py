@@ -89,7 +89,7 @@ def main() -> int:
     for problem in problems:
         print(problem)
     if problems:
-        print(f"{len(problems)} problems; docs/style/reject.toml says what to write instead", file=sys.stderr)
+        print(f"{len(problems)} problems; docs/style/reject.toml lists what to write instead", file=sys.stderr)
     return 1 if problems else 0
 
 

@@ -102,6 +102,13 @@ class ModuleReports:
     """The newest reports of all modules of a robot. Joint i is node i + 1."""
 
     def __init__(self, joints: int) -> None:
+        """Prepare to read the frames of all modules of a robot, none of which has sent a report yet.
+
+        Functions that read each kind of frame are compiled here, because they run for every frame.
+
+        Args:
+            joints: number of joints; joint i has node i + 1.
+        """
         self.modules = [ModuleStatus(node) for node in range(1, joints + 1)]
 
         # What is still missing of the answers to the newest Sync.

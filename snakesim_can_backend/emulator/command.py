@@ -121,6 +121,13 @@ class Loop:
     """Serves the emulators until it is stopped, and keeps statistics."""
 
     def __init__(self, server: EmulatorServer, arguments: argparse.Namespace, bit_rate: int) -> None:
+        """Prepare to serve the emulators with the options of the command line.
+
+        Args:
+            server: the modules, and their end of each bus.
+            arguments: the parsed command line.
+            bit_rate: bit rate of the buses in bit/s, for the load that is printed.
+        """
         self._server = server
         self._chain = server.chain
         self._bit_rate = bit_rate

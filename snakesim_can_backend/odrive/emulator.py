@@ -280,7 +280,12 @@ class EmulatedOdrive(CanEmulator):
 
 
 def make_configuration(joint: Joint, settings: OdriveSettings) -> AxisConfiguration:
-    """Return what an axis is configured for: what its joint in the robot file needs, unless the scenario differs."""
+    """Return what an emulated axis is configured for: what its joint needs, unless the scenario differs.
+
+    Args:
+        joint: the joint, as the robot file describes it.
+        settings: settings of the driver type, which may mount an axis that is configured otherwise.
+    """
     mounted = settings.mounted.get(joint.name, MountedAxis())
     watchdog_timeout_s = settings.watchdog_s
     if mounted.watchdog_timeout_s is not None:

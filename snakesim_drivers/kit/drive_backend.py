@@ -127,7 +127,12 @@ class DriveBackend(Backend):
         return self._make_samples(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """Send setpoints to the drives that follow in this lifecycle state, and switch off the others."""
+        """Send setpoints to the drives that follow in this lifecycle state, and switch off the others.
+
+        Args:
+            setpoints: setpoints of all joints that have passed the limiter, and which joints are isolated.
+            lifecycle: state of the robot in this cycle.
+        """
         if not self._open:
             return
         self._send_lifecycle(lifecycle, setpoints.isolated)

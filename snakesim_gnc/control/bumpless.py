@@ -31,6 +31,11 @@ class HandOver:
     """
 
     def __init__(self, robot: Description) -> None:
+        """Prepare the hand-over of torque between joints that are all in position mode.
+
+        Args:
+            robot: description of the robot, with the gains of the drives' position loops.
+        """
         stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         # Gains of the drives' position loops.
         self._kp = np.maximum(stiffness, MIN_STIFFNESS_NM_PER_RAD)  # N·m/rad
@@ -62,13 +67,13 @@ class HandOver:
     def pass_to(
         self, torque_joint: int | None, joints: JointState, reference_rad: Floats, *, fade_in_again: bool = False
     ) -> None:
-        """Hand the propulsion over to another joint.
+        """Hand the propulsion over to another joint, so that neither of the two drives changes its torque with a jump.
 
         Args:
             torque_joint: index of the joint that is in torque mode from now on; None for no joint.
             joints: measured joint states.
             reference_rad: reference angles of all joints.
-            fade_in_again: fade in again even if the joint is the same, because the requested torque may have jumped.
+            fade_in_again: fade in also if the joint is the same, because the requested torque may have jumped.
         """
         if torque_joint == self._torque_joint and not fade_in_again:
             return

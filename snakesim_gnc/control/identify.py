@@ -136,7 +136,7 @@ def triangle_wave(cycles: float) -> float:
 
 
 def make_tones(joint_count: int, max_hz: float) -> list[list[Tone]]:
-    """Make the tones of each joint.
+    """Make the sine tones with which system identification shakes each joint.
 
     The frequencies are in geometric progression from max_hz / BAND_RATIO to max_hz, and no two joints have one in
     common. Amplitudes are proportional to 1 / sqrt(frequency), and those of a joint sum to 1.

@@ -46,6 +46,12 @@ class JointCheck(Controller[JointCheckParameters]):
     needs_world = False
 
     def __init__(self, robot: Description, parameters: JointCheckParameters) -> None:
+        """Create a controller that tests one joint after the other, beginning at the tail.
+
+        Args:
+            robot: description of the robot, with the limits of the joints.
+            parameters: how far and how fast each joint is moved.
+        """
         super().__init__(robot, parameters)
         self._start_rad: list[float] = []  # empty: there has been no observation yet
 

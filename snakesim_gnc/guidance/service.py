@@ -82,6 +82,12 @@ class _SurveyedSource:
     """Uses the scene's map. Dead reckoning replaces a missing pose sensor, an estimate missing contact sensors."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
+        """Subscribe to the sensors, and read the surveyed obstacles of the scene.
+
+        Args:
+            client: connection to the robot.
+            config: configuration of the run, with the scene and the robot's sensors.
+        """
         sensors = config.robot.sensors
         self._client = client
         self._config = config

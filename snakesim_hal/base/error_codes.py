@@ -17,7 +17,7 @@ class ErrorCode(NamedTuple):
     title: str
     cause: str
     remedy: str
-    page: str = ""  # a page below docs/ with the steps of the remedy; empty if the remedy says everything
+    page: str = ""  # a page below docs/ with the steps of the remedy; empty if the remedy is complete
 
 
 ERROR_CODES = {

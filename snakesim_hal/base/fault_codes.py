@@ -171,7 +171,7 @@ REFUSAL_CODES = {
     "wrong_config": ErrorCode("The request names another configuration.", "The run changed.", "Read the description."),
     "wrong_host": ErrorCode("The request names another host.", "The host restarted.", "Read the description again."),
     "not_simulated": ErrorCode("Time cannot be changed here.", "The robot is real.", "Use a simulated robot."),
-    "wrong_pace": ErrorCode("The clock mode has no speed.", "It is not realtime.", "Use --clock-mode realtime."),
+    "wrong_clock_mode": ErrorCode("The clock mode has no speed.", "It is not realtime.", "Use --clock-mode realtime."),
     "not_allowed": ErrorCode(
         "This run does not allow it.", "Faults were not allowed.", "See docs/how-to/inject-faults.md."
     ),

@@ -111,7 +111,7 @@ class SimulatedTime:
             return Refusal("wrong_state", "nothing to resume: it is not paused")
         if request.action == "speed" and self._clock_mode != "realtime":
             explanation = "goes as fast as it can; for a speed start the run with --clock-mode realtime"
-            return Refusal("wrong_pace", f"the clock mode is {self._clock_mode}, which {explanation}")
+            return Refusal("wrong_clock_mode", f"the clock mode is {self._clock_mode}, which {explanation}")
         return None
 
     def tick_done(self, tick: int) -> None:

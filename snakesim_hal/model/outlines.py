@@ -184,8 +184,8 @@ def has_gap_below(single: Outlines, others: Outlines, limit_m: float) -> bool:
     """
     offset_w = others.center_w - single.center_w
     distances_m = np.hypot(offset_w[:, 0], offset_w[:, 1])
-    least_gaps_m = distances_m - others.reach_m - single.reach_m
-    near = np.flatnonzero(least_gaps_m < limit_m + ROUNDING_ERROR_M)
+    min_gaps_m = distances_m - others.reach_m - single.reach_m
+    near = np.flatnonzero(min_gaps_m < limit_m + ROUNDING_ERROR_M)
     if not len(near):
         return False
     return bool(gaps_m(single, others.select(near)).min() < limit_m)

@@ -216,7 +216,7 @@ class Client:
             self.session.rejected[error.reason] += 1
             return
         if clock.clock_mode == "lockstep" and self._clock_mode != "lockstep":
-            self.session.rejected["other_pace"] += 1
+            self.session.rejected["other_clock_mode"] += 1
             return
         self.newest_clock = clock
         if clock.paused or clock.tick % self._decimation == 0:

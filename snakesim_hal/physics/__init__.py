@@ -5,5 +5,5 @@
 `motors`          all motors of a robot as vectors: the power stages of emulated drives
 `physics_model`   the protocol of a model of joints that move under torques, for emulated joint modules
 `backlash`        a physics model whose gears have backlash
-`hills`           heights of uneven ground
+`hills`           heights of hilly ground
 """

@@ -43,7 +43,7 @@ class ConsolePorts:
 
 @contextlib.contextmanager
 def open_console_ports(port: int | None) -> Iterator[ConsolePorts]:
-    """Open both sockets, and choose a token.
+    """Open the sockets of the console, for browsers and for its page server, and choose a secret token.
 
     Args:
         port: The port for browsers; None: the default port, or any free one if that is in use.

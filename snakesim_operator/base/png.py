@@ -10,14 +10,17 @@ NO_FILTER = b"\0"  # precedes each row
 
 
 def encode_png(width: int, height: int, pixels: bytes, *, bits: int, color: bool) -> bytes:
-    """Encode an image as PNG.
+    """Encode an image as PNG, without a library.
 
     Args:
-        width: in pixels.
-        height: in pixels.
-        pixels: rows without padding, from the top.
-        bits: of a channel, 8 or 16; 16 is big endian.
-        color: whether a pixel has the channels red, green and blue; otherwise it has one, gray.
+        width: Width in pixels.
+        height: Height in pixels.
+        pixels: Rows without padding, from the top.
+        bits: Bits of a channel, 8 or 16; 16 is big endian.
+        color: Whether a pixel has the channels red, green and blue; otherwise it has one, gray.
+
+    Returns:
+        The content of the file.
     """
     channels = 3 if color else 1
     row_bytes = width * channels * bits // 8

@@ -39,32 +39,32 @@ def namespace_of(key: str) -> str:
 
 def find_robots(where: RobotSelection) -> list[Link]:
     """Return every addressed robot that can be reached."""
-    found: list[Link] = []
+    links: list[Link] = []
     for link in where.networks():
         try:
             with open_session(link, SEARCH_S) as session:
                 if link.namespace is None:
-                    found += [replace(link, namespace=name) for name in robots_on(session)]
+                    links += [replace(link, namespace=name) for name in robots_on(session)]
                 elif session.present(keys.alive_key("hal"), SEARCH_S):
-                    found.append(link)
+                    links.append(link)
         except NotConnectedError:
             continue
-    return found
+    return links
 
 
 def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tuple[Link, Session]]:
     """Open a session on every network that answers, for messages of any size. Raises NotConnectedError without one."""
-    found: list[tuple[Link, Session]] = []
+    sessions: list[tuple[Link, Session]] = []
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
             whole = replace(link, max_bytes=MAX_IMAGE_BYTES)
-            found.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
-    if not found:
+            sessions.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
+    if not sessions:
         raise NotConnectedError(
             f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first",
             code="network/nothing-listens",
         )
-    return found
+    return sessions
 
 
 def only_robot(where: RobotSelection, command: str) -> Link:

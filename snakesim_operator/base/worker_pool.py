@@ -171,7 +171,15 @@ class WorkerPool:
         return [worker for worker, call in running.items() if worker.connection in readable or now_s >= call.deadline_s]
 
     def _receive(self, worker: "_Worker", call: _Call) -> Outcome | None:
-        """Return the outcome of a call, or None if the call is tried again."""
+        """Return the outcome of a call, or None if the call is tried again.
+
+        A call is tried again if its worker died or the function raised, unless this has happened too often.
+
+        Args:
+            worker: The worker of the call. If it has sent nothing yet, the call has exceeded its time, and the worker
+                is ended.
+            call: The call, whose failures are counted.
+        """
         is_done = worker.connection.poll()
         if not is_done:
             self._discard(worker)

@@ -35,7 +35,17 @@ QUEUED_IMAGES = 4  # a few invalid images do not displace the valid one
 
 
 def preview(where: RobotSelection, hz: float, width: int) -> int:
-    """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
+    """Publish small pictures of every camera of a robot, for slow networks, until Ctrl-C.
+
+    Args:
+        where: selects the robot.
+        hz: rate of the previews.
+        width: maximum width in pixels.
+
+    Raises:
+        ConfigError: an option is out of range, or the robot has no camera.
+        NotConnectedError: no robot is reachable.
+    """
     extras.require("console", "`snakesim start preview`")
     if not MIN_HZ <= hz <= MAX_HZ:
         raise ConfigError(f"--hz {hz:g}: give from {MIN_HZ:g} to {MAX_HZ:g} Hz", code="command/invalid-option")
@@ -113,9 +123,13 @@ class Camera:
 
 
 def preview_of(image: DepthImage | ColorImage, width: int) -> Preview:
-    """Return a compressed copy that is at most `width` pixels wide.
+    """Return a compressed copy of an image: color as JPEG, depth as PNG.
 
     A depth image keeps every n-th pixel unchanged, because the mean of a near and a far point is neither.
+
+    Args:
+        image: the image.
+        width: maximum width of the copy in pixels.
     """
     import PIL.Image
 

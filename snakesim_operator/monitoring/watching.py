@@ -41,7 +41,7 @@ def _add_count(parser: argparse.ArgumentParser, about: str) -> None:
 
 
 def _add_record(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim record`."""
+    """Add the options of `snakesim record`, which records the messages of a running robot or demonstrations."""
     add_out(parser, "the MCAP file (default: NAMESPACE-TIME.mcap)")
     parser.add_argument(
         "--episodes",
@@ -113,7 +113,7 @@ def _show_rates(arguments: argparse.Namespace) -> int:
 
 
 def _record(arguments: argparse.Namespace) -> int:
-    """Run `snakesim record`, and return its exit code."""
+    """Run `snakesim record`: record a running robot, or demonstrations with --episodes. Return the exit code."""
     from snakesim_operator.base import extras
 
     if arguments.episodes is not None:

@@ -62,7 +62,7 @@ def _add_compare(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim replay` to its parser."""
+    """Add the options of `snakesim replay`, which plays a recording on a network or through the services."""
     add_recording(parser)
     _add_speed(parser, (0.001, 1e6))
     parser.add_argument("--step", action="store_true", help="play one tick at each Enter")
@@ -97,6 +97,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_video(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim recording video`, which films a recorded run as MP4 or GIF."""
     add_recording(parser)
     add_out(parser, "FILE.mp4 or FILE.gif", required=True)
     parser.add_argument(

@@ -58,7 +58,7 @@ class DatasetSize:
 def write_lerobot(
     episodes: Sequence[Episode], folder: Path, write_table: WriteTable, fps: float | None = None
 ) -> DatasetSize:
-    """Write episodes as a LeRobot dataset.
+    """Write episodes as a dataset in the format of LeRobot.
 
     Args:
         episodes: Runs, or parts of runs between gaps.

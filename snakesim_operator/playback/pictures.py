@@ -46,7 +46,7 @@ class Pictures:
 
 
 def read_pictures(path: Path) -> dict[str, Pictures]:
-    """Read the pictures of a recording.
+    """Read the color and depth images of all cameras in a recording.
 
     Pictures are left out if they are damaged, if they are not newer than the one before, or if their size differs from
     the camera's first.

@@ -55,7 +55,7 @@ def read_chunk_length(head: bytes) -> int:
 
 
 def unpack_chunk(content: bytes) -> bytearray:
-    """Decompress an MCAP chunk.
+    """Decompress a chunk of an MCAP file, and check its lengths and its checksum.
 
     Args:
         content: Content of the chunk's record: a header, the name of the compression, and the compressed records.
@@ -143,7 +143,7 @@ def parse_chunk(data: bytearray) -> Iterator[McapRecord]:
 
 
 def parse_record(opcode: int, content: memoryview) -> McapRecord:
-    """Decode the content of one MCAP record.
+    """Decode the content of one MCAP record, and check that its length is right.
 
     Args:
         opcode: Kind of the record: a message, channel, header, metadata, schema or statistics.

@@ -30,7 +30,7 @@ class GrowingFile:
         return self._written_bytes + len(self._waiting)
 
     def flush(self) -> None:
-        """Write the buffered bytes to the disk.
+        """Write the buffered bytes to the disk: either all of them, or none.
 
         Raises:
             OSError: The disk does not take all of them. The file then ends where it ended before, and the buffered

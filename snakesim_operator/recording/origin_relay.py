@@ -33,7 +33,7 @@ class OriginRelay:
     def __init__(
         self, port: int, server: tuple[str, int], origins: Collection[str], report: Callable[[str], None]
     ) -> None:
-        """Start to listen, in a thread.
+        """Start to listen for viewers, in a thread. Those of unknown web pages are refused.
 
         Args:
             port: Port on loopback; 0 takes any free one.

@@ -27,6 +27,11 @@ class Tap:
     """Receives every message below one robot's namespace, in Zenoh's threads, until the recorder takes them."""
 
     def __init__(self, session: Session) -> None:
+        """Subscribe to every key of a robot. Messages wait until the recorder takes them, within a limit of memory.
+
+        Args:
+            session: Session on the robot's network.
+        """
         self.lossless = False  # whether the network waits for room; set in lockstep
         self.dropped: Counter[str] = Counter()  # by key
         self._waiting: deque[Arrival] = deque()

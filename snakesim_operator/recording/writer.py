@@ -40,11 +40,11 @@ class RecordingWriter:
     """A file that is being written. A full disk ends it (see `failure`), and raises nothing."""
 
     def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:
-        """Create the file and write its beginning.
+        """Create an MCAP file for a robot's messages, and write its beginning.
 
         Args:
             path: The new file.
-            shown_as: The robot's name in topics for viewers; None: record the messages as on the wire alone.
+            shown_as: The robot's name in topics for viewers; None: record only the messages as on the wire.
             show: Gets each message that is made for viewers.
 
         Raises:

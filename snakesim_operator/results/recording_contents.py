@@ -399,7 +399,7 @@ def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.floa
 def read_recording(
     path: Path, selected_keys: Collection[str] = ALL, on_message: Callable[[RecordedMessage], None] | None = None
 ) -> RecordingContents:
-    """Read the messages of a recording.
+    """Read the messages of a recording, and find out what is missing in it.
 
     Args:
         path: The recording, an MCAP file.

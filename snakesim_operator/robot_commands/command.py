@@ -73,7 +73,21 @@ def arm(
 
 
 def _arm_once(robot: str, backend: str, where: RobotSelection, print_text: PrintLine, *, unchecked: bool) -> int:
-    """Try to arm a robot, as `arm` declares."""
+    """Send one request to arm a robot, if its name and its backend are those that the user typed.
+
+    Args:
+        robot: Name of the robot, as the user typed it.
+        backend: Name of the backend, as the user typed it.
+        where: Selects the robot.
+        print_text: Prints a line.
+        unchecked: Whether to arm although the joints were not checked.
+
+    Returns:
+        The exit code: 0 if the robot is armed.
+
+    Raises:
+        RefusedError: The robot or the backend has another name, or the host refuses.
+    """
     link = only_robot(where, f"robot arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _read_description(session, link)
@@ -99,9 +113,13 @@ def disarm(where: RobotSelection, print_text: PrintLine = print_line) -> int:
 
 
 def reset(where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Reset a fault or an emergency stop. The robot is disarmed then.
+    """Reset a fault or an emergency stop of a robot, which is disarmed afterwards.
 
     If no robot runs, an emergency stop stored by the last run is removed.
+
+    Args:
+        where: Selects the robot.
+        print_text: Prints a line.
 
     Returns:
         The exit code.
@@ -244,7 +262,16 @@ def _wait_for_status(statuses: Reader[Status], lifecycle: str | None) -> Status 
 
 
 def _read_description(session: Session, link: Link) -> Description:
-    """Read the robot's description. Raises NotConnectedError without one, RefusedError when two hosts publish one."""
+    """Read the description that the host of a robot publishes, and check that there is only one host.
+
+    Args:
+        session: Session on the robot's network.
+        link: How to reach the robot, for messages.
+
+    Raises:
+        NotConnectedError: No host publishes a description.
+        RefusedError: Several hosts publish one.
+    """
     reader = session.latched_reader(keys.DESCRIPTION, Description)
     deadline = time.monotonic() + DESCRIPTION_S
     descriptions: list[Description] = []

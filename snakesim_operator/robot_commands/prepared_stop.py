@@ -81,7 +81,7 @@ class PreparedStop:
     """Stops the robot at one link. Every method may be called from any thread, and none but `stop` waits."""
 
     def __init__(self, where: RobotSelection, link: Link, on_result: Callable[[str, str], None] = lambda *_: None):
-        """Open the sockets and start the threads.
+        """Prepare an emergency stop, which then needs no time to open sockets or to start threads.
 
         Args:
             where: Selects the robot for `snakesim estop`.

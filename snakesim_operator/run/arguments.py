@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim run`."""
+    """Add the options of `snakesim run`, which runs a scenario with all of its processes."""
     add_scenario(parser)
     parser.add_argument(
         "--fault",

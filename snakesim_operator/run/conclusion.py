@@ -104,7 +104,13 @@ def _describe_ending(ending: Ending) -> str:
 
 
 def _write_and_print(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) -> tuple[list[str], str]:
-    """Write summary and report, and print the summary.
+    """Write summary and report of a run, and print the summary.
+
+    Args:
+        files: The files of the run; without a folder, nothing is written.
+        ending: Why and how the run ended.
+        outcome: What the processes reported.
+        host: What the host reported at its end.
 
     Returns:
         What the record is missing, and the verdict of the report; the verdict is empty without one.

@@ -15,10 +15,10 @@ from snakesim_operator.run.folder import locked_folder
 
 
 def run_host(arguments: argparse.Namespace) -> int:
-    """Run a host to its end.
+    """Run the HAL host of a robot in this process, until it ends by itself or is stopped.
 
     Args:
-        arguments: the parsed command line. If it names a folder with `--out`, the host keeps its record there.
+        arguments: the parsed command line. If it names a folder with `--out`, the host writes its record there.
 
     Returns:
         0 if all ticks were done without a fault, 1 otherwise.

@@ -288,7 +288,14 @@ def _recording(
 ) -> "Iterator[RecordingWriter | None]":
     """Record the messages at these keys for as long as the context lives.
 
-    Yields None when there are no keys, or when no file can be created.
+    Args:
+        session: Session of the run's process.
+        files: The files of the run; without a folder, nothing is recorded.
+        recorded_keys: Keys of the messages; without keys, nothing is recorded.
+        shown_as: The robot's name in topics for viewers; None: record only the messages as on the wire.
+
+    Yields:
+        The recording; None when there are no keys, or when no file can be created.
     """
     recording = None
     try:

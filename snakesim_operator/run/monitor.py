@@ -177,7 +177,10 @@ class RunMonitor:
             self._polls_without_status = 0
 
     def _handle_faults(self) -> None:
-        """Carry out injected faults, and detect real ones."""
+        """Inject the faults that are due, and end the run if the robot has a fault or is silent.
+
+        With `--stay`, faults and silence are only printed, because the user resets and arms the robot.
+        """
         status = self._status
         if self._robot is not None and not self._armed:
             refusal = self._faults.refusal(self._robot)

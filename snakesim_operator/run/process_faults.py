@@ -55,6 +55,14 @@ class ProcessFaults:
     def __init__(
         self, config: RunConfig, session: Session, supervisor: Supervisor, print_text: Callable[[str], None]
     ) -> None:
+        """Prepare the faults of processes that the scenario plans, and accept requests for further ones.
+
+        Args:
+            config: Configuration of the run, with the planned faults, and whether others may be requested.
+            session: Session of the run.
+            supervisor: Has the processes that are killed, frozen or restarted.
+            print_text: Prints a line.
+        """
         self._allowed = config.allow_fault_injection
         self._supervisor = supervisor
         self._print_text = print_text

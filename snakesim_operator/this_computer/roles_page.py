@@ -22,7 +22,7 @@ then delivered is decided key by key.
 
 
 def roles_page() -> str:
-    """Return the text of the page."""
+    """Return the documentation page about the roles in a lab, generated from the table of permissions."""
     return "\n".join(
         [
             INTRODUCTION,

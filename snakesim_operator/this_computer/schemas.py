@@ -75,6 +75,7 @@ def _schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -
 
 
 def _key_space() -> str:
+    """Return the page that lists all keys of the network with their messages and writers, as Markdown."""
     rows = [
         TITLE,
         "",

@@ -47,7 +47,7 @@ class Liar(Workbench):
         return Samples(self.reads(super().sample(tick, timestamp_ns).joints))
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: Any) -> None:
-        super().enact(self.hears(setpoints), lifecycle)
+        super().enact(self.alters(setpoints), lifecycle)
 
     def describes(self, robot: Description) -> Description:
         return robot
@@ -55,7 +55,7 @@ class Liar(Workbench):
     def reads(self, joints: JointState) -> JointState:
         return joints
 
-    def hears(self, points: SafeSetpoints) -> SafeSetpoints:
+    def alters(self, points: SafeSetpoints) -> SafeSetpoints:
         return points
 
 
@@ -73,7 +73,7 @@ def breaks(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
     return register
 
 
-describes, reads, hears = (partial(breaks, lie=lie) for lie in ("describes", "reads", "hears"))
+describes, reads, alters = (partial(breaks, lie=lie) for lie in ("describes", "reads", "alters"))
 
 
 # --- the description -------------------------------------------------------------------------------------------
@@ -84,12 +84,12 @@ def listing(robot: Description, key: str, rate_hz: float = 50.0) -> Description:
     return replace(robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)])
 
 
-@describes("the_description_is_what_the_robot_file_says")
+@describes("the_description_matches_the_robot_file")
 def named_from_the_head(robot):
     return replace(robot, joints=robot.joints[::-1])
 
 
-@describes("the_description_is_what_the_robot_file_says")
+@describes("the_description_matches_the_robot_file")
 def limits_in_degrees(robot):
     return replace(robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints])
 
@@ -227,40 +227,40 @@ def let_go(points: SafeSetpoints) -> SafeSetpoints:
     return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
 
-@hears("position_mode_turns_only_the_requested_joint")
+@alters("position_mode_turns_only_the_requested_joint")
 def targets_in_degrees(points):
     return dataclasses.replace(points, target=np.radians(points.target).tolist())
 
 
-@hears("position_mode_turns_only_the_requested_joint")
+@alters("position_mode_turns_only_the_requested_joint")
 def head_to_tail(points):
     return SafeSetpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
 
 
-@hears("position_mode_turns_only_the_requested_joint", "torque_mode_pushes_with_the_torque_that_is_asked")
+@alters("position_mode_turns_only_the_requested_joint", "torque_mode_pushes_with_the_torque_that_is_asked")
 def wrong_way_round(points):
     return dataclasses.replace(points, target=[-target for target in points.target])
 
 
-@hears("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
+@alters("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
 def speed_in_turns(points):
     scale = [0.16 if mode == Mode.VELOCITY else 1.0 for mode in points.mode]
     return dataclasses.replace(points, target=np.multiply(points.target, scale).tolist())
 
 
-@hears("joints_may_be_in_different_modes_at_once")
+@alters("joints_may_be_in_different_modes_at_once")
 def one_mode_for_all(points):
     return dataclasses.replace(points, mode=[points.mode[1]] * len(points.mode))
 
 
-@hears("an_isolated_joint_is_passive_while_others_continue")
+@alters("an_isolated_joint_is_passive_while_others_continue")
 def holds_what_is_lost(points):
     held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
     target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
     return SafeSetpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
 
 
-@hears("an_isolated_joint_is_passive_while_others_continue")
+@alters("an_isolated_joint_is_passive_while_others_continue")
 def one_for_all(points):
     return let_go(points) if points.isolated else points
 
@@ -269,7 +269,7 @@ def one_for_all(points):
 class TakesNothingBack(Liar):
     lost: frozenset[int] = frozenset()
 
-    def hears(self, points):
+    def alters(self, points):
         self.lost |= points.isolated
         modes = [Mode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)]
         return dataclasses.replace(points, mode=modes)
@@ -285,7 +285,7 @@ def angle_in_degrees(joints):
     return replace(joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s])
 
 
-@reads("torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_set_points_is_kept")
+@reads("torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_setpoints_is_kept")
 def no_torque_sensor(joints):
     return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
 
@@ -306,11 +306,11 @@ class PassivePushes(Workbench):
         super().step()
 
 
-@breaks("set_points_hold_until_the_next_ones")
+@breaks("setpoints_hold_until_the_next_ones")
 class ForgetsWhatIsRepeated(Liar):
     last: Any = None
 
-    def hears(self, points):
+    def alters(self, points):
         repeated, self.last = points == self.last, points
         return let_go(points) if repeated else points
 
@@ -319,7 +319,7 @@ class ForgetsWhatIsRepeated(Liar):
         super().step()
 
 
-@breaks("set_points_hold_without_being_handed_over_again")
+@breaks("setpoints_hold_without_being_handed_over_again")
 class ForgetsAfterAPeriod(Workbench):
     def advance(self):
         super().advance()
@@ -342,12 +342,12 @@ class MovesAfterAll(Liar):
 # --- limits and switching --------------------------------------------------------------------------------------
 
 
-@hears("the_torque_limit_of_the_set_points_is_kept", "a_torque_limit_of_zero_lets_nothing_move")
+@alters("the_torque_limit_of_the_setpoints_is_kept", "a_torque_limit_of_zero_lets_nothing_move")
 def ignores_torque_limit(points):
     return dataclasses.replace(points, torque_limit_nm=[4.0] * len(points.mode))
 
 
-@hears("a_torque_limit_of_zero_lets_nothing_move")
+@alters("a_torque_limit_of_zero_lets_nothing_move")
 def zero_is_no_limit(points):
     return dataclasses.replace(points, torque_limit_nm=[limit or 4.0 for limit in points.torque_limit_nm])
 

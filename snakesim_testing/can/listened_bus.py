@@ -70,7 +70,7 @@ timestep_s = 0.01
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedFrame:
     """A frame, and when it was on the bus by the kernel's clock."""
 
     at_ns: int
@@ -80,7 +80,7 @@ class Heard:
     def opcode(self) -> int:
         return parse_opcode(self.frame.id)
 
-    def says(self) -> Mapping[str, float]:
+    def decode(self) -> Mapping[str, float]:
         return load_layouts()[Opcode(self.opcode)].decode(self.frame.data)
 
 
@@ -93,32 +93,32 @@ class Listener:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         self._socket.bind((channel,))
         self._socket.setblocking(False)
-        self.heard: list[Heard] = []
+        self.received: list[ReceivedFrame] = []
 
-    def listen(self) -> list[Heard]:
+    def listen(self) -> list[ReceivedFrame]:
         """Receive the buffered frames; return all received since the last `forget`."""
         while True:
             try:
                 data, extra, _, _ = self._socket.recvmsg(FRAME.size, socket.CMSG_SPACE(16))
             except BlockingIOError:
-                return self.heard
+                return self.received
             number, length, content = FRAME.unpack(data)
             seconds, nanoseconds = struct.unpack("=qq", extra[0][2])
-            self.heard.append(Heard(seconds * 10**9 + nanoseconds, Frame(number, content[:length])))
+            self.received.append(ReceivedFrame(seconds * 10**9 + nanoseconds, Frame(number, content[:length])))
 
     def forget(self) -> None:
         self.listen()
-        self.heard = []
+        self.received = []
 
-    def of(self, opcode: Opcode) -> list[Heard]:
-        return [heard for heard in self.listen() if heard.opcode == opcode]
+    def of(self, opcode: Opcode) -> list[ReceivedFrame]:
+        return [frame for frame in self.listen() if frame.opcode == opcode]
 
     def states(self) -> list[ModuleState]:
         """The state that each module reported last, in any frame."""
         reported = dict.fromkeys(NODES, ModuleState.BOOT)
-        for heard in self.listen():
-            if heard.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE):
-                reported[parse_node(heard.frame.id)] = ModuleState(int(heard.says()["state"]))
+        for frame in self.listen():
+            if frame.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE):
+                reported[parse_node(frame.frame.id)] = ModuleState(int(frame.decode()["state"]))
         return list(reported.values())
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ class Bench:
 
     def modules(self) -> None:
         self.start("modules", "snakesim_can_backend.emulator.command", self._saved, "--pose", "none")
-        self.until(lambda: "modules ready" in self.said("modules"), "modules ready")
+        self.until(lambda: "modules ready" in self.read_log("modules"), "modules ready")
 
     def control(self) -> subprocess.Popen[bytes]:
         return self.start(
@@ -164,7 +164,7 @@ class Bench:
     def _saved(self) -> str:
         return str(self.folder / "config.json")
 
-    def said(self, name: str) -> str:
+    def read_log(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()
 
     def until(self, condition: Callable[[], bool], what: str, limit_s: float = START_LIMIT_S) -> None:
@@ -182,7 +182,7 @@ class Bench:
         """Once what there is has been cleared."""
         if self.tell("robot", "arm", self.config.robot.name, self.config.backend).code == 0:
             return True
-        print(self.tell("robot", "reset").said)
+        print(self.tell("robot", "reset").printed)
         return False
 
     def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
@@ -208,27 +208,27 @@ def bench(folder: Path, channel: str) -> Iterator[Bench]:
         yield Bench(folder, config, free_endpoint(), listener, running)
 
 
-def stop_commands(heard: Sequence[Heard]) -> list[Heard]:
-    return [h for h in heard if h.opcode == Opcode.COMMAND and h.says()["action"] == CommandAction.STOP]
+def stop_commands(received: Sequence[ReceivedFrame]) -> list[ReceivedFrame]:
+    return [h for h in received if h.opcode == Opcode.COMMAND and h.decode()["action"] == CommandAction.STOP]
 
 
-def first_in(heard: Sequence[Heard], states: set[ModuleState], since_ns: int) -> dict[int, Heard]:
+def first_in(received: Sequence[ReceivedFrame], states: set[ModuleState], since_ns: int) -> dict[int, ReceivedFrame]:
     """Each module's first frame after a time that reports one of these states."""
-    found: dict[int, Heard] = {}
-    for h in heard:
-        if h.at_ns >= since_ns and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE) and h.says()["state"] in states:
-            found.setdefault(parse_node(h.frame.id), h)
-    return found
+    first: dict[int, ReceivedFrame] = {}
+    for h in received:
+        if h.at_ns >= since_ns and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE) and h.decode()["state"] in states:
+            first.setdefault(parse_node(h.frame.id), h)
+    return first
 
 
-def uptimes_ms(heard: Sequence[Heard], node: int) -> list[tuple[int, float]]:
+def uptimes_ms(received: Sequence[ReceivedFrame], node: int) -> list[tuple[int, float]]:
     """(kernel's time, module's uptime) of its heartbeats."""
-    beats = [h for h in heard if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node]
-    return [(h.at_ns, 1e3 * h.says()["uptime"]) for h in beats]
+    beats = [h for h in received if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node]
+    return [(h.at_ns, 1e3 * h.decode()["uptime"]) for h in beats]
 
 
-def passed_for_module_ms(heard: Sequence[Heard], node: int, from_ns: int, to_ns: int) -> float:
+def passed_for_module_ms(received: Sequence[ReceivedFrame], node: int, from_ns: int, to_ns: int) -> float:
     """How long a stretch of the kernel's time took in a module's own; heartbeats around it give both."""
-    at_ns, uptime_ms = zip(*uptimes_ms(heard, node), strict=True)
+    at_ns, uptime_ms = zip(*uptimes_ms(received, node), strict=True)
     from_ms, to_ms = np.interp([from_ns - at_ns[0], to_ns - at_ns[0]], [ns - at_ns[0] for ns in at_ns], uptime_ms)
     return float(to_ms - from_ms)

@@ -67,5 +67,5 @@ HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1
 HOT_AND_WET = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1)
 
 
-def said(found: list[Finding]) -> list[tuple[str, int | None]]:
-    return [(finding.what, finding.joint) for finding in found]
+def list_findings(findings: list[Finding]) -> list[tuple[str, int | None]]:
+    return [(finding.what, finding.joint) for finding in findings]

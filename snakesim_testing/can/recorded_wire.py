@@ -62,7 +62,7 @@ def is_action(frame: Frame, *actions: CommandAction) -> bool:
     return parse_opcode(frame.id) == Opcode.COMMAND and read(frame)["action"] in actions
 
 
-def is_set_point(frame: Frame) -> bool:
+def is_setpoint(frame: Frame) -> bool:
     return parse_opcode(frame.id) == Opcode.SET_POINT
 
 

@@ -89,7 +89,11 @@ class SharedBus(Loop):
 
 @contextmanager
 def shared_bus(channel: str) -> Iterator[SharedBus]:
-    """Open, all joints armed and swinging, and close at the end."""
+    """Open a driver and emulated modules on one kernel bus, with all joints armed and moving, until the end.
+
+    Args:
+        channel: name of the CAN interface.
+    """
     run = config(clock_mode="realtime")
     settings = CanSettings(channels=[channel], physics_model="inertia")
     modules_end = SocketCanWire(channel, FROM_HOST)

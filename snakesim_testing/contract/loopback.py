@@ -149,6 +149,12 @@ class Hosted:
     """Runs host and controller in threads until `close`, each with its own session, and observes them."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
+        """Start a host with a backend, and a controller, in two threads that communicate over a loopback network.
+
+        Args:
+            backend: the backend under test, whose calls are recorded.
+            config: configuration of the run.
+        """
         link = Link(f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}")
         self.backend = RecordingBackend(backend)
         self.controller = Controller()

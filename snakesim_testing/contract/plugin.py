@@ -54,7 +54,7 @@ def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options."""
+    """Add the options of the contract suite to pytest: the backend to test, its scenario, and its table of results."""
     group = parser.getgroup("snakesim", "contract tests of SnakeSIM backends (--pyargs snakesim_testing.contract)")
     group.addoption("--snakesim-backend", metavar="NAME", help="backend to test: an installed one, or ./file.py:Class")
     group.addoption(
@@ -146,7 +146,15 @@ def _find_benches_in_options(config: pytest.Config) -> "list[Bench]":
 
 
 def _make_bench_from_options(backend: str, config: pytest.Config) -> "Bench":
-    """Return the bench for a backend. Raises ConfigError."""
+    """Return the bench for a backend that the user has named on the command line.
+
+    Args:
+        backend: name of an installed backend, or ./file.py:Class.
+        config: configuration of pytest, with the options of the suite.
+
+    Raises:
+        ConfigError: the backend or its scenario cannot be loaded.
+    """
     from snakesim_hal.model.plugins import BACKENDS, find_plugin
     from snakesim_testing.contract.bench import SCENARIO, Bench
 
@@ -270,7 +278,12 @@ class Outcomes:
             outcomes.append(outcome)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-        """Print the table, and write it to the requested file."""
+        """Print the table of clauses with their outcome on each bench, and write it to the requested file.
+
+        Args:
+            terminalreporter: prints lines at the end of a session.
+            config: configuration of pytest, with the options of the suite.
+        """
         if not self._rows:
             return
         benches = list(dict.fromkeys(bench for row in self._rows.values() for bench in row))

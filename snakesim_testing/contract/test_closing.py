@@ -57,7 +57,7 @@ def test_a_backend_opens_again_after_it_was_closed(bench: Bench) -> None:
 
 
 def test_in_lockstep_same_seed_and_commands_give_same_samples(bench: Bench) -> None:
-    """Two runs in lockstep have bit-identical samples."""
+    """Two runs in lockstep with the same seed and the same commands have bit-identical samples."""
     if bench.clock_mode != "lockstep":
         pytest.skip("this backend supports real time only, which is not exactly repeatable")
 

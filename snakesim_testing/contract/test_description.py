@@ -15,7 +15,7 @@ from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.rig import Record, Rig
 
 
-def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:
+def test_the_description_matches_the_robot_file(bench: Bench, rig: Rig) -> None:
     """Joints (count, order, names, axes, limits, gains), links, period, lease and safety come from the run's files."""
     robot = rig.robot
     wanted = describe_run_robot(bench.config)

@@ -8,7 +8,7 @@ from snakesim_testing.contract.recordings import Pushing
 from snakesim_testing.contract.rig import Rig
 
 
-def test_the_torque_limit_of_the_set_points_is_kept(rig: Rig, pushing: Pushing) -> None:
+def test_the_torque_limit_of_the_setpoints_is_kept(rig: Rig, pushing: Pushing) -> None:
     """Velocity mode (or else a position beyond it) against a stop pushes with the limit, and no more."""
     rig.skip_without(torque=True)
     measured_nm = abs(pushing.limited.torque_nm[-1, :2])

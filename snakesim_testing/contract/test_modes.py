@@ -77,7 +77,7 @@ def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
     assert abs(still[-1]) < t.REACHED_RAD, f"the passive joint moved by {still[-1]:.3f} rad"
 
 
-def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
+def test_setpoints_hold_until_the_next_ones(rig: Rig) -> None:
     """Without commands for less than a lease the joint keeps its setpoint."""
     rig.skip_without(Mode.VELOCITY)
     rig.cruise()
@@ -85,7 +85,7 @@ def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
     assert_cruising(rig)
 
 
-def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
+def test_setpoints_hold_without_being_handed_over_again(rig: Rig) -> None:
     """`advance` alone keeps the last setpoints active."""
     rig.skip_without(Mode.VELOCITY)
     rig.cruise()

@@ -76,7 +76,7 @@ class Stage:
         self.reported += self.states.drain()
         return self.reported[-1] if self.reported else None
 
-    def tells(self, words: str) -> ControlState:
+    def wait_for_reason(self, words: str) -> ControlState:
         """Wait until control has reported a reason with these words."""
 
         def found() -> list[ControlState]:

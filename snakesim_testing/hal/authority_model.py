@@ -61,13 +61,13 @@ class Health:
     """What one module reported last, and what follows from it."""
 
     def __init__(self) -> None:
-        self.heard_ns: int | None = None
+        self.received_ns: int | None = None
         self.celsius, self.volts, self.leak = 20.0, 24.0, False
         self.hot = False
         self.low_since_ns: int | None = None
 
     def known(self, now_ns: int) -> bool:
-        return self.heard_ns is not None and now_ns - self.heard_ns <= KNOWN_FOR_NS
+        return self.received_ns is not None and now_ns - self.received_ns <= KNOWN_FOR_NS
 
     def wrong(self, now_ns: int) -> set[str]:
         low = self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS
@@ -87,6 +87,11 @@ class Model(RuleBasedStateMachine):
     max_isolated: int
 
     def __init__(self) -> None:
+        """Start the model of an authority that is disarmed, without a lease, a command or a joint state.
+
+        The model predicts every decision of the safety core from the same events, in another way. Tests compare the
+        two.
+        """
         super().__init__()
         self.now_ns = 0
         self.tick = 0
@@ -99,7 +104,7 @@ class Model(RuleBasedStateMachine):
         self.epoch = 0
         self.priority = 0
         self.expires_ns = 0
-        self.heard: tuple[int, JointCommand] | None = None  # the newest good command of this holder, and when it came
+        self.newest_command: tuple[int, JointCommand] | None = None  # when it came; only of this holder
         self.since_arming: list[JointCommand] = []
         self.counting: JointCommand | None = None  # of those, what the last tick was decided by
         self.last_sequence = -1
@@ -132,7 +137,7 @@ class Model(RuleBasedStateMachine):
             self.halt = [self.beginning_of_halt(i) for i in range(JOINTS)] if self.state == "armed" else None
             self.reported = self.reported and following != "disarmed"
         if self.state == "armed":
-            self.heard = None
+            self.newest_command = None
         self.state = following
 
     def mode_before(self, i: int) -> Mode:
@@ -189,7 +194,7 @@ class Model(RuleBasedStateMachine):
         return bool(far) and taken_s - min(far) > LEASE_NS * 1e-9 and abs(state_[2]) < 0.95 * limit
 
     def drop_lease(self) -> None:
-        self.holder = self.heard = None
+        self.holder = self.newest_command = None
         self.last_sequence = -1
 
     def note_fault(self) -> None:

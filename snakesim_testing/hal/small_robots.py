@@ -191,7 +191,11 @@ def write_files(
 
 
 def status(**reported: Any) -> Status:
-    """A status as the worm's host publishes it, with these values."""
+    """Return a status as the host of the robot `worm` publishes it, armed and without faults.
+
+    Args:
+        **reported: fields that differ from these defaults.
+    """
     values: dict[str, Any] = {
         "tick": 0,
         "timestamp_ns": 0,

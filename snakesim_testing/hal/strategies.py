@@ -17,6 +17,11 @@ def messages_of(struct: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
 
 
 def _strategy(info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: C901 - one case a type
+    """Return a strategy of Hypothesis that generates every valid value of a message's field.
+
+    Args:
+        info: type of the field with its bounds, as msgspec inspects it.
+    """
     match info:
         case inspect.Metadata():
             return _strategy(info.type)
@@ -71,6 +76,11 @@ def plain_example(struct: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def _example(info: inspect.Type) -> Any:  # noqa: C901 - one case a type
+    """Return one valid value of a message's field, as simple as its type allows.
+
+    Args:
+        info: type of the field with its bounds, as msgspec inspects it.
+    """
     match info:
         case inspect.Metadata():
             return _example(info.type)

@@ -32,8 +32,8 @@ class Ended:
     took_s: float = 0.0
 
     @property
-    def said(self) -> str:
-        """On both."""
+    def printed(self) -> str:
+        """Standard output and standard error together."""
         return self.out + self.err
 
 
@@ -110,32 +110,32 @@ class Running:
     @property
     def endpoint(self) -> str:
         """The endpoint of its network, as it prints it."""
-        return self.asked_endpoint or self._told(r"network: (\S+?),")
+        return self.asked_endpoint or self._find_printed(r"network: (\S+?),")
 
     def console(self) -> str:
         """The address of its live console, once it is printed."""
-        return self._told(r"console: (http\S+)")
+        return self._find_printed(r"console: (http\S+)")
 
-    def _told(self, pattern: str) -> str:
+    def _find_printed(self, pattern: str) -> str:
         wait_until(
-            lambda: re.search(pattern, self.said()) or self.process.poll() is not None, f"{pattern!r} from the run"
+            lambda: re.search(pattern, self.printed()) or self.process.poll() is not None, f"{pattern!r} from the run"
         )
-        found = re.search(pattern, self.said())
+        found = re.search(pattern, self.printed())
         assert found is not None, self.how_it_ended()
         return found[1]
 
     def how_it_ended(self) -> str:
         """For the words of a failure."""
-        return f"the run ended with {self.process.returncode}: {self.said()[-2000:]}"
+        return f"the run ended with {self.process.returncode}: {self.printed()[-2000:]}"
 
-    def said(self) -> str:
+    def printed(self) -> str:
         """All that it has printed."""
-        return self.out.with_suffix(".said").read_text(encoding="utf-8", errors="replace")
+        return self.out.with_suffix(".printed").read_text(encoding="utf-8", errors="replace")
 
     def wait_for(self, text: str, limit_s: float = LIMIT_S) -> None:
         """Wait until it has printed this text."""
-        wait_until(lambda: text in self.said() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
-        assert text in self.said(), self.how_it_ended()
+        wait_until(lambda: text in self.printed() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
+        assert text in self.printed(), self.how_it_ended()
 
     def tell(self, *arguments: str, limit_s: float = LIMIT_S) -> Ended:
         """Run a tool on the same machine with the endpoint of this run."""
@@ -169,19 +169,24 @@ def running(
     more: Mapping[str, str] | None = None,
     inside: Sequence[str] = (),
 ) -> Iterator[Running]:
-    """A run in the background; whatever is left of it at the end is killed.
+    """Run `snakesim run` in the background, and kill all of its processes that are left at the end.
 
-    endpoint: given to it; "free" for an unused port, None to let it choose.
+    Args:
+        out: Folder of the run; its output is written beside it.
+        *arguments: Arguments of the command.
+        endpoint: Endpoint of its network; "free" for an unused port, None to let it choose.
+        more: Variables that are added to its environment.
+        inside: Command line that runs it elsewhere, such as in a network namespace.
     """
     asked = free_endpoint() if endpoint == "free" else endpoint
     network = ["--endpoint", asked] if asked is not None and "--router" not in arguments else []
-    with out.with_suffix(".said").open("wb") as said:
+    with out.with_suffix(".printed").open("wb") as output:
         process = subprocess.Popen(
             [*inside, *WITH_TESTS, *SNAKESIM, "run", *arguments, "--out", str(out), *network],
             cwd=out.parent,
             env=environment(out.parent, **(more or {})),
             stdin=subprocess.DEVNULL,
-            stdout=said,
+            stdout=output,
             stderr=subprocess.STDOUT,
         )
     try:

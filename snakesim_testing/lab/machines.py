@@ -77,6 +77,14 @@ class Machine:
         env: Mapping[str, str] | None = None,
         keep: Sequence[int] = (),
     ) -> subprocess.Popen[bytes]:
+        """Start a program that ends with the tests, also if they are killed.
+
+        Args:
+            command: The program and its arguments.
+            log: File that gets its output; None: the output can be read from the process.
+            env: Variables that are added to its environment.
+            keep: File descriptors that it inherits.
+        """
         parent = os.getpid()
         process = subprocess.Popen(
             command,

@@ -92,7 +92,7 @@ class SmallLab:
         """A session of stock Zenoh."""
         return opened(self.settings(identity, **more))
 
-    def said(self) -> list[str]:
+    def printed(self) -> list[str]:
         """The router's log."""
         return COLOR.sub("", self.log.read_text(errors="replace")).splitlines()
 

@@ -15,7 +15,12 @@ from snakesim_operator.features.console.web.viser_server import PageServer
 
 @contextmanager
 def fronted(ports: ConsolePorts, stop: StopPath | None) -> Iterator[FrontServer]:
-    """Run a front server without pages behind it."""
+    """Run a front server without a page server, in a thread, for as long as the context lasts.
+
+    Args:
+        ports: Sockets and token of the console.
+        stop: Stops the robot; None for a recording.
+    """
     server = FrontServer(ports.browsers, ports.pages_path, ports.token, stop)
     ended = asyncio.Event()
     loops: Queue[asyncio.AbstractEventLoop] = Queue()

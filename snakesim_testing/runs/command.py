@@ -59,7 +59,7 @@ def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunS
     """`snakesim run ... --out out`, and the summary that it left, and no process."""
     network = [] if "--router" in arguments else ["--endpoint", free_endpoint()]
     ended = snakesim("run", *arguments, "--out", str(out), *network, cwd=out.parent, more=more)
-    assert (out / SUMMARY).is_file(), ended.said
+    assert (out / SUMMARY).is_file(), ended.printed
     nothing_left(out)
     return ended, summary_of(out)
 

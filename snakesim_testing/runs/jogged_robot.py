@@ -8,16 +8,16 @@ from snakesim_testing.benches.workbench import text_of_the_example
 from snakesim_testing.runs.bench import lab_folder
 from snakesim_testing.runs.hand_turned_robot import JOINTS, SCENARIO
 
-BACKEND = "./told.py:Told"
+BACKEND = "./setpoint_log.py:SetpointLog"
 
 
-TOLD = """
+SETPOINT_LOG = """
 
 import json
 from pathlib import Path
 
 
-class Told(Workbench):
+class SetpointLog(Workbench):
     \"\"\"Writes the setpoints that it receives to a file.\"\"\"
 
     ticks = 0
@@ -27,18 +27,18 @@ class Told(Workbench):
         self.ticks += 1
         received = {"tick": self.ticks, "lifecycle": lifecycle, "mode": setpoints.mode, "target": setpoints.target}
         Path("new.json").write_text(json.dumps({**received, "limit_nm": setpoints.torque_limit_nm}))
-        Path("new.json").replace("told.json")
+        Path("new.json").replace("setpoints.json")
 """
 
 
 def make_jogged_folder(folder: Path) -> Path:
     real = text_of_the_example().replace("emulated=True", "emulated=False")
-    return lab_folder(folder, JOINTS, SCENARIO, {"told.py": real + TOLD})
+    return lab_folder(folder, JOINTS, SCENARIO, {"setpoint_log.py": real + SETPOINT_LOG})
 
 
-def told(home: Path) -> dict[str, Any]:
-    return json.loads((home / "told.json").read_text())
+def read_setpoints(home: Path) -> dict[str, Any]:
+    return json.loads((home / "setpoints.json").read_text())
 
 
 def stopped(home: Path) -> bool:
-    return told(home)["lifecycle"] == "fault"
+    return read_setpoints(home)["lifecycle"] == "fault"

@@ -21,7 +21,7 @@ class Terminal:
     def __init__(self, run: Running, cwd: Path) -> None:
         self.ours, self._theirs = pty.openpty()
         self.before = termios.tcgetattr(self._theirs)
-        self._said = b""
+        self._printed = b""
         self.process = subprocess.Popen(
             [*SNAKESIM, "teleop", "--endpoint", run.endpoint, "--max-speed", "0.2"],
             stdin=self._theirs,
@@ -36,17 +36,17 @@ class Terminal:
     def _listen(self) -> None:
         with contextlib.suppress(OSError):
             while data := os.read(self.ours, 4096):
-                self._said += data
+                self._printed += data
 
     def type(self, data: bytes) -> None:
         os.write(self.ours, data)
 
     def shows(self, words: str) -> None:
-        wait_until(lambda: words in self.said, f"{words!r} in the terminal")
+        wait_until(lambda: words in self.printed, f"{words!r} in the terminal")
 
     @property
-    def said(self) -> str:
-        return self._said.decode(errors="replace")
+    def printed(self) -> str:
+        return self._printed.decode(errors="replace")
 
     @property
     def given_back(self) -> bool:

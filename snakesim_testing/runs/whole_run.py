@@ -75,7 +75,15 @@ def _make_watched(
     telemetry: list[Telemetry],
     update_us: list[float],
 ) -> type[Controller[Any]]:
-    """A controller that gets no world model in blind ticks, and no trajectory in lost ones; both lists are filled."""
+    """Return a controller class that does not get all of its inputs, and that records its telemetry and its run times.
+
+    Args:
+        controller_class: The controller that it extends.
+        blind: Ticks in which it gets no world model.
+        lost: Ticks in which it gets no trajectory.
+        telemetry: Gets the telemetry of each tick.
+        update_us: Gets the duration of each update in µs.
+    """
 
     class Watched(controller_class):
         def update(self, observation: Observation) -> ControllerCommand:

@@ -48,7 +48,7 @@ class Robot:
             if "Traceback" in (news := path.read_text(errors="replace")[before.written.get(path, 0) :])
         ]
         assert not complaints, f"{what}: {'; '.join(complaints)}"
-        assert self.run.parts() == before.parts, f"{what}: {self.run.said()[-1000:]}"
+        assert self.run.parts() == before.parts, f"{what}: {self.run.printed()[-1000:]}"
 
     def stays(self, lifecycle: str, seconds: float) -> None:
         """Fail unless it says nothing else for so long."""

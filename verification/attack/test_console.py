@@ -146,7 +146,7 @@ def test_c3_unexpected_page_message_ends_nothing_and_is_reported_once(robot: Rob
     assert (robot.run.out / "console.log").read_text().count(": unknown:") == 1
 
 
-def test_c4_who_says_too_much_is_hung_up_on(robot: Robot, at: str) -> None:
+def test_c4_a_client_that_sends_too_much_is_disconnected(robot: Robot, at: str) -> None:
     health = robot.health()
     with Page(at) as viewer, Page(at) as other:
         viewer.change(viewer.find(STOP), {"value": "x" * 1_000_000})

@@ -85,7 +85,7 @@ def test_a9_an_intent_of_another_time_is_not_followed(moving: Robot, age_s: floa
     assert 0.0123 not in speeds(operator, now_ns, now_ns + NS), f"an intent that is {age_s:g} s old is followed"
 
 
-def test_a9_an_intent_ends_when_it_says(moving: Robot) -> None:
+def test_a9_an_intent_ends_after_its_validity(moving: Robot) -> None:
     operator, said_ns = moving.operator, [0]
     operator.recover()
 
@@ -181,7 +181,7 @@ def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
         assert operator.next("hal/clock")["arm_session"] == armings
         stopped = robot.run.tell("estop")
     operator.forget()
-    assert operator.next("hal/clock")["lifecycle"] == "estop", stopped.said
+    assert operator.next("hal/clock")["lifecycle"] == "estop", stopped.printed
 
 
 def test_a8_forged_service_answers_at_most_stop_lockstep_run(tmp_path: Path) -> None:

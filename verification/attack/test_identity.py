@@ -66,10 +66,10 @@ def test_a2_a_second_answer_is_an_impostor(
     with impostor(routed, "hal/estop" if tool == "estop" else "hal/lifecycle", lies):
         ended = routed.run.tell(*arguments)
     if tool == "estop" and ended.code == 0:  # confirmed past the network, by the stop port of a run of this user
-        assert operator.next("hal/clock")["lifecycle"] == "estop", ended.said
+        assert operator.next("hal/clock")["lifecycle"] == "estop", ended.printed
         return
-    assert ended.code == 1, f"exit code {ended.code} with the robot in {operator.lifecycle()}: {ended.said}"
-    assert "impostor" in ended.said, ended.said
+    assert ended.code == 1, f"exit code {ended.code} with the robot in {operator.lifecycle()}: {ended.printed}"
+    assert "impostor" in ended.printed, ended.printed
     if tool != "arm":  # whoever sees an impostor may well refuse to arm
         # Not armed in any case: a busy machine may have stopped it before it was asked.
         operator.until(lambda: operator.lifecycle() in (after, "fault"), f"{after}, as the robot was asked, too", 3.0)
@@ -82,7 +82,7 @@ def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: Robot) -> No
         forged = {**operator.status(), "lifecycle": "disarmed", "reason": "disarmed on request"}
         stranger.latch("hal/status", forged)
         ended = robot.run.tell("robot", "disarm")
-    assert ended.code == 1 and "impostor" in ended.said, f"the robot is {operator.lifecycle()}: {ended.said}"
+    assert ended.code == 1 and "impostor" in ended.printed, f"the robot is {operator.lifecycle()}: {ended.printed}"
 
 
 @pytest.mark.parametrize("_time", TIMES)
@@ -99,7 +99,7 @@ def test_a2_frozen_host_is_not_stopped_by_another_answer(
 ) -> None:
     with impostor(routed, key, lies), frozen_host(routed):
         ended = routed.run.tell(*(["estop"] if tool == "estop" else ["robot", tool]))
-    assert ended.code == 1 and word not in ended.said, f"exit code {ended.code}: {ended.said}"
+    assert ended.code == 1 and word not in ended.printed, f"exit code {ended.code}: {ended.printed}"
 
 
 @pytest.mark.parametrize("how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL])
@@ -122,10 +122,10 @@ def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, 
         if "frozen_host" in how:
             lies.enter_context(frozen_host(robot))
         ended = snakesim(tmp_path / "elsewhere", "estop", "--router", endpoint)
-        assert ended.code == 1 and "planar13: stopped" not in ended.said, ended.said
+        assert ended.code == 1 and "planar13: stopped" not in ended.printed, ended.printed
 
 
 def test_a2_a_frozen_host_gives_no_answer(routed: Robot) -> None:
     with frozen_host(routed):
         ended = routed.run.tell("estop")
-    assert ended.code == 1 and "planar13" in ended.said and "planar13: stopped" not in ended.said, ended.said
+    assert ended.code == 1 and "planar13" in ended.printed and "planar13: stopped" not in ended.printed, ended.printed

@@ -10,7 +10,7 @@ from verification.attack.robot import Robot, joined
 from verification.attack.stranger import Stranger
 
 
-def test_a12_who_disarms_clears_and_arms_is_told(robot: Robot) -> None:
+def test_a12_requesters_of_disarm_clear_and_arm_are_reported(robot: Robot) -> None:
     operator = robot.operator
     with Stranger(robot.endpoint) as stranger:
         for action, before in (("disarm", None), ("arm", "ready"), ("reset", "estop")):
@@ -30,9 +30,9 @@ def test_a12_a_run_that_a_stranger_finishes_is_not_complete(tmp_path: Path) -> N
             answer = stranger.request("finish", requester="mallory")
         code = run.end()
         summary = json.loads((run.out / "summary.json").read_text())
-    assert code == 1, f"exit code {code}, answered {answer}: {run.said()}"
+    assert code == 1, f"exit code {code}, answered {answer}: {run.printed()}"
     assert "finished on request" in summary["ended"] and summary["ended"].endswith("of 20 s"), summary["ended"]
-    assert "mallory" in run.said(), run.said()
+    assert "mallory" in run.printed(), run.printed()
 
 
 def test_a12_a_request_without_a_name_is_not_anonymous(robot: Robot) -> None:

@@ -78,26 +78,26 @@ def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot
 
 def printed_safely(robot: Robot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
-    told = {f"snakesim {tool}": robot.run.tell(*tool.split()).said for tool in ("status", "estop", "robot reset")}
-    for who, said in {**told, "the run": robot.run.said()[len(before) :]}.items():
+    told = {f"snakesim {tool}": robot.run.tell(*tool.split()).printed for tool in ("status", "estop", "robot reset")}
+    for who, said in {**told, "the run": robot.run.printed()[len(before) :]}.items():
         assert not steering(said), f"{who} prints {said!r}"
         assert not any(line.startswith("planar13: armed - all is well") for line in said.splitlines()), said
 
 
 def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robot) -> None:
-    said = robot.run.said()
+    said = robot.run.printed()
     with Stranger(robot.endpoint) as stranger:
         stranger.ask("hal/estop", {"requester": EVIL})
     robot.operator.until(lambda: robot.operator.lifecycle() == "estop", "the stop")
     robot.run.wait_for("evil")
     assert "evil" in robot.run.tell("status").out
     echoed = robot.run.tell("topic", "echo", "hal/status", "--count", "1")
-    assert EVIL in json.loads(echoed.out)["message"]["reason"] and not steering(echoed.said), echoed.said
+    assert EVIL in json.loads(echoed.out)["message"]["reason"] and not steering(echoed.printed), echoed.printed
     printed_safely(robot, said)
 
 
 def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robot) -> None:
-    said = robot.run.said()
+    said = robot.run.printed()
     with Stranger(robot.endpoint) as stranger:
         stranger.ask("hal/lease", {"action": "acquire", "holder": EVIL, "priority": 255})
         for action in ("disarm", "reset", "arm"):
@@ -107,7 +107,7 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robo
 
 
 def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) -> None:
-    said, operator = robot.run.said(), robot.operator
+    said, operator = robot.run.printed(), robot.operator
     fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "reach": "robot"}
     status = {**operator.status(), "lifecycle": "fault", "reason": EVIL, "faults": [fault], "injected": [EVIL]}
     status |= {"robot": EVIL, "backend": EVIL, "lease_holder": EVIL, "alive": [EVIL], "waiting_for": [EVIL]}
@@ -130,7 +130,7 @@ def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) ->
 
 
 def test_control_characters_in_a_namespace_reach_no_terminal(robot: Robot) -> None:
-    said = robot.run.said()
+    said = robot.run.printed()
     with Stranger(robot.endpoint, "evil\x1b[2J\rplanar13: armed - all is well") as stranger:
         stranger.seem_alive("alive/hal")
         stranger.pretend("hal/estop", {"ok": True, "reason": EVIL, "epoch": 0, "lifecycle": "estop"})
@@ -175,7 +175,7 @@ def test_false_robots_do_not_keep_a_stop_from_real_one(robot: Robot, record_prop
             token.undeclare()
     record_property("stopped after", f"{took_s:.2f} s, the command ended after {ended.took_s:.2f} s")
     assert took_s < 3.0 and ended.took_s < STATUS_S
-    assert "planar13: stopped" in ended.said, ended.said
+    assert "planar13: stopped" in ended.printed, ended.printed
     assert ended.code == 1, "robots that do not answer are no success"
 
 
@@ -238,4 +238,4 @@ def test_a_host_that_is_none_does_not_end_a_run(tmp_path: Path) -> None:
         with Stranger(run.endpoint) as stranger:
             stranger.seem_alive("hal/host/another")
             code = run.end()
-    assert code == 0, f"exit code {code}: {run.said()[-600:]}"
+    assert code == 0, f"exit code {code}: {run.printed()[-600:]}"

@@ -55,7 +55,7 @@ def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str,
         *("--out", str(out), "--endpoint", free_endpoint()),
     )
     summary = json.loads((out / "summary.json").read_bytes())
-    assert ended.code == 1 and words in summary["ended"], ended.said
+    assert ended.code == 1 and words in summary["ended"], ended.printed
     assert summary["duration_s"] < 60
     nothing_left(out, 20.0)
     assert sum(file.stat().st_size for file in out.iterdir()) < 200 * 2**20

@@ -27,10 +27,10 @@ def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
     out = str(home / "second")
     second = snakesim(home, "run", *SHORT, "--backend", "sim", "--out", out, *network)
     seen = {heard.message["lifecycle"] for heard in operator.heard("hal/clock")}
-    assert "armed" not in seen and operator.next("hal/clock")["arm_session"] == armings, second.said
-    assert second.code in (1, 2), second.said
-    assert "planar13" in second.said, f"the live robot is not named: {second.said}"
-    assert "Traceback" not in second.said
+    assert "armed" not in seen and operator.next("hal/clock")["arm_session"] == armings, second.printed
+    assert second.code in (1, 2), second.printed
+    assert "planar13" in second.printed, f"the live robot is not named: {second.printed}"
+    assert "Traceback" not in second.printed
 
 
 @pytest.mark.parametrize("_time", TIMES)
@@ -69,7 +69,7 @@ def test_a1_phantom_robot_only_keeps_a_run_from_starting(routed: Robot, tmp_path
             *(tmp_path, "run", *SHORT, "--set", 'robot="mamba"', "--router", routed.endpoint),
             *("--out", str(tmp_path / "second")),
         )
-    assert second.code in (1, 2) and "mamba" in second.said, second.said
+    assert second.code in (1, 2) and "mamba" in second.printed, second.printed
     operator.recover()
 
 
@@ -81,7 +81,7 @@ def test_a1_two_runs_started_together_have_a_network_each(tmp_path: Path, _time:
         running(tmp_path, *SHORT, name="two", endpoint=None, inside=machine) as two,
     ):
         codes = one.end(), two.end()
-        assert codes == (0, 0), one.said() + two.said()
+        assert codes == (0, 0), one.printed() + two.printed()
         assert one.endpoint != two.endpoint, f"both met at {one.endpoint}"
 
 
@@ -97,15 +97,15 @@ def test_a14_stop_without_arguments_names_every_robot_and_its_result(tmp_path: P
         frozen = two.part("host")
         os.kill(frozen, signal.SIGSTOP)
         stopped = snakesim(tmp_path, "estop", inside=machine)
-        assert lifecycles(machine, one.endpoint) == ["estop"], stopped.said
-        assert stopped.code == 1 and named(one, stopped.said) and named(two, stopped.said), stopped.said
+        assert lifecycles(machine, one.endpoint) == ["estop"], stopped.printed
+        assert stopped.code == 1 and named(one, stopped.printed) and named(two, stopped.printed), stopped.printed
         os.kill(frozen, signal.SIGCONT)
         stopped = snakesim(tmp_path, "estop", inside=machine)
-        assert [lifecycles(machine, run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.said
-        assert stopped.code == 0 and stopped.said.count("stopped") == 2, stopped.said
-        assert named(one, stopped.said) and named(two, stopped.said), stopped.said
+        assert [lifecycles(machine, run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.printed
+        assert stopped.code == 0 and stopped.printed.count("stopped") == 2, stopped.printed
+        assert named(one, stopped.printed) and named(two, stopped.printed), stopped.printed
         status = snakesim(tmp_path, "status", inside=machine)
-        assert status.said.count("planar13: estop") == 2, status.said
+        assert status.printed.count("planar13: estop") == 2, status.printed
 
 
 def named(run: Run, said: str) -> bool:

@@ -99,8 +99,8 @@ def test_impostor_blocks_confirmation_but_not_the_stop(robot: Robot) -> None:
         stranger.pretend("hal/lifecycle", answer)
         asked_s = time.monotonic()
         ended = robot.run.tell("estop")
-        assert robot.operator.stopped_at(asked_s, 3.0) and ended.code == 0, ended.said  # its own stop port says so
-        assert "WARNING: 2 answered in its name" in ended.said
+        assert robot.operator.stopped_at(asked_s, 3.0) and ended.code == 0, ended.printed  # its own stop port says so
+        assert "WARNING: 2 answered in its name" in ended.printed
         assert robot.run.tell("robot", "reset").code == 1
 
 

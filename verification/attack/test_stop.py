@@ -59,12 +59,12 @@ def test_a4_the_command_stops_the_robot_under(robot: Robot, name: str, _time: in
         try:
             took_s = operator.stopped_at(asked_s, COMMAND_S) - asked_s
         except AssertionError:
-            raise AssertionError(f"not stopped, exit code {ended.code}: {ended.said}") from None
+            raise AssertionError(f"not stopped, exit code {ended.code}: {ended.printed}") from None
     record_property("stopped after", f"{took_s:.2f} s from `snakesim estop`, {before} before, exit {ended.code}")
-    assert took_s < COMMAND_S, ended.said
-    assert "nobody listens" not in ended.said, ended.said
+    assert took_s < COMMAND_S, ended.printed
+    assert "nobody listens" not in ended.printed, ended.printed
     if name not in SHUTS:  # there the robot is stopped, and the tool may have had no status to confirm it by
-        assert ended.code == 0 and "planar13: stopped" in ended.said, ended.said
+        assert ended.code == 0 and "planar13: stopped" in ended.printed, ended.printed
 
 
 @pytest.mark.parametrize("_time", TIMES)
@@ -141,7 +141,7 @@ def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: Robot) ->
     before = robot.health()
     for who in (b"", b"\xff\xfe\x80", b"\x1b[2J\r\nplanar13: armed", b"x" * 65, b"x" * 60_000, "é".encode() * 64):
         datagrams.ask(robot.endpoint, datagrams.stop(who), 0.2)
-    printed = robot.run.tell("status").said + robot.run.said()
+    printed = robot.run.tell("status").printed + robot.run.printed()
     assert not steering(printed), printed
     assert "\nplanar13: armed" not in printed.partition("planar13: ")[2], printed
     assert datagrams.ask(robot.endpoint, datagrams.stop("after it"), 2.0) is not None, "no answer any more"
@@ -153,8 +153,8 @@ def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: Robot, knows
     endpoint = free_endpoint()
     with datagrams.false_port(endpoint, knows_nonce=knows_nonce):
         ended = snakesim(robot.run.home, "estop", "--endpoint", endpoint)
-    assert ended.code == 1, ended.said
-    assert "planar13: stopped\n" not in ended.said, ended.said
+    assert ended.code == 1, ended.printed
+    assert "planar13: stopped\n" not in ended.printed, ended.printed
 
 
 def test_a4_a_stop_keeps_trying_while_the_network_is_shut(robot: Robot) -> None:
@@ -165,4 +165,4 @@ def test_a4_a_stop_keeps_trying_while_the_network_is_shut(robot: Robot) -> None:
         asked_s = time.monotonic()
         ended = robot.run.tell("estop")
         opens.join()
-    assert robot.operator.stopped_at(asked_s, 1.0) and ended.code == 0, ended.said
+    assert robot.operator.stopped_at(asked_s, 1.0) and ended.code == 0, ended.printed

@@ -211,7 +211,7 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> Soak:
         joints = len(watch.description().joints)
         Operator(watch, health, found, log).go(Dice(seed, joints), 60 * minutes)
         if run.process.poll() is not None:
-            found.violations.append(f"the run has ended by itself: {run.said()[-500:]}")
+            found.violations.append(f"the run has ended by itself: {run.printed()[-500:]}")
         code = run.interrupt()
         if code != 130:
             found.violations.append(f"an interrupted run ends with exit code {code}, not 130")

@@ -99,7 +99,7 @@ class Outcome:
     hits: int = 0
     code: int | None = None
     interrupted: bool = False  # by a signal to the supervisor, whoever sent it
-    said: str = ""
+    printed: str = ""
     logs: dict[str, str] = field(default_factory=dict[str, str])
     armed_ticks: int = 0  # as somebody on the network has counted them
     record: HostRecord | None = None
@@ -140,7 +140,7 @@ class KilledRun:
                 self._outcome.code = self._process.poll()
                 self._asking.shutdown()
                 self._sweep()
-            self._outcome.said = run.said()
+            self._outcome.printed = run.printed()
         self._gather()
         return self._outcome
 

@@ -67,7 +67,7 @@ def judge(outcome: Outcome) -> list[str]:
     trial, wrong = outcome.trial, [f"left behind: {what}" for what in outcome.left_behind]
     wrong += [
         f"{name}: {_around(text, thrown.start())}"
-        for name, text in {"the run": outcome.said, **outcome.logs}.items()
+        for name, text in {"the run": outcome.printed, **outcome.logs}.items()
         if (thrown := THREW.search(text)) is not None and not _before_our_code(trial, name, text)
     ]
     wrong += _lies(outcome)
@@ -75,7 +75,7 @@ def judge(outcome: Outcome) -> list[str]:
         wrong.append("an emergency stop was answered, and is not on the disk")
     if outcome.reset_answered and outcome.stop_kept:
         wrong.append("a reset was answered, and the emergency stop is still on the disk")
-    if not outcome.said.strip() and outcome.code not in (None, 0) and trial.moment != "starting":
+    if not outcome.printed.strip() and outcome.code not in (None, 0) and trial.moment != "starting":
         wrong.append(f"exit code {outcome.code}, and not a word why")
     return wrong
 
@@ -102,7 +102,7 @@ def _lies(outcome: Outcome) -> list[str]:
         return [] if outcome.interrupted else ["exit code 130, and nobody has interrupted it"]
     if code == 1:
         words = ("fault:", "snakesim:", "left no record")
-        return [] if any(word in outcome.said for word in words) else ["exit code 1, and no word of a fault"]
+        return [] if any(word in outcome.printed for word in words) else ["exit code 1, and no word of a fault"]
     by = {hit.number for hit in trial.hits if hit.victim == SUPERVISOR}
     by |= {signal.SIGINT} if outcome.interrupted else set()
     return [] if code is not None and -code in by else [f"exit code {code}"]

@@ -238,7 +238,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         return self._load_nm / self._stiffness
 
     def _compute_propulsion(self, observation: Observation, located: Located, choice: Choice) -> PropulsionDemand:
-        """Compute the torque of the propulsion joint.
+        """Compute the torque with which the propulsion joint pushes the body along the path in this tick.
 
             f   = propulsion_n (1 - v / v_mission) * fade,   between 0 and propulsion_n, with a limited rate
             tau = f * torque_per_n - damping q',             within the joint's torque limit

@@ -136,7 +136,7 @@ def find_propulsion_joint(
 def choose_triplet(
     choices: Sequence[Choice], present: Triplet | None, *, switch_fraction: float, banned: Collection[Names] = ()
 ) -> Choice | None:
-    """Choose the triplet to push with.
+    """Choose the triplet of push-points with which the body pushes itself forward.
 
     The present triplet stays as long as it can be used, unless another needs less than `switch_fraction` of its torque.
     Candidates for its successor need little more than the minimum torque. Among them, in this order, the successor

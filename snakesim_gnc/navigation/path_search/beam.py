@@ -56,7 +56,7 @@ class BeamSearch:
         parameters: SearchParameters,
         growth: type[PathGrowth] | None = None,
     ) -> None:
-        """Prepare to search paths on a map.
+        """Prepare to search paths on a map, from the head of a body or for the whole body.
 
         Args:
             obstacles: the map.

@@ -57,7 +57,7 @@ def _add_jog(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_check(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim robot check`."""
+    """Add the options of `snakesim robot check`, which judges how the joints of a new robot are mounted."""
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run")
     add_write(parser, "that it was checked is written into it, if all of it was confirmed")
     parser.add_argument(
@@ -84,7 +84,9 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_identify(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run, in which the robot hung by its tail")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="folder of the run, in which the robot was suspended by its tail"
+    )
     add_write(parser, "the values are written into it")
     add_out(parser, "the page, an HTML file (default: identified.html in the run)")
     add_json(parser)

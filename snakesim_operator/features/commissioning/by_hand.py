@@ -38,7 +38,11 @@ NO_ANSWER = f"the robot's host did not publish its configuration within {HOST_TI
 
 
 def running_joints(session: Session, path: Path) -> Sequence[Joint]:
-    """Return the joints of the robot file that a host runs with.
+    """Return the joints of the robot file that a host runs with, after a check that it is this file.
+
+    Args:
+        session: session on the robot's network.
+        path: the robot file.
 
     Raises:
         ConfigError: the host runs with another file.
@@ -87,6 +91,12 @@ class HandMovedRobot:
 
     def read_samples(self, is_over: Callable[[], bool]) -> Iterator[tuple[float, Floats]]:
         """Yield time in seconds by the robot's clock and joint angles, as they arrive, until a condition holds.
+
+        Args:
+            is_over: returns whether to end.
+
+        Yields:
+            Robot time in s, and (n_joints,) angles in rad.
 
         Raises:
             RefusedError: the robot is armed, sends no angles, or does not know one.
@@ -243,7 +253,13 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
 def _wait_for_turn(robot: HandMovedRobot, joint: Joint, instruction: str) -> HandTurn | None:
     """Ask the person to turn a joint, and wait until the robot rests after it.
 
-    Returns the turn; or None, after printing the reason, if the joint was skipped or another joint turned.
+    Args:
+        robot: Connection to the robot.
+        joint: The joint to turn.
+        instruction: How to turn it, in words.
+
+    Returns:
+        The turn; None, after printing the reason, if the joint was skipped or another joint turned.
     """
     detector = TurnDetector()
     instruction_printed = False

@@ -37,9 +37,9 @@ def find_zeros(joints: Sequence[Joint], angles_rad: Floats) -> list[float]:
         NotStillError: a joint moved.
     """
     range_rad = np.ptp(angles_rad, axis=0)
-    most_moved = int(np.argmax(range_rad))
-    if range_rad[most_moved] > MAX_UNTOUCHED_RAD:
-        raise NotStillError(f"{joints[most_moved].name} moved by {range_rad[most_moved]:.3f} rad")
+    max_moved = int(np.argmax(range_rad))
+    if range_rad[max_moved] > MAX_UNTOUCHED_RAD:
+        raise NotStillError(f"{joints[max_moved].name} moved by {range_rad[max_moved]:.3f} rad")
     return Mounting(joints).to_drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
 
 

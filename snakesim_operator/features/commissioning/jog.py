@@ -140,6 +140,16 @@ class _JogSession:
     def __init__(
         self, session: Session, link: Link, robot: Description, status: Status, request: JogRequest, joint: int
     ) -> None:
+        """Prepare to jog one joint of a disarmed robot; `run` arms it.
+
+        Args:
+            session: session on the robot's network.
+            link: how to reach the robot.
+            robot: description of the robot.
+            status: its status, which is disarmed.
+            request: the joint and its bounds.
+            joint: index of the joint.
+        """
         # Connection.
         self._session = session
         self._link = link

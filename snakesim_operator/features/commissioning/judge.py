@@ -119,6 +119,13 @@ class _JointJudge:
     """Judges the joints of one run, with what all of their motions tell together."""
 
     def __init__(self, run: CheckMeasurements, *, straight: bool, allowed_backlash_rad: float) -> None:
+        """Measure the motion of the links for each joint, and find modules whose ids are swapped.
+
+        Args:
+            run: measurements of the joint check.
+            straight: whether a person states that the robot lay straight at the start.
+            allowed_backlash_rad: largest backlash that is not judged as wrong.
+        """
         self._run = run
         self._straight = straight
         self._allowed_backlash_rad = allowed_backlash_rad
@@ -281,7 +288,7 @@ def _judge_gear(turned: float, lost: LostMotion | None, drive: Drive, allowed_ba
 
 
 def _judge_zero(run: CheckMeasurements, joint: int, *, straight: bool) -> PropertyFinding:
-    """Judge the zero of a joint's angle.
+    """Judge whether the zero of a joint's angle in the robot file is right.
 
     If accelerometers measure the joint's angle by gravity, the encoder is compared with it. Otherwise it is compared
     with zero, if the robot was laid straight.
@@ -290,6 +297,9 @@ def _judge_zero(run: CheckMeasurements, joint: int, *, straight: bool) -> Proper
         run: Measurements of the check.
         joint: Index of the joint.
         straight: Whether a person states that the robot lay straight at the start.
+
+    Returns:
+        Confirmed, wrong with the zero to write into the robot file, or unknown with the reason.
     """
     at_rest = run.at_rest()
     before_motion = run.before_motion()

@@ -114,7 +114,7 @@ def _fit_fraction(signal: Floats, reference: Floats, where: Select) -> float:
 
 
 def find_order(motions: Sequence[LinkShares | None]) -> Order:
-    """Find joint modules whose ids are swapped.
+    """Find joint modules whose ids are swapped, from the motion of the links while each joint moved.
 
     Repeatedly exchanges the pair of modules whose exchange leaves the smallest misfit between IMUs and encoders, as
     long as the exchange explains the motions of both joints. Both motions count together, because one alone may show

@@ -95,9 +95,16 @@ class _ServoModel:
         return np.column_stack((sampled[self.FIRST_TICK :][self._used], np.ones(len(self.torque_nm))))
 
     def lagged_inputs(self, latency_s: float, response_time_s: float) -> Floats:
-        """Return target minus angle, and minus velocity, both behind a first-order lag: (ticks * STEPS_PER_TICK, 2).
+        """Return target minus angle, and minus velocity, both delayed and behind a first-order lag.
 
         A target begins at its tick, and holds until the next. Each row is at the end of its step.
+
+        Args:
+            latency_s: Delay from a target to its effect.
+            response_time_s: Time constant of the lag.
+
+        Returns:
+            (ticks * STEPS_PER_TICK, 2).
         """
         record = self._record
         ticks = len(self._angle_rad)

@@ -63,6 +63,17 @@ def _move_links(
         a'     = R' (a + alpha x l + omega x (omega x l))
         alpha' = R' alpha + (R' omega) x (q' z) + q'' z
         omega' = R' omega + q' z
+
+    Args:
+        robot: The robot, which is suspended by its tail link; the tail link does not move.
+        links: Lengths and masses of all links, tail to head.
+        rotations: For each joint, (n, 3, 3) from the link ahead to the link behind.
+        velocity_rad_s: (n, joints) joint velocities q'.
+        acceleration_rad_s2: (n, joints) joint accelerations q''.
+
+    Returns:
+        For each joint, the angular velocity, the angular acceleration and the acceleration of the link ahead of it, (n,
+        3) each in the frame of that link; the acceleration includes gravity.
     """
     count = len(velocity_rad_s)
     omega = np.zeros((count, 3))
@@ -86,13 +97,22 @@ def _move_links(
 def _torques_through_joints(
     robot: RobotFile, links: Sequence[Link], rotations: Sequence[Floats], motions: Sequence[_LinkMotion]
 ) -> Floats:
-    """Return the torque through every joint, (n, joints), by the forces on the links from the head to the tail.
+    """Return the torque through every joint, by the forces on the links from the head to the tail.
 
     With c to the center of mass, l to the front joint, I the inertia about c, and f and m from the link ahead:
 
         F  = mass (a + alpha x c + omega x (omega x c))
         m' = I alpha + omega x (I omega) + c x F + m + l x f
         f' = F + f
+
+    Args:
+        robot: The robot, with the axes of its joints.
+        links: Lengths, masses and inertias of all links, tail to head.
+        rotations: For each joint, (n, 3, 3) from the link ahead to the link behind.
+        motions: Motion of the link ahead of each joint.
+
+    Returns:
+        (n, joints) torques in N·m.
     """
     count = len(motions[0].omega)
     torque = np.zeros((count, len(motions)))

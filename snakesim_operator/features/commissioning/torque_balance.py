@@ -108,10 +108,18 @@ def fit_torque_balance(
 
 
 def _balance_columns(record: JointRecord, load_nm: Floats, load_by_angle_nm: Floats) -> tuple[Floats, Floats]:
-    """Return regressors and instruments of the torque balance, (ticks - 2 HALF_WINDOW, 6) each.
+    """Return regressors and instruments of the torque balance of a joint.
 
     Columns: dry friction, viscous friction, rotor inertia, offset, latency of the torque, load. The instruments of
     velocity and acceleration come from the angles, whose noise is independent of that of the velocities.
+
+    Args:
+        record: Motion and torque of the joint, one row for each tick.
+        load_nm: (ticks - 2 HALF_WINDOW,) torque that the links need, from smoothed angles and velocities.
+        load_by_angle_nm: The same, with the velocities derived from the angles.
+
+    Returns:
+        Regressors and instruments, (ticks - 2 HALF_WINDOW, 6) each.
     """
     period_s = record.period_s
     direction = smooth(direction_of_motion(record.velocity_rad_s))

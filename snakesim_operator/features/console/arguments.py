@@ -10,7 +10,7 @@ from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim console`."""
+    """Add the options of `snakesim console`, which shows a running robot or a recorded run in a browser."""
     parser.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
     parser.add_argument(
         "--at", type=number_type(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds into the recording"

@@ -29,12 +29,12 @@ MAX_OPEN_FILES = 4096  # far more than connections of browsers may use
 
 
 def console(where: RobotSelection, port: int | None, commission: Path | None = None) -> int:
-    """Show a running robot until Ctrl-C.
+    """Show a running robot in the browser, on pages that can also control it, until Ctrl-C.
 
     Args:
         where: Selects the robot.
         port: Port of the page; None: the default port, or any free one.
-        commission: The robot file, into which pages may write what was found by hand; None: pages write no file.
+        commission: The robot file, into which pages may write what was measured by hand; None: pages write no file.
 
     Returns:
         The exit code.
@@ -58,11 +58,11 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
 
 
 def show_record(folder: Path, at_s: float, port: int | None) -> int:
-    """Show a recorded run until Ctrl-C.
+    """Show a recorded run in the browser, with controls to play and to jump, until Ctrl-C.
 
     Args:
         folder: The folder of the run.
-        at_s: Where to begin, in seconds after the first instant.
+        at_s: Time at which to begin, in seconds after the first instant.
         port: Port of the page; None: the default port, or any free one.
 
     Returns:

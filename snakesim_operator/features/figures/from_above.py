@@ -79,13 +79,13 @@ def plot_obstacles(axes: Axes, record: RunRecord) -> None:
 
 
 def plot_body(axes: Axes, record: RunRecord, nodes_w: Floats, *, alpha: float = 1.0) -> None:
-    """Plot links and joints to scale.
+    """Plot links and joints of a robot to scale, seen from above.
 
     Args:
         axes: Axes to plot into.
         record: The run, which has the radius of the links.
-        nodes_w: (joints + 2, 2), tail end, joints and head end in m.
-        alpha: 1: opaque, 0: invisible.
+        nodes_w: (joints + 2, 2) tail end, joints and head end, m.
+        alpha: Opacity; 1: opaque, 0: invisible.
     """
     joints_w = nodes_w[1:-1]
     for rear, front, link in zip(nodes_w[:-1], nodes_w[1:], record.description.links, strict=True):

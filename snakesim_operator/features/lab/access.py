@@ -64,6 +64,13 @@ def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
     """Return the rules of Zenoh's access control for one identity.
 
     All keys at which the same messages may pass in the same direction (flow) share one rule.
+
+    Args:
+        identity: The router, robot or machine that the rules are for.
+        lab: The lab.
+
+    Returns:
+        The rules as Zenoh's configuration file has them, each with an id.
     """
     messages_at_key: dict[tuple[str, str], set[str]] = defaultdict(set)  # (key, flow) -> messages
     for flow, message, key in _permitted(identity, lab):
@@ -90,6 +97,13 @@ def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
     """Yield every kind of message that may pass between a router and an identity.
 
     Keys begin with the robot's namespace, unlike those of the table of roles.
+
+    Args:
+        identity: The router, robot or machine.
+        lab: The lab, with its robots.
+
+    Yields:
+        Direction, kind of message and key.
     """
     if identity.role is None:
         yield from _permitted_to_router()

@@ -43,6 +43,10 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
 
     The private key of the authority stays in this folder: it is copied to no machine.
 
+    Args:
+        folder: The folder of the authority.
+        lab: The lab, whose name and durations a new authority gets.
+
     Raises:
         ConfigError: The files in the folder are damaged, or other users may read them.
     """
@@ -59,7 +63,12 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
 
 
 def _sign_authority(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certificate:
-    """Return a certificate that the authority signs for itself. It may only sign certificates and revocation lists."""
+    """Return a certificate that the authority signs for itself. It may only sign certificates and revocation lists.
+
+    Args:
+        key: Private key of the authority.
+        lab: The lab, with its name and the days for which the certificate is valid.
+    """
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{lab.file.name} authority")])
     usage = x509.KeyUsage(
         digital_signature=False,
@@ -101,7 +110,15 @@ def _make_private(folder: Path) -> None:
 
 
 def _read_authority(certificate_path: Path, key_path: Path) -> Issuer:
-    """Read the authority and check that certificate and key belong together. Raises ConfigError."""
+    """Read the certificate authority, and check that certificate and key belong together.
+
+    Args:
+        certificate_path: File of the certificate.
+        key_path: File of the private key, which no other user may read.
+
+    Raises:
+        ConfigError: The files are damaged, expired, readable by others, or do not belong together.
+    """
     warning = check_permissions(key_path)
     if warning:
         raise ConfigError(
@@ -131,11 +148,11 @@ def _read_authority(certificate_path: Path, key_path: Path) -> Issuer:
 
 
 def issue(issuer: Issuer, identity: Identity, lab: Lab, life: timedelta | None = None) -> tuple[bytes, bytes]:
-    """Create a certificate and its private key.
+    """Create a private key and a certificate that identifies one machine of a lab with its role.
 
     Args:
         issuer: The authority that signs.
-        identity: What the certificate is for.
+        identity: The router, robot or machine that the certificate is for.
         lab: The lab.
         life: How long the certificate is valid; None takes `certificate_days` of the lab file.
 

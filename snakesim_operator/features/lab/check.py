@@ -185,11 +185,11 @@ def _check_router(name: str, lab: Lab, folder: Path, findings: Findings) -> bool
     stored = read_certificate(_certificate_path(router, folder))
     if shown.serial_number != stored.serial_number:
         _check_expiry(f"{name} shows an earlier certificate", shown, f"restart it on {router.machine}", findings)
-    _check_refuses_strangers(name, settings, findings)
+    _check_refuses_unknown_clients(name, settings, findings)
     return True
 
 
-def _check_refuses_strangers(name: str, settings: dict[str, Any], findings: Findings) -> None:
+def _check_refuses_unknown_clients(name: str, settings: dict[str, Any], findings: Findings) -> None:
     """Check that a router refuses a client without a certificate. settings: those of a client with one."""
     tls = settings["transport"]["link"]["tls"]
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
@@ -303,7 +303,14 @@ def check_what_moves(robot: LabRobot, description: Description | None, findings:
 def _check_process(
     process: Process, host: Process | None, clock_offsets_s: dict[str, float], findings: Findings
 ) -> None:
-    """Check version and settings of a process against those of the host, and its clock against ours."""
+    """Check version and settings of a process against those of the host, and its clock against this computer's.
+
+    Args:
+        process: The process.
+        host: The host of the robot; None if it does not run.
+        clock_offsets_s: How far clocks are ahead of this computer's, by the key of the messages that show it.
+        findings: Collects the results.
+    """
     findings.passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
     if host is not None:
         if process.version != host.version:

@@ -171,7 +171,15 @@ def _check_buses_of_robot(robot: LabRobot, where: str) -> None:
 
 
 def _check_one_type(robot: LabRobot, where: str) -> None:
-    """Check a robot whose drives all have one type: it has buses of that type's kind, and no others."""
+    """Check a robot whose drives all have one type: it has buses of that type's kind, and no others.
+
+    Args:
+        robot: The robot's entry in the lab file.
+        where: Place of the entry, for errors.
+
+    Raises:
+        ConfigError: the robot has buses of another kind, or none.
+    """
     match DRIVE_TYPES[robot.backend].kind:
         case "can":
             kind = "can"
@@ -197,7 +205,15 @@ def _check_one_type(robot: LabRobot, where: str) -> None:
 
 
 def _check_mixed(robot: LabRobot, where: str) -> None:
-    """Check that every bus has one drive type, and that every drive type has a bus of its kind."""
+    """Check a robot with several drive types: every bus has one type, and every type has a bus of its kind.
+
+    Args:
+        robot: The robot's entry in the lab file.
+        where: Place of the entry, for errors.
+
+    Raises:
+        ConfigError: a bus has no drive type, or several.
+    """
     if not robot.buses:
         raise ConfigError(
             f"{where}.buses` is missing, and backend `{MIXED}` without buses emulates its drives: nothing real would "
@@ -222,7 +238,16 @@ def _check_mixed(robot: LabRobot, where: str) -> None:
 
 
 def _check_buses_of_type(robot: LabRobot, name: str, where: str) -> None:
-    """Check that a drive type in `buses` exists, and that its buses are listed under its kind."""
+    """Check that a drive type in `buses` exists, and that its buses are listed under its kind, `can` or `serial`.
+
+    Args:
+        robot: The robot's entry in the lab file.
+        name: Name of the drive type.
+        where: Place of the entry, for errors.
+
+    Raises:
+        ConfigError: there is no such drive type, or a bus is not listed.
+    """
     if name not in DRIVE_TYPES:
         raise ConfigError(
             f"{where}.buses.{name}`: no such drive type; {suggest_word(name, list(DRIVE_TYPES))}there are "

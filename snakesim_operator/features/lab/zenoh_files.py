@@ -13,7 +13,7 @@ LEASE_MS = 2000  # after which a silent link is closed
 
 
 def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
-    """Return the Zenoh configuration of a router.
+    """Return the Zenoh configuration of a router, with certificates, access rules and limits of message sizes.
 
     The router listens with TLS on its machine's address, requires a certificate of every client, and enforces the
     access rules. It connects to the routers before it in the lab file, so that each pair of routers has one connection.

@@ -8,7 +8,7 @@ from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_import(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim robot import`."""
+    """Add the options of `snakesim robot import`, which converts a URDF into a robot file."""
     parser.add_argument("file", type=Path, metavar="FILE.urdf", help="the URDF")
     add_out(parser, "robot file to write (default: NAME.toml)")
     parser.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")

@@ -78,7 +78,7 @@ def _whole_length_m(robot: RobotFile) -> float:
 
 
 def export_robot(name: str, out: Path | None) -> int:
-    """Write a URDF from a robot file.
+    """Write a URDF from a robot file, with the values that URDF cannot hold in elements of its own.
 
     Args:
         name: Name of a shipped robot, or path of a robot file.

@@ -215,7 +215,16 @@ def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exc
 
 
 def _read_number(imported: Imported, number: JointNumber, joint: UrdfJoint) -> float | None:
-    """Return a number of a joint, or None if the file gives none. Raises ConfigError for one out of its range."""
+    """Return a number of a joint, such as its torque limit, or None if the file gives none.
+
+    Args:
+        imported: The import, whose report gets a doubt about a number that is unusually large.
+        number: Which number, with its element, unit and range.
+        joint: The joint of the URDF.
+
+    Raises:
+        ConfigError: The number is out of its range.
+    """
     element = joint.element.first(number.tag)
     if element is None or number.attribute not in element.attributes:
         return None

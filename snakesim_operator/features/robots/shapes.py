@@ -25,7 +25,10 @@ class Shape:
 
 
 def read_shape(element: Element) -> Shape:
-    """Read a shape.
+    """Read an element of <geometry>: a box, cylinder, capsule, sphere or mesh with its sizes.
+
+    Args:
+        element: The element.
 
     Raises:
         ConfigError: The shape is unknown, or a size is zero or negative.

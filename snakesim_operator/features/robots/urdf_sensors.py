@@ -140,7 +140,18 @@ def _scale_lengths(frame: Floats, scale: float) -> Floats:
 
 
 def _convert_pose(imported: Imported, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
-    """Return a pose, (4, 4), as position, yaw and pitch. A roll is reported, because a robot file has none."""
+    """Return the pose of a sensor on its link as position, yaw and pitch, as a robot file has it.
+
+    A roll is reported, because a robot file has none.
+
+    Args:
+        imported: The import, whose report is extended.
+        link_from_sensor: (4, 4) with lengths in m.
+        sensor: The <sensor> element, for the report.
+
+    Returns:
+        The values by the key of the robot file.
+    """
     matrix = link_from_sensor[:3, :3]
     roll_rad = math.atan2(matrix[2, 1], matrix[2, 2])
     if abs(roll_rad) > MAX_ROLL_RAD:
@@ -185,6 +196,14 @@ def _read_lidar(imported: Imported, sensor: Element, mounted_yaw_rad: float) -> 
     """Return beams, field of view, range and noise of a lidar.
 
     A robot file's scan is symmetric about the viewing direction, so another scan also changes the sensor's yaw.
+
+    Args:
+        imported: The import, whose report is extended.
+        sensor: The <sensor> element.
+        mounted_yaw_rad: Yaw of the sensor on its link.
+
+    Returns:
+        The values by the key of the robot file.
     """
     lidar = sensor.first("ray") or sensor.first("lidar")
     if lidar is None:
@@ -203,7 +222,16 @@ def _read_lidar(imported: Imported, sensor: Element, mounted_yaw_rad: float) -> 
 
 
 def _read_scan(imported: Imported, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
-    """Return beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric."""
+    """Return beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric.
+
+    Args:
+        imported: The import, whose report is extended.
+        horizontal: The <horizontal> element, with the angles of the first and the last beam.
+        mounted_yaw_rad: Yaw of the sensor on its link.
+
+    Returns:
+        The values by the key of the robot file.
+    """
     beams = _read_whole_number(horizontal, "samples", 1)
     first_rad = horizontal.text_number("min_angle", 0.0)
     last_rad = horizontal.text_number("max_angle", 0.0)
@@ -241,7 +269,12 @@ def _read_range(owner: Element, tag: str, min_tag: str, max_tag: str, default: s
 
 
 def _read_noise(imported: Imported, element: Element) -> dict[str, Any]:
-    """Return the standard deviation of a sensor's noise in m."""
+    """Return the standard deviation of a sensor's Gaussian noise in m, by the key of the robot file.
+
+    Args:
+        imported: The import, whose report gets a change if the file has noise of another type.
+        element: The element with a <noise> element; without one, the noise is reported as 0.
+    """
     noise = element.first("noise")
     if noise is None:
         element.note_absent("<noise>", "0 m")

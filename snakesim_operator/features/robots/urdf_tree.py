@@ -241,7 +241,21 @@ def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
 def _add_joint(
     imported: Imported, tree: _Tree, element: Element, parent: str, child: str, *, alone_at_root: bool
 ) -> None:
-    """Place the link behind a joint, and keep the joint if it turns. Raises ConfigError for one that slides."""
+    """Place the link behind a joint, and add the joint to the tree if it rotates.
+
+    Links on both sides of a fixed joint become one body.
+
+    Args:
+        imported: The import, whose report is extended.
+        tree: The links and joints so far, which is extended.
+        element: The <joint> element.
+        parent: Name of the link ahead of the joint, towards the root.
+        child: Name of the link behind it.
+        alone_at_root: Whether it is the only joint of the root link, which may be free to move.
+
+    Raises:
+        ConfigError: The joint slides, or has another type that no snake has.
+    """
     kind = element.get("type")
     if kind in ("floating", "planar") and alone_at_root:
         imported.omissions.add(
@@ -274,7 +288,15 @@ def _read_joint(imported: Imported, element: Element, frame: Floats) -> UrdfJoin
 
 
 def _read_axis(imported: Imported, joint: Element) -> Floats:
-    """Return the axis of a joint in the joint's frame, (3,), as a vector of length 1."""
+    """Return the axis of a joint in the joint's frame, (3,), as a vector of length 1.
+
+    Args:
+        imported: The import, whose report gets a change if the file's vector has another length.
+        joint: The <joint> element.
+
+    Raises:
+        ConfigError: The vector has no usable direction.
+    """
     axis_element = joint.first("axis")
     if axis_element is None:
         joint.note_absent("<axis>", "1 0 0")
@@ -295,7 +317,17 @@ def _read_axis(imported: Imported, joint: Element) -> Floats:
 
 
 def _add_mass(imported: Imported, body: Body, link: Element, frame: Floats) -> None:
-    """Add mass and inertia of a link to its body. Raises ConfigError for a mass that is negative or too large."""
+    """Add mass and inertia of a link to its body, which is all links that fixed joints connect.
+
+    Args:
+        imported: The import, whose report gets an assumption for a link without mass.
+        body: The body, which is changed.
+        link: The <link> element.
+        frame: root_from_link, (4, 4), in the file's unit of length.
+
+    Raises:
+        ConfigError: The mass is negative or too large, or a value is missing.
+    """
     inertial = link.first("inertial")
     if inertial is None:
         imported.assumptions.add("<link> without <inertial>: 0 kg", link.place)

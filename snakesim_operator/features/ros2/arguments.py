@@ -18,6 +18,7 @@ ROS_NAMESPACE = r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim start ros2`, which bridges a robot to ROS 2."""
     parser.add_argument(
         "--domain", type=number_type(0, MAX_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (default: 0)"
     )

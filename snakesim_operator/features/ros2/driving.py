@@ -29,7 +29,7 @@ class JointCommander:
     """Commands every joint in every tick from the messages of one topic; reconnects after a loss of the robot."""
 
     def __init__(self, session: Session, messages: RawReader, print_text: PrintLine, *, wall_time: bool) -> None:
-        """Start the thread that commands the robot.
+        """Start the thread that commands a robot from the joint targets on a ROS topic.
 
         Args:
             session: Session on the robot's network.

@@ -112,7 +112,14 @@ class RosJointTargets:
         return held_rad
 
     def _decode(self, payload: bytes) -> _JointCommand:
-        """Return what a message commands. Raises _RefusedMessageError."""
+        """Return mode, targets and timestamp of a sensor_msgs/JointState that commands joints.
+
+        Args:
+            payload: The message in CDR.
+
+        Raises:
+            _RefusedMessageError: The message is malformed, or a target is not allowed.
+        """
         try:
             message: Any = STORE.deserialize_cdr(payload, JOINT_STATE.name)
         except SerdeError as error:

@@ -101,10 +101,14 @@ def explain_age_refusal(age_ns: float, source: str) -> str:
 
 
 def explain_request_age_refusal(attachment: bytes, wall_ns: int) -> str:
-    """Return why a service request may not allow the robot to move; empty if it may.
+    """Return why a service request is too old to let the robot move; empty if it is recent.
 
-    A client sends a single request, so there is no faster message to compare with: its clock must agree with ours
-    to within MAX_REQUEST_AGE_NS.
+    A client sends a single request, so there is no faster message to compare with: its clock must agree with ours to
+    within MAX_REQUEST_AGE_NS.
+
+    Args:
+        attachment: Attachment of the request, with the time at which it was sent.
+        wall_ns: Present time of this computer's wall clock.
     """
     origin = read_sender(attachment)
     if origin is None:

@@ -152,7 +152,14 @@ def encode_markers(timestamp_ns: int, frame: str, shapes: Sequence[Marker]) -> b
 
 
 def _make_marker(header: Any, number: int, action: int, shape: Marker) -> Any:
-    """Return a visualization_msgs/Marker; its fields are in the order of their definition."""
+    """Return a visualization_msgs/Marker; its fields are in the order of their definition.
+
+    Args:
+        header: Header of the message, with time and frame.
+        number: Number of the marker in its group.
+        action: ADD or DELETE, as the message defines them.
+        shape: Shape, size in m, pose and color.
+    """
     position = _make_point(shape.position_m)
     orientation = make_quaternion(shape.orientation_wxyz)
     until_replaced = make_message("builtin_interfaces/msg/Duration", 0, 0)
@@ -183,13 +190,13 @@ def _make_marker(header: Any, number: int, action: int, shape: Marker) -> Any:
 
 
 def encode_image(timestamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
-    """Return a sensor_msgs/Image in CDR.
+    """Encode a camera image as a sensor_msgs/Image in CDR.
 
     Args:
         timestamp_ns: Time of the image.
-        frame: Its optical frame.
-        width: In pixels.
-        height: In pixels.
+        frame: Optical frame of the camera.
+        width: Width in pixels.
+        height: Height in pixels.
         encoding: 16UC1 (mm), 32FC1 (m) or rgb8.
         pixels: Rows without padding, little endian.
     """

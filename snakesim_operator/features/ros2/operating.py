@@ -25,7 +25,7 @@ REQUESTER = f"{get_user_name()[:40]}, ros2"
 def make_operating_servers(
     session: Session, node: Node, link: Link, prefix: str, *, operate: bool
 ) -> list[ServiceServer]:
-    """Declare the services that operate the robot.
+    """Declare the ROS services that stop the robot and, if ROS may operate it, arm, disarm and reset it.
 
     Args:
         session: Session on the robot's network.

@@ -205,7 +205,12 @@ def _decode_value(value: Any) -> Any:
 
 
 def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
-    """Return an rcl_interfaces/ParameterDescriptor; an empty one for an unknown parameter."""
+    """Return an rcl_interfaces/ParameterDescriptor; an empty one for an unknown parameter.
+
+    Args:
+        name: Name that was asked for.
+        parameter: The parameter of the controller; None if there is none of this name.
+    """
     if parameter is None:
         return make_message("rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], [])
     kind = _find_type(parameter.value)

@@ -44,9 +44,14 @@ INVERSE_DEPTH_UNUSED = struct.pack("<i2f", 0, 0.0, 0.0)  # format and two parame
 
 
 def encode_joint_state(timestamp_ns: int, names: list[str], joints: JointState) -> bytes:
-    """Return a sensor_msgs/JointState without a frame.
+    """Encode a joint state as a sensor_msgs/JointState without a frame.
 
     Joints whose state is not valid are left out, because a JointState may name any subset of the joints.
+
+    Args:
+        timestamp_ns: Time of the state in ROS.
+        names: Names of the joints, tail to head.
+        joints: The state.
     """
     valid_joints = [i for i, is_valid in enumerate(joints.valid) if is_valid]
     valid_names = [names[i] for i in valid_joints]
@@ -170,7 +175,13 @@ def encode_imu(timestamp_ns: int, frame: str, sample: Imu, entry: int) -> bytes:
 
 
 def encode_camera_info(timestamp_ns: int, frame: str, image: DepthImage | ColorImage) -> bytes:
-    """Return the sensor_msgs/CameraInfo of a depth or color image, of a camera without distortion."""
+    """Encode the intrinsics of a camera without distortion as a sensor_msgs/CameraInfo.
+
+    Args:
+        timestamp_ns: Time of the image in ROS.
+        frame: Optical frame of the camera.
+        image: The depth or color image, which carries the intrinsics.
+    """
     intrinsics = np.array(
         [
             [image.fx_px, 0.0, image.cx_px],
@@ -235,7 +246,12 @@ def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: 
 
 
 def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:
-    """Return a diagnostic_msgs/DiagnosticArray with one entry: the robot's state, its reason and its faults."""
+    """Encode the robot's status as a diagnostic_msgs/DiagnosticArray with one entry: state, reason and faults.
+
+    Args:
+        timestamp_ns: Time of the status in ROS.
+        status: The newest status.
+    """
     values = {
         "lifecycle": status.lifecycle,
         "backend": status.backend,

@@ -62,7 +62,7 @@ class SensorTopics:
     def __init__(
         self, session: Session, node: Node, prefix: str, ros_time: RosTime, static_frames: StaticFrames
     ) -> None:
-        """Prepare the topics; `set_robot` and `make_relays` follow.
+        """Prepare the ROS topics of one robot's sensors; `set_robot` and `make_relays` must be called next.
 
         Args:
             session: Session on the robot's network.

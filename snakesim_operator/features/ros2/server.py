@@ -37,12 +37,12 @@ class ServiceServer:
         make_refusal: Callable[[str], bytes] | None = None,
         explain_refusal: Callable[[bytes], str] = _allow_any,
     ) -> None:
-        """Declare the service in the ROS graph.
+        """Declare a service in the ROS graph, whose requests are answered in a thread of its own.
 
         Args:
             node: The node that offers it.
-            name: Its name, with its namespace.
-            service: Its type.
+            name: Name of the service, with its namespace.
+            service: Type of the service.
             answer: Makes the response to a request, in the thread of this service.
             depth: Depth of its queue, as the rmw profile of its kind has it.
             make_refusal: Makes the response that states a reason for refusal; None if its type has no such response.

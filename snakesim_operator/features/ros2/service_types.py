@@ -43,10 +43,10 @@ class RosService:
 
 
 def define_service(name: str, request: str, response: str) -> RosService:
-    """Register a service type.
+    """Register a ROS service type with its request, response and event, and return it with its type hash.
 
     Args:
-        name: Its name, such as std_srvs/srv/Trigger.
+        name: Name of the type, such as std_srvs/srv/Trigger.
         request: Definition of the request's fields.
         response: Definition of the response's fields.
     """

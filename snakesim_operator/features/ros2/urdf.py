@@ -17,7 +17,7 @@ LOSSES = (
 
 
 def make_urdf(robot: Description, prefix: str = "") -> str:
-    """Return the URDF document.
+    """Return a URDF document with the links and joints of a robot, for viewers in ROS.
 
     Args:
         robot: Description of the robot, with one link more than joints.

@@ -219,6 +219,10 @@ def differ(a: RunRecord, b: RunRecord) -> Difference:
 def _check_comparable(a: RunRecord, b: RunRecord) -> None:
     """Check that two runs have ticks, the same joints, and arrays that fit to each other.
 
+    Args:
+        a: The first run.
+        b: The second run.
+
     Raises:
         ConfigError: A run has no tick, the joints differ, or an array is damaged.
     """

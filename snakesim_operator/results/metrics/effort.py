@@ -112,6 +112,10 @@ def _form_closure_fraction(record: RunRecord, advance: Advance) -> float | None:
     The obstacles are those of the scene, at their initial places. Poses are sampled every FORM_CLOSURE_PERIOD_NS, until
     the end of the advance.
 
+    Args:
+        record: What was recorded of the run.
+        advance: The advance of the run, with its end.
+
     Returns:
         A value between 0 and 1; 0 if the scene has no obstacles; None if no sampled pose is known.
     """

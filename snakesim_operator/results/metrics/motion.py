@@ -84,7 +84,7 @@ def measure_motion(record: RunRecord) -> Motion | None:
         stop_end_s = run_end_s
         if last < last_sample:
             stop_end_s = _find_stop_end_s(time_s, center_w, last)
-        # Motion for less than a window cannot be told from a stop: merge the stops before and after it.
+        # Motion for less than a window cannot be distinguished from a stop: merge the stops before and after it.
         if stops and start_s - stops[-1].end_s < WINDOW_S:
             previous = stops.pop()
             start_s = previous.start_s

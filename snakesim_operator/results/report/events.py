@@ -127,6 +127,10 @@ def _snapshot_of_event(record: RunRecord, event: Event) -> Snapshot | None:
     Snapshots in which the controller's desired forces balance are preferred: first those with the fewest forces that
     were not measured, then the nearest in time. After a hand-over the new forces settle, so its snapshot may come up to
     SETTLING_S later. Without a balanced snapshot the one at the time of the event is used, which shows no forces.
+
+    Args:
+        record: What was recorded of the run.
+        event: The event; a hand-over has the joint that propels from then on.
     """
     if event.joint is None:
         begin_s = event.time_s - SIMULTANEOUS_S

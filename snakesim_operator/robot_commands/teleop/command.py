@@ -70,6 +70,17 @@ class Teleop:
     def __init__(
         self, session: Session, link: Link, fastest_m_s: float, keyboard: Keyboard | None, stick: Joystick | None
     ) -> None:
+        """Prepare to drive a robot by keyboard or joystick: it publishes intents, and watches the robot's state.
+
+        The emergency stop is connected here, so that it is ready before it is needed.
+
+        Args:
+            session: Session on the robot's network.
+            link: How to reach the robot.
+            fastest_m_s: Maximum speed along the path.
+            keyboard: Reads keys from the terminal; None: there is no terminal.
+            stick: The joystick; None: there is none.
+        """
         # The operator.
         self._link = link
         self._keyboard = keyboard

@@ -120,7 +120,7 @@ class Joystick:
 
 
 def open_joystick(device: Path | None) -> Joystick:
-    """Open a joystick.
+    """Open a joystick of Linux' event interface that has a stick and buttons.
 
     Args:
         device: such as /dev/input/event5; None: the first device with a stick and buttons.

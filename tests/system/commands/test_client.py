@@ -156,7 +156,7 @@ def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path)
                 print(error)
     """
     ended = script(stopped, waiting, tmp_path)
-    assert ended.out.startswith("planar13 is no longer armed, but estop: "), ended.said
+    assert ended.out.startswith("planar13 is no longer armed, but estop: "), ended.printed
     settled(waiting)
 
 

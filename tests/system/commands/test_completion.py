@@ -54,6 +54,6 @@ def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
     words, wanted = TYPED[typed]
     plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
     done = call([shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent)
-    assert done.code == 0, done.said
+    assert done.code == 0, done.printed
     found = {word for word in done.out.split() if word.startswith(words[-1])}  # which zsh leaves to its matcher
     assert done.err == "" and (found >= wanted if typed == "all commands" else found == wanted), done.out

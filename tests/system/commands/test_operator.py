@@ -32,7 +32,7 @@ LONG = (
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     with armed_run(tmp_path_factory.mktemp("operator") / "run", *LONG) as started:
         yield started
-        assert started.interrupt() == 130, started.said()
+        assert started.interrupt() == 130, started.printed()
 
 
 def until_armed(run: Running) -> None:
@@ -76,7 +76,7 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
     assert tell(run, "robot", "reset").code == 0
     assert not kept.exists()
     until_armed(run)
-    assert run.said().count("; restart in") == 1
+    assert run.printed().count("; restart in") == 1
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) ->
     for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
         typed = ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"]
         ended = call(typed, tmp_path, limit_s=120.0)
-        assert ended.code == code, ended.said
+        assert ended.code == code, ended.printed
 
 
 def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:

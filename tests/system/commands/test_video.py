@@ -15,7 +15,7 @@ from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("filmed") / "run"
     ended, _ = run_to_summary(out, "triplet", "--duration", "1")
-    assert ended.code == 0, ended.said
+    assert ended.code == 0, ended.printed
     return out
 
 

@@ -111,5 +111,5 @@ def test_by_hand_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) 
             (("limits", "snake.toml", "joint_9"), 2, "joint_1 to joint_4"),
         ):
             refused = run.tell("robot", "calibrate", *words)
-            assert refused.code == code and why in refused.err, refused.said
+            assert refused.code == code and why in refused.err, refused.printed
     assert (home / "snake.toml").read_bytes() == before

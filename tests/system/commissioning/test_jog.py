@@ -13,7 +13,7 @@ import pytest
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.command import background
-from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, stopped, told
+from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, read_setpoints, stopped
 
 REPEAT_S = 0.03  # of a key
 HELD_BACK = 270  # keys that come at once, as after a stall of some seconds
@@ -43,7 +43,7 @@ def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], 
 def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
     with host(home, BACKEND) as endpoint:
         assert moved_and_stood(home, endpoint)
-        wait_until(lambda: told(home)["lifecycle"] == "disarmed", "the end of it")
+        wait_until(lambda: read_setpoints(home)["lifecycle"] == "disarmed", "the end of it")
         assert stopped_when_killed(home, endpoint)
 
 
@@ -54,25 +54,25 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
         def ended() -> bool:
             return process.poll() is not None or stopped(home)
 
-        wait_until(lambda: ended() or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
-        before = told(home)["target"][1]
-        while not ended() and told(home)["target"][1] < before + 0.04:
+        wait_until(lambda: ended() or read_setpoints(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+        before = read_setpoints(home)["target"][1]
+        while not ended() and read_setpoints(home)["target"][1] < before + 0.04:
             os.write(terminal, UP)
             time.sleep(REPEAT_S)
-        let_go = told(home)["tick"]
-        wait_until(lambda: told(home)["tick"] > let_go + 25, "half a second")
-        half = told(home)
-        wait_until(lambda: told(home)["tick"] > let_go + 50, "another half second")
+        let_go = read_setpoints(home)["tick"]
+        wait_until(lambda: read_setpoints(home)["tick"] > let_go + 25, "half a second")
+        half = read_setpoints(home)
+        wait_until(lambda: read_setpoints(home)["tick"] > let_go + 50, "another half second")
         if ended():
             return False
         assert half["limit_nm"][1] == pytest.approx(0.3 * 7.0)
-        assert told(home)["target"][1] == half["target"][1]
+        assert read_setpoints(home)["target"][1] == half["target"][1]
         os.write(terminal, HELD_BACK * UP)
-        held_back = told(home)["tick"]
-        wait_until(lambda: told(home)["tick"] > held_back + 25, "half a second")
+        held_back = read_setpoints(home)["tick"]
+        wait_until(lambda: read_setpoints(home)["tick"] > held_back + 25, "half a second")
         if ended():
             return False
-        assert told(home)["target"][1] == half["target"][1], "moved by keys that a network has held back"
+        assert read_setpoints(home)["target"][1] == half["target"][1], "moved by keys that a network has held back"
         os.write(terminal, b"q")
         return process.wait(20) == 0
 
@@ -80,9 +80,9 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
 def stopped_when_killed(home: Path, endpoint: str) -> bool:
     """Kill the command; False when it was not armed."""
     with jogging(home, endpoint) as (process, _terminal):
-        wait_until(lambda: process.poll() is not None or told(home)["lifecycle"] != "disarmed", "armed again")
+        wait_until(lambda: process.poll() is not None or read_setpoints(home)["lifecycle"] != "disarmed", "armed again")
         if process.poll() is not None:
             return False
         process.kill()
-        wait_until(lambda: told(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
+        wait_until(lambda: read_setpoints(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
         return True

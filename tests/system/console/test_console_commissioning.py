@@ -15,7 +15,7 @@ from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.checked_robot import make_checked_folder
 from snakesim_testing.runs.command import background, running
 from snakesim_testing.runs.hand_turned_robot import robot
-from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, stopped, told
+from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, read_setpoints, stopped
 
 pytestmark = pytest.mark.e2e
 REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
@@ -105,7 +105,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         assert await moved_and_stood(viewer, relay, home)
         await armed(viewer, home)
     await watching  # the page is closed
-    await until(lambda: told(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")
+    await until(lambda: read_setpoints(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")
 
 
 async def armed(viewer: Viewer, home: Path) -> None:
@@ -114,24 +114,24 @@ async def armed(viewer: Viewer, home: Path) -> None:
     await viewer.say({"type": "GuiUpdateMessage", "uuid": viewer.named("Joint (0: all)"), "updates": {"value": 2}})
     await viewer.click("Start step")
     await until(lambda: viewer.shows("<div>joint_2: from -0.2"), "a joint that may be moved")
-    await until(lambda: told(home)["lifecycle"] != "disarmed", "armed")
+    await until(lambda: read_setpoints(home)["lifecycle"] != "disarmed", "armed")
 
 
 async def moved_and_stood(viewer: Viewer, relay: StallingRelay, home: Path) -> bool:
     """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
     await armed(viewer, home)
-    await until(lambda: stopped(home) or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
-    before = told(home)["target"][1]
+    await until(lambda: stopped(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+    before = read_setpoints(home)["target"][1]
     held = {"type": "GuiButtonHoldMessage", "uuid": viewer.named(FORWARDS), "frequency": HOLD_HZ}
-    while not stopped(home) and told(home)["target"][1] < before + 0.04:
+    while not stopped(home) and read_setpoints(home)["target"][1] < before + 0.04:
         await viewer.say(held)
         await asyncio.sleep(1 / HOLD_HZ)
     await ticks(home, 25)
-    half = told(home)
+    half = read_setpoints(home)
     await ticks(home, 25)
     if stopped(home):
         return False
-    assert told(home)["target"][1] == half["target"][1]
+    assert read_setpoints(home)["target"][1] == half["target"][1]
     relay.stall()
     for _ in range(HELD_IN_STALL):
         await viewer.say(held)
@@ -141,14 +141,14 @@ async def moved_and_stood(viewer: Viewer, relay: StallingRelay, home: Path) -> b
     await ticks(home, 50)
     if stopped(home):
         return False
-    assert told(home)["target"][1] == half["target"][1], "moved by what was held before the finger was lifted"
+    assert read_setpoints(home)["target"][1] == half["target"][1], "moved by what was held before the finger was lifted"
     await viewer.click("End step")
     await until(lambda: viewer.shows("<div>done"), "its end")
-    await until(lambda: told(home)["lifecycle"] == "disarmed", "a robot without current")
+    await until(lambda: read_setpoints(home)["lifecycle"] == "disarmed", "a robot without current")
     return True
 
 
 async def ticks(home: Path, count: int) -> None:
     """Of the robot's."""
-    since = told(home)["tick"]
-    await until(lambda: told(home)["tick"] > since + count, f"{count} ticks")
+    since = read_setpoints(home)["tick"]
+    await until(lambda: read_setpoints(home)["tick"] > since + count, f"{count} ticks")

@@ -34,7 +34,7 @@ def test_cable_turn_forgotten_by_its_drive_is_not_repeated(tmp_path: Path) -> No
     with host(tmp_path, BACKEND) as endpoint:
         assert "joint_1: how far its cable is wound is not known" in why(tmp_path, endpoint)
         declared = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=tmp_path)
-        assert declared.code == 0 and "its cable counts as unwound here" in declared.out, declared.said
+        assert declared.code == 0 and "its cable counts as unwound here" in declared.out, declared.printed
     assert robot(tmp_path).joint_table[0].limits.cable_unwound
     with host(tmp_path, BACKEND) as endpoint:
         assert "cable" not in why(tmp_path, endpoint)

@@ -32,8 +32,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pose(folder: Path) -> Iterator[str]:
     """Servos on `./servos`; where they send the pose."""
     address = f"127.0.0.1:{find_free_port()}"
-    said, first = folder / "servos.said", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
-    with said.open("wb") as file:
+    output, first = folder / "servos.log", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
+    with output.open("wb") as file:
         servos = subprocess.Popen(
             [*first, *SNAKESIM, "drive", "emulate", "dynamixel", "triplet", "--channel", "servos", "--pose", address],
             cwd=folder,
@@ -42,7 +42,7 @@ def pose(folder: Path) -> Iterator[str]:
             stderr=file,
         )
     try:
-        wait_until(lambda: "servos ready: 13" in said.read_text(), "the servos")
+        wait_until(lambda: "servos ready: 13" in output.read_text(), "the servos")
         yield address
     finally:
         servos.terminate()
@@ -60,9 +60,9 @@ def run(folder: Path, pose: str, *arguments: str) -> Ended:
 
 def test_external_servos_are_detected_and_driven_in_real_time(pose: str, folder: Path) -> None:
     found = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
-    assert found.code == 0 and found.out.count("XM540-W270 (1120)") == 13, found.said
+    assert found.code == 0 and found.out.count("XM540-W270 (1120)") == 13, found.printed
     ended = run(folder, pose, "--duration", "2")
-    assert ended.code == 0, ended.said
+    assert ended.code == 0, ended.printed
     again = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
     assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, "current-based position is kept"
 
@@ -73,7 +73,7 @@ def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path)
     ended = run(folder, pose, *frozen, "--out", str(folder / "frozen"))
     record = RunRecord.load(folder / "frozen").host
     assert record.armed_ticks > 10, "it was armed when it was frozen"
-    assert ended.code == 1 and record.lifecycle == "fault", ended.said
+    assert ended.code == 1 and record.lifecycle == "fault", ended.printed
     stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
     assert len(stopped) == 13, record.faults
     assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"
@@ -145,6 +145,6 @@ def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_
                 "mission.speed_m_s=0.3",
                 *network,
             )
-            wait_until(lambda: "`mission.speed_m_s` = 0.3 (here " in arm().said, "a refusal", 30.0)
+            wait_until(lambda: "`mission.speed_m_s` = 0.3 (here " in arm().printed, "a refusal", 30.0)
         start(stack, "control.log", "start", "service", "control", "row.toml", *network)
         wait_until(lambda: arm().code == 0, "armed", 60.0)

@@ -51,7 +51,7 @@ def test_without_joints_it_sends_nothing_and_the_lease_ends() -> None:
         made.run.arm()
         made.run.reaches("fault")
         assert [fault.what for fault in made.run.status.faults] == ["lease_expired"]
-        reported = made.tells("sensor/joints is ")
+        reported = made.wait_for_reason("sensor/joints is ")
         assert reported.state in ("NotLocomoting", "Idle")  # the latter when a busy machine delays it until the stop
         assert "at most 0.06 s" in reported.reason
         last_joints, last_command = joints.drain()[-1].tick, commands.drain()[-1].tick
@@ -85,7 +85,8 @@ def test_control_without_streams_withholds_them_until_they_return() -> None:
         for sender, key, what in (("hal", keys.POSE, "world"), ("navigation", keys.TRAJECTORY, "trajectory")):
             assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key)).ok
             wait_until(lambda what=what: blind(made, what), f"observations without a {what}")
-            reported, words = made.tells(f"{key} is "), f"at most {limits[key.partition('/')[2] + '_s']:.3g} s"
+            reported = made.wait_for_reason(f"{key} is ")
+            words = f"at most {limits[key.partition('/')[2] + '_s']:.3g} s"
             assert reported.state == "NotLocomoting"
             assert words in reported.reason
             since = len(made.observations)
@@ -98,8 +99,8 @@ def test_control_without_streams_withholds_them_until_they_return() -> None:
         assert not made.run.status.faults
         made.reported.clear()
         made.services["guidance"].stop()
-        made.tells("guidance/world is ")
-        made.tells("navigation/trajectory is ")  # planned from the last world model over and over
+        made.wait_for_reason("guidance/world is ")
+        made.wait_for_reason("navigation/trajectory is ")  # planned from the last world model over and over
         wait_until(lambda: blind(made, "world") and blind(made, "trajectory"), "observations without either")
         assert made.run.status.lifecycle == "armed"
 
@@ -121,7 +122,7 @@ def test_control_after_intent_expired_rests_and_says_why() -> None:
             if observation.trajectory is not None and observation.trajectory.speed_m_s == 0.0
         )
         assert (stopped.tick * PERIOD_NS - now_ns) * 1e-9 == pytest.approx(0.6, abs=0.25)
-        reported = made.tells("the intent of ann has expired")
+        reported = made.wait_for_reason("the intent of ann has expired")
         assert reported.state == "Idle"
         assert "send a new one to go on" in reported.reason
         intents.put(Intent(timestamp_ns=clocks.drain()[-1].timestamp_ns, requester="ann"))
@@ -162,7 +163,7 @@ def test_a_controller_that_answers_wrongly_ends_control_with_its_name(answer, wo
         control = made.services["control"]
         wait_until(lambda: not control.thread.is_alive(), "the end of control")
         assert isinstance(control.error, ControllerError)
-        for text in (str(control.error), made.tells(words).reason):
+        for text in (str(control.error), made.wait_for_reason(words).reason):
             assert "controller showing (class Showing): " in text
             assert words in text
         made.run.reaches("fault")

@@ -92,7 +92,7 @@ def test_simulated_speed_scales_real_time_and_reset_ends_disarmed() -> None:
     [
         (False, "realtime", {"action": "pause"}, "not_simulated"),
         (False, "realtime", {"action": "reset"}, "not_simulated"),
-        (True, "lockstep", {"action": "speed", "speed": 2.0}, "wrong_pace"),
+        (True, "lockstep", {"action": "speed", "speed": 2.0}, "wrong_clock_mode"),
         (True, "lockstep", {"action": "resume"}, "wrong_state"),
     ],
 )

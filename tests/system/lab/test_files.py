@@ -63,7 +63,7 @@ def test_systemd_accepts_every_unit_and_finds_it_closed(rendered: Path) -> None:
     for unit in units:
         rated = call(["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered)
         score = re.search(r"exposure level for \S+: ([\d.]+)", rated.out)
-        assert score is not None and float(score[1]) <= MAX_EXPOSED, f"{unit.name}: {rated.said[-200:]}"
+        assert score is not None and float(score[1]) <= MAX_EXPOSED, f"{unit.name}: {rated.printed[-200:]}"
 
 
 def test_containers_run_what_the_units_run(rendered: Path) -> None:

@@ -150,14 +150,14 @@ def test_router_log_states_only_who_joined_and_what_was_refused(lab: SmallLab) -
     assert_told(lab, f"let in: {who.common_name} from 127.0.0.1")
     for what in (f"Put (ingress) on {COMMAND}", f"Query (ingress) on {OWN}/hal/lifecycle"):
         assert_told(lab, f"refused: {who.common_name}: {what}")
-    own = [line for line in lab.said() if who.common_name in line and " on unused/key" not in line]
+    own = [line for line in lab.printed() if who.common_name in line and " on unused/key" not in line]
     assert len([line for line in own if "Put (ingress)" in line]) < 5
     assert not [line for line in own if "Reply" in line or "Delete" in line]
 
 
 def assert_told(lab: SmallLab, what: str) -> None:
     """The router's log has it, at the latest in a moment."""
-    eventually(lambda: any(what in line for line in lab.said()), True)
+    eventually(lambda: any(what in line for line in lab.printed()), True)
 
 
 def passed(lab: SmallLab, settings: dict[str, Any], command: str) -> list[str]:

@@ -80,7 +80,7 @@ def test_what_the_table_grants_passes_and_nothing_else(
 
 def seen_by(lab: SmallLab, name: str) -> Seen:
     """What of these places the router's log says that it refused to a certificate."""
-    said = [line.partition(f" refused: {name}: ")[2] for line in lab.said()]
+    said = [line.partition(f" refused: {name}: ")[2] for line in lab.printed()]
     return {
         kind: {
             line.removeprefix(start)

@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     flags = [word for one in mounted for word in ("--set", f"robot.joints.joint_6.{one}")]
     more = ("--duration", DURATION_S, "--set", f"backends.can.log={log}")
     ended, _ = run_to_summary(folder, "triplet", "--backend", "can", *flags, *more)
-    assert ended.code == 0, ended.said
+    assert ended.code == 0, ended.printed
     return folder
 
 

@@ -50,18 +50,18 @@ class Recording:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
         )
-        self.said = ""
+        self.printed = ""
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
         for line in self.process.stdout or ():
-            self.said += line
+            self.printed += line
 
     def type(self, line: str, answer: str) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(f"{line}\n")
         self.process.stdin.flush()
-        wait_until(lambda: answer in self.said, f"{answer!r}, not {self.said!r}", 20.0)
+        wait_until(lambda: answer in self.printed, f"{answer!r}, not {self.printed!r}", 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -76,19 +76,19 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _demonstrate(run: Running, home: Path) -> None:
     at = Recording(run, home)
     with at_the_keyboard(run, home) as terminal:
-        wait_until(lambda: "Enter begins an episode" in at.said, "the recorder at the robot", 20.0)
+        wait_until(lambda: "Enter begins an episode" in at.printed, "the recorder at the robot", 20.0)
         terminal.type(UP + UP)
         for number, word, became in ((0, "s", "succeeded"), (1, "f", "failed"), (2, "d", "dropped")):
             name = f"episode-{number:03d}.mcap"
             at.type("", f"{name}: recording")
             file = home / "demos" / name
             wait_until(lambda file=file: file.is_file() and file.stat().st_size > 150_000, "something in it", 20.0)
-            before = at.said
+            before = at.printed
             at.type("", f"{before}{name}: ")
             if number == 0:
                 at.type("x", "'x': s if it succeeded")
             at.type(word, f"{name}: {became}")
-        before = at.said
+        before = at.printed
         at.type("", f"{before}episode-002.mcap: recording")
         at.type("q", "2 episodes;")
         assert at.process.wait(10) == 0
@@ -104,7 +104,7 @@ def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
     assert {one["task"] for one in labels} == {"through the field"}
     assert {path.name for path in (demos / "demos").iterdir()} == {"episodes.jsonl", *(one["file"] for one in labels)}
     info = snakesim("recording", "info", "demos/episode-000.mcap", cwd=demos)
-    assert "operator/intent" in info.out and "sensor/depth/head" in info.out, info.said
+    assert "operator/intent" in info.out and "sensor/depth/head" in info.out, info.printed
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path
     assert refused.code == 2
     assert "--fps 7: of a robot at 50 Hz give one of 1, 2, 5, 10" in refused.err
     ended = snakesim(*given, "--fps", "10", "--out", "set", cwd=tmp_path)
-    assert "2 episodes" in ended.out, ended.said
+    assert "2 episodes" in ended.out, ended.printed
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     assert info["fps"] == 10
     assert info["total_episodes"] == 2

@@ -46,7 +46,7 @@ def test_a_replay_changes_them_in_the_same_tick(tuned: Path, tmp_path: Path) -> 
     assert replayed.code == 0 and replayed.out == "60 commands, the same to the bit\n", replayed.out + replayed.err
 
 
-def test_the_recording_tells_who_set_what_and_when(tuned: Path, tmp_path: Path) -> None:
+def test_the_recording_names_who_set_what_and_when(tuned: Path, tmp_path: Path) -> None:
     said = snakesim("recording", "info", str(tuned), cwd=tmp_path).out
     row = next(line for line in said.splitlines() if line.startswith("  set "))
     assert row.endswith(" s by ada: control.propulsion_n: 35.0 -> 20.0, control.damping_nm_s_per_rad: 0.5 -> 0.9")

@@ -53,8 +53,8 @@ def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> No
             wait_until(lambda: newest_status(session).tick > 100, "two seconds")
             host, tick = run.part("host"), newest_status(session).tick
         os.kill(host, signal.SIGKILL)
-        assert run.end() == 1, run.said()
-        said = run.said()
+        assert run.end() == 1, run.printed()
+        said = run.printed()
     assert "host was ended by SIGKILL" in said
     assert "may lack the last second" in said
     assert "Traceback" not in said
@@ -102,11 +102,11 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
         host = run.part("host")
         wait_until(lambda: handles(host, signal.SIGTERM), "a host that takes signals")
         os.kill(host, signal.SIGTERM)
-        assert run.end() == 1, run.said()
+        assert run.end() == 1, run.printed()
     summary = summary_of(tmp_path / "run")
     assert summary.ended.startswith("the host was stopped by a signal after ")
     assert " of 30 s" in summary.ended
-    assert f"fault: {summary.ended}" in run.said()
+    assert f"fault: {summary.ended}" in run.printed()
     nothing_left(tmp_path / "run")
 
 
@@ -114,7 +114,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
 def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
     with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
         assert command.tell(run, "robot", "disarm").code == 0
-        assert run.end() == 1, run.said()
+        assert run.end() == 1, run.printed()
     ended = summary_of(tmp_path / "run").ended
     assert "of 2 s" in ended
     assert "the time was over before the requested armed time was reached" in ended
@@ -265,6 +265,6 @@ def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hangs: Path) -> N
             assert time.monotonic() - began < 3.0
             assert "not stored yet" in answer.reason or (tmp_path / "run" / ESTOP).exists()
             assert session.request(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
-        assert run.end(30.0) == 1, run.said()
-        assert "the disk has not answered" in run.said()
-        assert "Traceback" not in run.said()
+        assert run.end(30.0) == 1, run.printed()
+        assert "the disk has not answered" in run.printed()
+        assert "Traceback" not in run.printed()

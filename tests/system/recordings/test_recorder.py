@@ -74,9 +74,9 @@ def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> N
             assert beside.wait(20) == 0
             assert said.count("refused a viewer") == 4 and "http://evil.example" in said, said
         assert links == [f"link_{i}" for i in range(14)]
-        assert run.end() == 3, run.said()  # complete, but the record is incomplete
-    assert run.said().count("warning:") == 1
-    assert "recorder was ended by SIGKILL" in run.said()
+        assert run.end() == 3, run.printed()  # complete, but the record is incomplete
+    assert run.printed().count("warning:") == 1
+    assert "recorder was ended by SIGKILL" in run.printed()
     kept = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages([keys.JOINTS]))
     assert len(kept) > 10
     alone = RunRecord.load(tmp_path / "beside.mcap")

@@ -30,7 +30,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str) -> None:
     ended, _ = run_to_summary(tmp_path / "run", scenario, "--duration", str(DURATION_S), "--clock-mode", "lockstep")
-    assert ended.code == 0, ended.said
+    assert ended.code == 0, ended.printed
     replayed = snakesim("replay", "run", "--control", cwd=tmp_path)
     ticks = round(DURATION_S * load(scenario).config.rate_hz)
     assert replayed.code == 0

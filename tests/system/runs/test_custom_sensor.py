@@ -74,10 +74,10 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             assert "bend_rad" in text
             assert " rad" in text
         echoed = started.tell("topic", "echo", LEFT, "--count", "1")
-        assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.said
+        assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.printed
         started.interrupt()  # in order: a killed recorder lacks its last half second, here that is all
     done = command("recording", "export", "run", "--format", "csv", "--out", "whiskers.csv", cwd=tmp_path)
-    assert done.code in (0, 3), done.said  # 3: the run was ended from outside
+    assert done.code in (0, 3), done.printed  # 3: the run was ended from outside
     with (tmp_path / "whiskers.csv").open() as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert {"bend_rad.left", "bend_rad.right", "age_s.left"} <= rows[0].keys()
@@ -136,4 +136,5 @@ def test_a_lying_whisker_stops_the_robot_and_is_named(tmp_path: Path, robot: str
     late = "bend_rad=7.0 if tick > 30 else 0.0"
     whisker.write_text(whisker.read_text().replace(BENT, late))
     done = in_process.snakesim("run", "peg_row", "--in-process", "--set", robot, "--duration", "5", cwd=tmp_path)
-    assert done.code != 0 and "sensor/custom/left cannot be published: Whisker.bend_rad is 7.0" in done.said, done.said
+    assert done.code != 0, done.printed
+    assert "sensor/custom/left cannot be published: Whisker.bend_rad is 7.0" in done.printed

@@ -69,11 +69,11 @@ def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
         "rate_hz=50",
     ]
     with armed_run(tmp_path / "run", *arguments) as run, starved(run.part("control")):
-        assert run.end() == 1, run.said()
+        assert run.end() == 1, run.printed()
     ended = summary_of(tmp_path / "run").ended
     assert re.match(rf"{TOO_SLOW}(control|host) waited for a processor for \d+ of \d+ ms", ended), ended
     assert "; lease of control expired: " in ended
-    assert f"fault: {TOO_SLOW}" in run.said()
+    assert f"fault: {TOO_SLOW}" in run.printed()
 
 
 @pytest.mark.quiet

@@ -55,11 +55,11 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
             assert tell(run, "robot", "arm", "planar13", "sim").code == 0
             sim("step", "7")
             wait_until(lambda: shows("armed", 7), "7 ticks")
-            wait_until(lambda: "PAUSED" in run.said(), "the pause on the terminal")
+            wait_until(lambda: "PAUSED" in run.printed(), "the pause on the terminal")
             sim("resume")
-        assert run.end() == 0, run.said()
+        assert run.end() == 0, run.printed()
     nothing_left(out)
-    said = run.said()
+    said = run.printed()
     assert "the simulator was reset" in said
     assert "host" in said
     assert f"command digest        {plain.command_digest[:16]}" in said
@@ -69,7 +69,7 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
     assert recorded.command_digest == plain.command_digest
     assert recorded.ticks == 100
     told = snakesim("recording", "info", str(out), cwd=tmp_path)
-    assert told.code == 0 and "missing" not in told.out, told.said
+    assert told.code == 0 and "missing" not in told.out, told.printed
     replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)
     same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}  # the last may come too late
     assert replayed.out in same, replayed.out + replayed.err

@@ -75,7 +75,7 @@ def pids(run: Running, *names: str) -> dict[str, int]:
 
 
 def interrupt(run: Running) -> RunSummary:
-    assert run.interrupt() == 130 and "report:" in run.said(), run.said()
+    assert run.interrupt() == 130 and "report:" in run.printed(), run.printed()
     return summary_of(run.out)
 
 
@@ -98,7 +98,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
     assert [restart.name for restart in summary.restarts] == ["host"]
     assert (tmp_path / "run" / "recording-1.mcap").is_file()
     assert summary.ticks > 0
-    assert "host was ended by SIGKILL; restart in 0.5 s" in run.said()
+    assert "host was ended by SIGKILL; restart in 0.5 s" in run.printed()
 
 
 def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -
         summary = interrupt(run)
     assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
     assert summary.ended == "interrupted"
-    assert "continue with `snakesim robot reset`" in run.said()
+    assert "continue with `snakesim robot reset`" in run.printed()
 
 
 @pytest.mark.slow  # a row of the fault table
@@ -150,7 +150,7 @@ def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> Non
     with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1
-        assert "guidance was ended by SIGKILL" in run.said()
+        assert "guidance was ended by SIGKILL" in run.printed()
 
 
 @pytest.mark.slow  # rows of the fault table
@@ -161,10 +161,10 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
             robot.reaches("armed")
             assert robot.fault("freeze", "control", for_s=0.5).ok
             robot.reaches("fault")
-            wait_until(lambda: "injected fault ends: freeze:control" in run.said(), "the thaw")
+            wait_until(lambda: "injected fault ends: freeze:control" in run.printed(), "the thaw")
             before = run.part("navigation")
             assert robot.fault("stop", "navigation").ok
-            wait_until(lambda: run.said().count("; restart in") == 1, "navigation's end")
+            wait_until(lambda: run.printed().count("; restart in") == 1, "navigation's end")
             wait_until(lambda: not robot.status().waiting_for, "navigation again", BACK_S)
             assert run.part("navigation") != before
             for kind, target, word in (

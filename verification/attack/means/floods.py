@@ -22,7 +22,7 @@ def flood(
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
     """So many processes of one kind of `verification.attack.means.flooder`, at work; killed at the end."""
     command = [sys.executable, "-m", "verification.attack.means.flooder", kind, endpoint, str(amount)]
-    logs = [folder / f"{kind}-{i}.said" for i in range(processes)]
+    logs = [folder / f"{kind}-{i}.printed" for i in range(processes)]
     with contextlib.ExitStack() as stack:
         started: list[subprocess.Popen[bytes]] = []
         for log in logs:

@@ -25,7 +25,7 @@ from snakesim_testing.can.listened_bus import (
     RATE_HZ,
     SCENARIO,
     Bench,
-    Heard,
+    ReceivedFrame,
     bench,
     first_in,
     passed_for_module_ms,
@@ -87,29 +87,29 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
     now_ns = time.time_ns()
     os.kill(pid, number)
     time.sleep(LEFT_S)  # also for the heartbeats after it, from which the modules' own time is known
-    heard = listener.listen()
-    if not _went_well_until(heard, now_ns):
+    received = listener.listen()
+    if not _went_well_until(received, now_ns):
         return None
-    stopped = first_in(heard, fault, now_ns)
+    stopped = first_in(received, fault, now_ns)
     if len(stopped) < JOINTS:
         return Trial(value=None, failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}")
     by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
     failures: list[str] = []
-    causes = {h.says()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
+    causes = {h.decode()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
     if causes - {LastStop.WATCHDOG}:
         failures.append(f"stopped by {causes}")
     own_ms: list[float] = []
     for node in NODES:
-        points = [h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node]
-        own_ms.append(passed_for_module_ms(heard, node, max(points), stopped[node].at_ns))
+        points = [h.at_ns for h in received if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node]
+        own_ms.append(passed_for_module_ms(received, node, max(points), stopped[node].at_ns))
     return Trial(value=max(own_ms), failure="; ".join(failures), recovered=True)
 
 
-def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
+def _went_well_until(received: Sequence[ReceivedFrame], now_ns: int) -> bool:
     """Return whether every module had a setpoint within the last three periods, and none had a stop command."""
     recent_ns = now_ns - round(3e9 / RATE_HZ)
-    driven = {parse_node(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
-    return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
+    driven = {parse_node(h.frame.id) for h in received if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
+    return driven == set(NODES) and not stop_commands([h for h in received if h.at_ns > recent_ns])
 
 
 @contextlib.contextmanager
@@ -135,7 +135,8 @@ def _arm(request: Request, robot: Bench, observer: Observer) -> None:
     deadline = time.monotonic() + ARM_LIMIT_S
     while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
         if time.monotonic() > deadline:
-            raise TrialError(f"not armed within {ARM_LIMIT_S:g} s: {observer.in_words()}; {robot.said('host')[-300:]}")
+            log = robot.read_log("host")[-300:]
+            raise TrialError(f"not armed within {ARM_LIMIT_S:g} s: {observer.in_words()}; {log}")
         if observer.state() != "armed":
             observer.arm(ARM_LIMIT_S)
         robot.listener.forget()
@@ -207,7 +208,7 @@ def _stepped(started_robot: Robot, observer: Observer, by_s: float) -> Trial:
     stops = sum(h.message.sequence is None for h in observer.applied)
     failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
     if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
-        failure = failure or f"only {len(observer.applied)} setpoints heard of in {AFTER_STEP_S:g} s"
+        failure = failure or f"only {len(observer.applied)} setpoints received of in {AFTER_STEP_S:g} s"
     return Trial(value=float(faults + stops), failure=failure)
 
 

@@ -87,10 +87,12 @@ class FrontServer:
         stop: StopPath | None,
         report: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """Accept nothing yet.
+        """Prepare the server to which browsers connect. It accepts connections once `run` is called.
+
+        It checks the token of each request, passes requests to the page server, and can stop the robot by itself.
 
         Args:
-            listening: Where browsers connect.
+            listening: The socket at which browsers connect.
             pages_path: The Unix socket of the page server.
             token: The first part of the path in each address that is answered.
             stop: Stops the robot; None for a recording, where there is nothing to stop.
@@ -169,6 +171,10 @@ class FrontServer:
 
     async def _answer_stop_request(self, method: str, writer: asyncio.StreamWriter) -> bool:
         """Answer `GET` with the readiness of the stop, and `POST` by stopping the robot.
+
+        Args:
+            method: Method of the HTTP request.
+            writer: The connection, to which the answer is written.
 
         Returns:
             Whether the connection is kept for further requests.

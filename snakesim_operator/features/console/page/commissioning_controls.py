@@ -28,7 +28,7 @@ class CommissioningControls:
         run_operation: Callable[[str, Callable[[], str]], object],
         on_late_press: Callable[[float], None],
     ) -> None:
-        """Add the controls to the viewer's page.
+        """Add the buttons with which one viewer runs a commissioning step, such as a search for zeros, to its page.
 
         Args:
             client: The viewer's page.
@@ -70,7 +70,12 @@ class CommissioningControls:
         self._end_button = gui.add_button("End step", color="gray")
 
     def _admit_controls(self, admission: Admission, on_late_press: Callable[[float], None]) -> None:
-        """Let this viewer's page use the controls. A step ends at any age of the press; nothing else may be old."""
+        """Let this viewer's page use the controls. A step ends at any age of the press; other presses may not be old.
+
+        Args:
+            admission: Decides which messages of the page count.
+            on_late_press: Called with the age of a press that was too old.
+        """
         jog_limits = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
         for control in (self._verb, self._joint, *jog_limits, self._end_button):
             admission.admit(control, self._viewer, self._is_in_control)

@@ -50,7 +50,7 @@ class Commissioning:
         token: ControlToken,
         log: PageLog,
     ) -> None:
-        """Add the table to the page.
+        """Add the table of joints to the page. No commissioning step runs yet.
 
         Args:
             gui: The page of all viewers.
@@ -79,7 +79,7 @@ class Commissioning:
             self._terminal_commands = gui.add_html("", order=3)
 
     def start(self, viewer: int, verb: str, joint: int, options: list[str]) -> str:
-        """Start a step.
+        """Start a commissioning step as a command in a process of its own, whose output the page shows.
 
         Args:
             viewer: The viewer in control.
@@ -174,7 +174,11 @@ class Commissioning:
         self._terminal_commands.content = self._terminal_html(snapshot)
 
     def _terminal_html(self, snapshot: RobotSnapshot) -> str:
-        """Return the exact commands for everything that this page cannot do."""
+        """Return the exact commands for the steps that this page cannot do, to be typed in a terminal.
+
+        Args:
+            snapshot: The newest snapshot of the robot, with its name and backend.
+        """
         flags = flags_of(self._link, snapshot.robot.robot)
         parts: list[str] = []
         if self.robot_file is None:

@@ -40,6 +40,12 @@ class JointCharts:
     """Angles against references and torques against limits, joint by joint, and both over time."""
 
     def __init__(self, gui: viser.GuiApi, robot: Description) -> None:
+        """Add the charts of all joints to the page, without values.
+
+        Args:
+            gui: The page.
+            robot: Description of the robot, whose limits are the scales of the charts.
+        """
         self._names = [joint.name for joint in robot.joints]
         self._numbers = np.arange(1.0, len(robot.joints) + 1)
         self._torque_limits_nm = np.array([joint.torque_limit_nm for joint in robot.joints])

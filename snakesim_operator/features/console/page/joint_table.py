@@ -19,7 +19,7 @@ HEADINGS = ("", "now", "limits, rad", "sign", "zero, rad")
 def commissioning_html(
     snapshot: RobotSnapshot, config: RunConfig | None, moved_ranges: Sequence[AngleRange] = ()
 ) -> str:
-    """Return the table of joints as HTML.
+    """Return the table of joints as HTML: angle, limits, sign and zero of each joint, and how it was checked.
 
     Args:
         snapshot: The newest snapshot of the robot.
@@ -39,7 +39,12 @@ def commissioning_html(
 
 
 def _check_html(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
-    """Return whether the joints were checked, and how."""
+    """Return one line of HTML about the start check: whether the joints were checked, by whom and how.
+
+    Args:
+        snapshot: The newest snapshot of the robot, with its status.
+        config: Configuration with which the host was started; None: not known.
+    """
     status = snapshot.status
     if snapshot.robot.emulated:
         return "<div>nothing real moves: its joints need no check</div>"

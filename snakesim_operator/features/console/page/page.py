@@ -51,7 +51,7 @@ class Page:
         recorded: str = "",
         commission: Path | None = None,
     ) -> None:
-        """Lay out the page, without a robot.
+        """Lay out the page for all viewers, before a robot is known.
 
         Args:
             server: Serves the page.
@@ -91,7 +91,14 @@ class Page:
     # --- layout ----------------------------------------------------------------------------------------------
 
     def _add_robot_tabs(self, tabs: viser.GuiTabGroupHandle) -> RobotTabs:
-        """Add the tabs that show the robot."""
+        """Add the tabs that show joints, forces, state, signals, cameras and sensors of the robot.
+
+        Args:
+            tabs: The group to which the tabs are added.
+
+        Returns:
+            The places in the tabs that a robot display fills.
+        """
         gui = self._server.gui
         with tabs.add_tab("Joints"):
             joints = gui.add_folder(None)
@@ -112,7 +119,13 @@ class Page:
         return RobotTabs(joints, forces, cameras, no_camera, sensors)
 
     def _add_commands(self, tabs: viser.GuiTabGroupHandle, operations: Operations, commission: Path | None) -> None:
-        """Add the stop, the keys that drive the robot, and the places of each viewer's controls."""
+        """Add the controls of a live robot: the stop, the keys that drive it, and the places of each viewer's controls.
+
+        Args:
+            tabs: The group to which tabs for parameters and commissioning are added.
+            operations: Sends commands to the robot.
+            commission: The robot file on this computer with which the host was started; None: pages may not change it.
+        """
         gui = self._server.gui
         control_folder = gui.add_folder("Control", order=2)
         with tabs.add_tab("Parameters"):

@@ -52,7 +52,7 @@ def _make_field(parameter: Parameter) -> InputField | None:
 
 
 def _make_number_field(parameter: Parameter, value: float) -> InputField:
-    """Return the input field for a number.
+    """Return the input field for a number, with the range and the step of its slider.
 
     It allows numbers up to four times the present value in both directions, as far as the parameter's bounds allow.
 

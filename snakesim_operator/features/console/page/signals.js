@@ -10,7 +10,7 @@
     made.append(...inside);
     return made;
   };
-  const say = (words, bad = false) => { at("said").textContent = words; at("said").className = bad ? "bad" : ""; };
+  const showNotice = (words, bad = false) => { at("notice").textContent = words; at("notice").className = bad ? "bad" : ""; };
   const ask = async (path, given = [], headers = {}) => {
     const answer = await fetch(`signals/${path}?${new URLSearchParams(given)}`, { cache: "no-store", headers });
     if (!answer.ok) throw new Error(await answer.text());
@@ -31,7 +31,7 @@
       if (chosen) line.append(element("button", { textContent: "beside", title: "in the plot with the blue frame", onclick: () => beside(name) }));
       return line;
     }));
-    say(words.length ? `${names.length} of ${Object.keys(units).length} signals` : `${Object.keys(units).length} signals`);
+    showNotice(words.length ? `${names.length} of ${Object.keys(units).length} signals` : `${Object.keys(units).length} signals`);
   };
   const suits = (unit, other) => unit === other || unit.split(/, | or /).includes(other) || other.split(/, | or /).includes(unit);
 
@@ -54,7 +54,7 @@
     const [left, right] = chosen.sides, unit = units[name];
     if (every(chosen).includes(name)) return;
     const side = [left, right].find((one) => !one.names.length || suits(units[one.names[0]], unit));
-    if (!side) return say(`${units[left.names[0]]} and ${units[right.names[0]]} have both axes: put ${name} into a plot of its own`, true);
+    if (!side) return showNotice(`${units[left.names[0]]} and ${units[right.names[0]]} have both axes: put ${name} into a plot of its own`, true);
     side.names.push(name);
     remember();
     load(chosen);
@@ -87,7 +87,7 @@
     try {
       plot.data = await (await ask("values", [...names.map((name) => ["name", name]), ...window_()])).json();
     } catch (error) {
-      return say(`no values: ${error.message}`, true);
+      return showNotice(`no values: ${error.message}`, true);
     }
     draw(plot);
   };
@@ -134,7 +134,7 @@
     const change = () => {
       const values = [low, high].map((field) => field.value.trim() === "" ? null : Number(field.value));
       if (values.some((value) => Number.isNaN(value)) || (values[0] !== null && values[1] !== null && values[0] >= values[1])) {
-        return say("a range has its lower number first, or is empty", true);
+        return showNotice("a range has its lower number first, or is empty", true);
       }
       side.range = values.every((value) => value === null) ? null : values;
       draw(plot);
@@ -180,7 +180,7 @@
     addEventListener("pointerup", (event) => {
       const still = pressed !== null && Math.abs(event.clientX - pressed) < 4, there = still ? time(event) : null;
       pressed = null;
-      if (there !== null && recorded) ask("go", [["time_s", there]], { "X-Snakesim": "go" }).catch((error) => say(error.message, true));
+      if (there !== null && recorded) ask("go", [["time_s", there]], { "X-Snakesim": "go" }).catch((error) => showNotice(error.message, true));
     }, true);
     Plotly.newPlot(plot.view, [], { height: PLOT_PX }, { responsive: true, displayModeBar: false, doubleClick: false });
     plot.view.on("plotly_relayout", (change) => {
@@ -196,7 +196,7 @@
     const link = element("a", { href: URL.createObjectURL(blob), download: name });
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-    say(`saved: ${name}`);
+    showNotice(`saved: ${name}`);
   };
   const picture = async () => {
     const width = plots[0].view.clientWidth, height = PLOT_PX + 22 * Math.max(...plots.map((plot) => every(plot).length));
@@ -210,8 +210,8 @@
     return [`<svg xmlns="http://www.w3.org/2000/svg" ${size}>${parts.join("")}</svg>`, width, parts.length * height];
   };
   const saving = (act) => async () => {
-    if (!plots.length) return say("nothing is drawn yet: search a signal first", true);
-    try { await act(); } catch (error) { say(`not saved: ${error.message}`, true); }
+    if (!plots.length) return showNotice("nothing is drawn yet: search a signal first", true);
+    try { await act(); } catch (error) { showNotice(`not saved: ${error.message}`, true); }
   };
   at("csv").onclick = saving(async () => {
     const names = [...new Set(plots.flatMap(every))].map((name) => ["name", name]);
@@ -252,7 +252,7 @@
         if (!recorded && span === null) await Promise.all(plots.map(load));
         place();
       }
-    } catch (error) { say("the console does not answer", true); }
+    } catch (error) { showNotice("the console does not answer", true); }
     setTimeout(turn, EVERY_MS);
   };
   const restore = () => {

@@ -90,7 +90,12 @@ class SignalsPage:
         return Response(status.value, status.phrase, headers, body)
 
     def _make_content(self, path: str, query: Query, request: Request) -> tuple[str, bytes]:
-        """Return content type and body for a path below PATH.
+        """Return content type and body of the answer to a request for the signals page, its scripts or its data.
+
+        Args:
+            path: Path of the request below PATH.
+            query: Parameters of the request.
+            request: The request itself.
 
         Raises:
             KeyError: There is no such path or signal.
@@ -172,6 +177,10 @@ def _write_csv(series: dict[str, Series], units: dict[str, str]) -> str:
     """Return a table with a row for every time at which a signal has a sample.
 
     A cell is empty if its signal has no sample at that time, or the value is unknown.
+
+    Args:
+        series: Times in s and values of each signal, by name.
+        units: Unit of each signal, by name.
     """
     text = io.StringIO()
     writer = csv.writer(text)

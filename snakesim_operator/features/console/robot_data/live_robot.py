@@ -91,6 +91,13 @@ class LiveRobot:
     """
 
     def __init__(self, session: Session) -> None:
+        """Subscribe to everything that a robot publishes.
+
+        Messages are stored on arrival, and decoded for each snapshot.
+
+        Args:
+            session: Session on the robot's network.
+        """
         now_s = time.monotonic()
         self.rejected = session.rejected
         # Messages, by key.

@@ -52,7 +52,11 @@ class RunPlayback:
         return float(times_s[0]), float(times_s[-1])
 
     def snapshot_at(self, time_s: float) -> RobotSnapshot:
-        """Return what was known of the robot at a time."""
+        """Return what was known of the robot at a time of the recorded run, from its newest messages up to then.
+
+        Args:
+            time_s: Robot time.
+        """
         record = self.record
         history = self.history
         if not len(record.time_s):

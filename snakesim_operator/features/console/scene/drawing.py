@@ -224,7 +224,15 @@ def _find_pushed_obstacles(snapshot: RobotSnapshot) -> frozenset[str]:
 
 
 def _contact_arrows(snapshot: RobotSnapshot, center_w: Floats) -> dict[str, Floats]:
-    """Return contacts, measured forces and their resultant as fields of ForceArrows."""
+    """Return contacts, measured forces and their resultant as fields of ForceArrows.
+
+    Args:
+        snapshot: The newest snapshot of the robot, with its contacts.
+        center_w: (3,) center of the body in the world, where the resultant is drawn, m.
+
+    Returns:
+        Points (n, 3) or arrows (n, 2, 3) by the name of the field; no fields without contacts.
+    """
     contacts = _list_contacts(snapshot)
     if not contacts:
         return {}

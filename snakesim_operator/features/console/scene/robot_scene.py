@@ -34,7 +34,13 @@ class RobotScene:
     """The 3-D scene of one robot."""
 
     def __init__(self, scene: viser.SceneApi, robot: Description, surroundings: Surroundings | None) -> None:
-        """Add everything that does not depend on a snapshot. surroundings: None if the true ones are unknown."""
+        """Add everything to the 3-D scene that does not depend on a snapshot: links, hinges, ground and obstacles.
+
+        Args:
+            scene: The scene of all viewers.
+            robot: Description of the robot.
+            surroundings: The true ground and obstacles; None if they are unknown.
+        """
         self._scene = scene
         self._robot = robot
         self._body_radius_m = max(link.radius_m for link in robot.links)
@@ -131,7 +137,7 @@ class RobotScene:
         )
 
     def _add_heightfield(self, along_m: Floats, heights_m: Floats) -> float:
-        """Add uneven ground as one mesh of triangles, and return its lowest height in m.
+        """Add a heightfield as one mesh of triangles, and return its lowest height in m.
 
         Args:
             along_m: (n,) coordinates of the samples, the same along x and along y.

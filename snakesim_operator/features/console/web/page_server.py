@@ -36,13 +36,14 @@ class BrowserRelay:
     """Serves browsers in a thread of its own, for as long as its context lasts."""
 
     def __init__(self, listening: socket.socket, viser: PageServer, page: bytes, answer_first: AnswerRequest) -> None:
-        """Accept nothing yet.
+        """Prepare the relay between browsers and viser, whose thread starts with the context.
 
         Args:
             listening: The Unix socket at which the front server connects.
             viser: Gets the messages of browsers.
             page: The console's page, as HTML.
-            answer_first: Answers requests for pages beside the console's; returns None for a page that it has not.
+            answer_first: Answers requests for pages beside the console's; returns None for a page that it does not
+                have.
         """
         self._listening = listening
         self._viser = viser
@@ -87,7 +88,12 @@ class BrowserRelay:
     # --- pages -----------------------------------------------------------------------------------------------
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a page; None lets a websocket connect."""
+        """Answer a request for a page; return None for a websocket, which then connects.
+
+        Args:
+            connection: The connection of the browser.
+            request: The request, with its path and headers.
+        """
         if "Upgrade" in request.headers:
             return None
         response = self._answer_first(request)

@@ -39,7 +39,7 @@ from snakesim_testing.can.recorded_wire import (
     RecordedWire,
     go,
     is_action,
-    is_set_point,
+    is_setpoint,
     words,
 )
 from snakesim_testing.messages import raises_error
@@ -61,7 +61,7 @@ def test_bring_up_enables_nothing() -> None:
         assert disarm < written
         assert parse_node(sent[disarm].id) == BROADCAST
         assert run.states() == [DISARMED] * JOINTS
-        assert not any(is_set_point(frame) for frame in go(run, "disarmed", 30))
+        assert not any(is_setpoint(frame) for frame in go(run, "disarmed", 30))
         assert run.faults == []
         assert run.true_speed_rad_s == [0.0] * 30
 
@@ -78,7 +78,7 @@ def test_opening_silent_module_is_reported_and_everything_closed(monkeypatch: py
     (wire,) = WIRES
     assert wire.closed == 1
     assert words(wire.sent)[-1] == "disarm"
-    assert not any(map(is_set_point, wire.sent))
+    assert not any(map(is_setpoint, wire.sent))
 
 
 def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]) -> None:

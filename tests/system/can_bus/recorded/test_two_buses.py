@@ -18,7 +18,7 @@ from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_testing.can.driver_loop import Loop, config
-from snakesim_testing.can.recorded_wire import WIRES, RecordedWire, go, is_action, is_set_point, words
+from snakesim_testing.can.recorded_wire import WIRES, RecordedWire, go, is_action, is_setpoint, words
 from snakesim_testing.messages import raises_error
 
 # --- several buses -----------------------------------------------------------------------------------------
@@ -77,10 +77,10 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
     a, b = WIRES
     for wire, nodes in ((a, {1, 2, 3}), (b, {4})):
         assert {parse_node(frame.id) for frame in wire.sent} == {0, *nodes}
-        assert {parse_node(frame.id) for frame in wire.sent if is_set_point(frame)} == nodes
+        assert {parse_node(frame.id) for frame in wire.sent if is_setpoint(frame)} == nodes
     counts = [[f.data for f in wire.sent if parse_opcode(f.id) == Opcode.SYNC] for wire in WIRES]
     assert counts[0] == counts[1], "all are seen at one instant"
-    b.refuses = is_set_point
+    b.refuses = is_setpoint
     run.run(7, run.waving)
     assert [fault.cause[:6] for fault in run.faults if fault.what == "bus_stuck"] == ["bus_b:"]
     stopped = NoProcess.stopped

@@ -26,7 +26,7 @@ from snakesim_testing.can.recorded_wire import (
     WIRES,
     go,
     is_action,
-    is_set_point,
+    is_setpoint,
     module_of,
     none,
     words,
@@ -51,7 +51,7 @@ def test_setpoints_are_sent_only_to_armed_robot_until_a_stop(
         run.run(20, run.waving)
         assert max(run.true_speed_rad_s) > 0.3
         sent = go(run, lifecycle, 40)
-        assert not any(map(is_set_point, sent))
+        assert not any(map(is_setpoint, sent))
         assert words(sent)[:1] == said and len(words(sent)) <= 3, "a word, and not all the time"
         assert run.states() == [state] * JOINTS
         assert run.true_speed_rad_s[-1] < 0.05
@@ -121,13 +121,13 @@ def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
         run.arm()
         start = run.tick
         refused = (start + 4, start + 5, start + 9)
-        WIRES[0].refuses = lambda frame: is_set_point(frame) and parse_node(frame.id) == 2 and run.tick in refused
+        WIRES[0].refuses = lambda frame: is_setpoint(frame) and parse_node(frame.id) == 2 and run.tick in refused
         by_tick: dict[int, list[dict[str, float]]] = {}
         for _ in range(30):
             tick = run.tick
             before = len(WIRES[0].sent)
             run.run(1, lambda tick: SafeSetpoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
-            mine = [f for f in WIRES[0].sent[before:] if is_set_point(f) and parse_node(f.id) == 2]
+            mine = [f for f in WIRES[0].sent[before:] if is_setpoint(f) and parse_node(f.id) == 2]
             by_tick[tick] = [read(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
         assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)

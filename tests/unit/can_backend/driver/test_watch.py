@@ -22,9 +22,9 @@ from snakesim_testing.can.monitor_rig import (
     Bench,
     Speak,
     answering,
+    list_findings,
     quiet,
     reporting,
-    said,
 )
 
 # --- what one module can do wrong --------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, aft
     assert bench.tick(speak) == [Finding(what, WHO + cause, 1, alone=what not in CONCERNS_ALL)]
     assert bench.ticks(40, speak) == []
     bench.reset()
-    assert (what, 1) in said(bench.ticks(CLEAR_GRACE + 1, speak))
+    assert (what, 1) in list_findings(bench.ticks(CLEAR_GRACE + 1, speak))
     assert bench.ticks(40, speak) == []
 
 
@@ -94,7 +94,7 @@ def test_watch_module_with_invalid_frames_is_not_silent(bad: Speak) -> None:
 def test_watch_module_never_received_is_reported_only_as_silent() -> None:
     reading, watch = ModuleReports(1), ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
     found = [f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]]
-    assert said(found) == [("module_silent", 0)]
+    assert list_findings(found) == [("module_silent", 0)]
     assert found[0].cause.endswith("ms")
 
 
@@ -122,14 +122,14 @@ def restarting(bench: Bench) -> list[Finding]:
 def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
     bench = Bench()
     found = restarting(bench) + bench.ticks(10)
-    assert said(found) == [("module_restarted", 1)]
+    assert list_findings(found) == [("module_restarted", 1)]
     assert found[0].cause.startswith(WHO + "has restarted")
     assert "0.20 s" in found[0].cause
     assert bench.watch.take_changed() == {1}
     assert bench.watch.take_changed() == set()
     bench.reset()
     assert bench.ticks(10) == []
-    assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
+    assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
 
 
 def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
@@ -137,7 +137,7 @@ def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
     assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
     (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
-    assert said([found]) == [("module_not_configured", 1)]
+    assert list_findings([found]) == [("module_not_configured", 1)]
     assert not found.alone
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}) == []
 
@@ -149,7 +149,7 @@ def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
         reading.process_frame(heartbeat(2, 0.01 * reading.sync))
 
     bench = Bench()
-    assert said(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]
+    assert list_findings(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]
     assert bench.watch.take_changed() == set()
 
 
@@ -157,7 +157,7 @@ def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
     bench = Bench()
     bench.tick(doubled)
     bench.ticks(5)
-    assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
+    assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
 
 
 def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
@@ -190,7 +190,7 @@ def test_water_after_heat_is_told_again_with_all_reasons() -> None:
 def test_watch_fault_without_heartbeat_is_reported_from_state() -> None:
     bench = Bench()
     found = bench.ticks(9, answering(ModuleState.FAULT))
-    assert said(found) == [("module_fault", 1)]
+    assert list_findings(found) == [("module_fault", 1)]
 
 
 def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
@@ -202,7 +202,7 @@ def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
     assert bench.ticks(10) == []
     bench.reset()
     assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
-    assert said(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], "and is told again when it stays"
+    assert list_findings(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], "and is told again when it stays"
 
 
 @pytest.mark.parametrize(("lifecycle", "reported"), [("estop", []), ("disarmed", [("module_emergency", 1)])])
@@ -211,7 +211,7 @@ def test_an_emergency_is_as_it_should_be_only_in_one(
 ) -> None:
     bench = Bench()
     bench.lifecycle = lifecycle
-    assert said(bench.ticks(9, answering(ModuleState.EMERGENCY))) == reported
+    assert list_findings(bench.ticks(9, answering(ModuleState.EMERGENCY))) == reported
 
 
 def test_watch_module_that_does_not_arm_is_reported_after_grace() -> None:

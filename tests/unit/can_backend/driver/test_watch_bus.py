@@ -9,7 +9,7 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode, frame_id
 from snakesim_testing.can.frames import answer, joint_state
-from snakesim_testing.can.monitor_rig import Bench, answering, quiet, said
+from snakesim_testing.can.monitor_rig import Bench, answering, list_findings, quiet
 
 # --- the bus -----------------------------------------------------------------------------------------------
 
@@ -35,7 +35,7 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
     assert bench.tick(errors=[error]) == []
     assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
     bench.reset()
-    assert said(bench.tick(errors=[error])) == [(kind, None)]
+    assert list_findings(bench.tick(errors=[error])) == [(kind, None)]
 
 
 @pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
@@ -93,13 +93,13 @@ def test_bus_watch_reports_a_second_host(frame: Frame, what: str, words: str) ->
     assert bench.tick(speak) == []
     bench.reset()
     assert bench.tick() == [], "it was there once and is no more"
-    assert said(bench.tick(speak)) == [(what, None)]
+    assert list_findings(bench.tick(speak)) == [(what, None)]
 
 
 def test_what_another_host_may_have_changed_is_written_anew() -> None:
     bench = Bench()
     bench.reading.process_frame(load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1))
-    assert said(bench.tick()) == [("second_host", None)]
+    assert list_findings(bench.tick()) == [("second_host", None)]
     assert bench.watch.take_changed() == {0, 1, 2}
 
 
@@ -113,17 +113,17 @@ def test_bus_watch_identity_request_is_no_second_host() -> None:
 def test_a_module_is_not_silent_that_was_not_asked() -> None:
     bench = Bench()
     for i in range(10):
-        assert said(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 2 else [])
+        assert list_findings(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 2 else [])
     assert bench.ticks(2, quiet) == []
-    assert said(bench.tick(quiet)) == [("module_silent", 1)]
+    assert list_findings(bench.tick(quiet)) == [("module_silent", 1)]
 
 
 def test_bus_watch_interface_down_is_not_also_reported_stuck() -> None:
     bench = Bench()
     down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
-    assert said(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
+    assert list_findings(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):
         assert bench.tick(unsent="can1") == []
     bench.tick(errors=[up], unsent="can1")
     found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
-    assert said(found) == [("bus_stuck", None)]
+    assert list_findings(found) == [("bus_stuck", None)]

@@ -181,7 +181,7 @@ class Everything(Model):
         for i, health in enumerate(self.healths if failure != "short" else ()):
             if i == silent or not math.isfinite(reported[i]):
                 continue
-            health.heard_ns, health.celsius, health.volts, health.leak = self.now_ns, celsius[i], volts[i], leaks[i]
+            health.received_ns, health.celsius, health.volts, health.leak = self.now_ns, celsius[i], volts[i], leaks[i]
             health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
             if volts[i] >= MIN_V:
                 health.low_since_ns = None
@@ -197,7 +197,7 @@ class Everything(Model):
             self.lose_or_fail({i} if word == "overheated" else None)
         quiet_before, self.silent = self.silent, set()
         for i, health in enumerate(self.healths):
-            if health.heard_ns is not None and not health.known(self.now_ns):
+            if health.received_ns is not None and not health.known(self.now_ns):
                 self.silent.add(i)
         fresh = self.silent - quiet_before
         if fresh and not (len(fresh) == 1 and fresh <= self.aside):
@@ -297,7 +297,7 @@ class Everything(Model):
         self.last_sequence = asked.sequence
         assert refusal is None
         self.expires_ns = self.now_ns + LEASE_NS
-        self.heard = self.now_ns, asked
+        self.newest_command = self.now_ns, asked
         if self.state == "armed":
             self.since_arming.append(asked)
 
@@ -315,15 +315,15 @@ class Everything(Model):
         config_hash=often("0" * 16, "1" * 16, None),
     )
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
-        ready = self.state == "disarmed" and self.known and self.live and self.heard is not None
+        ready = self.state == "disarmed" and self.known and self.live and self.newest_command is not None
         wrong = {
             (word, i) for word, i in self.wrong if word == "leak" or (word == "overheated" and i not in self.aside)
         }
         weak = any(health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths)
         ready = ready and not wrong and not weak and (self.reported or self.arm_session == 0)
-        if ready and self.heard is not None:
-            heard_ns, asked = self.heard
-            ready = self.now_ns - heard_ns <= LEASE_NS and all(
+        if ready and self.newest_command is not None:
+            received_ns, asked = self.newest_command
+            ready = self.now_ns - received_ns <= LEASE_NS and all(
                 i in self.aside or mode == Mode.PASSIVE or (mode == Mode.POSITION and abs(target - angle) <= FAR)
                 for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
             )
@@ -341,7 +341,7 @@ class Everything(Model):
             self.leave_for("armed")
             self.arm_session += 1
             self.armed_tick = self.seen_tick
-            self.heard = None
+            self.newest_command = None
             self.since_arming, self.counting = [], None
             self.expires_ns = self.now_ns + LEASE_NS
         self.check(answer, ready)
@@ -516,7 +516,7 @@ class Everything(Model):
         self.last = decision
 
     @invariant()
-    def it_is_as_the_model_says(self) -> None:
+    def it_matches_the_model(self) -> None:
         if not hasattr(self, "authority"):
             return
         found = self.authority
