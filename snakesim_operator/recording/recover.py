@@ -104,7 +104,7 @@ class _Copy:
         """Add a channel, unless its messages are made again."""
         if self._shown is not None and _is_shown(channel):
             return
-        stamps = self._requested_stamps or read_stamps(channel.metadata)
+        stamps: Stamps = self._requested_stamps or read_stamps(channel.metadata)
         schema = self._schemas.get(channel.schema_id, 0)
         metadata = mark_stamps(channel.metadata, stamps)
         number = self._mcap.add_channel(channel.topic, channel.message_encoding, schema, metadata)

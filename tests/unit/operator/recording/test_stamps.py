@@ -83,20 +83,18 @@ def test_copy_of_a_copy_is_in_robot_time_again(recording: Path, wall: Path, tmp_
     found = read_with_stock_reader(tmp_path / "robot.mcap")
     original = read_with_stock_reader(recording)
     assert all(STAMPS not in channel.metadata for channel, _, _ in found)
-    times = [
-        [(channel.topic, m.log_time, m.publish_time, m.data) for channel, m, _ in one] for one in (found, original)
-    ]
-    assert times[0] == times[1]
+    found_times, original_times = (
+        [(channel.topic, message.log_time, message.publish_time, message.data) for channel, message, _ in messages]
+        for messages in (found, original)
+    )
+    assert found_times == original_times
 
 
 def test_copy_without_a_choice_keeps_the_stamps(wall: Path, tmp_path: Path) -> None:
     count, _ = recover_recording(wall, tmp_path / "again.mcap")
-    times = [
-        [(m.log_time, m.publish_time) for _, m, _ in read_with_stock_reader(path)]
-        for path in (wall, tmp_path / "again.mcap")
-    ]
-    assert times[0] == times[1]
-    assert count == len(times[0])
+    original, copy = (read_with_stock_reader(path) for path in (wall, tmp_path / "again.mcap"))
+    assert [message.log_time for _, message, _ in copy] == [message.log_time for _, message, _ in original]
+    assert count == len(copy)
 
 
 def test_recorder_writes_wall_stamps(tmp_path: Path) -> None:
