@@ -1,7 +1,7 @@
 """The clock of a file's log times: the robot's, or the wall clock of the computer that recorded.
 
 An MCAP file has two times for each message. With robot stamps, `log_time` is robot time and `publish_time` the wall
-clock. With wall stamps they change places, and the metadata of each channel says so: no time is lost.
+clock. With wall stamps they change places, and each channel has a mark in its metadata: no time is lost.
 """
 
 from typing import Literal, get_args
