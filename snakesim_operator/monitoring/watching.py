@@ -9,6 +9,7 @@ from snakesim_hal.programs.arguments import add_duration, add_json, add_network,
 from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.recording.message import RAW_ONLY
+from snakesim_operator.recording.stamps import ABOUT_STAMPS, CHOICES
 
 MAX_TASK = 200
 
@@ -51,6 +52,7 @@ def _add_record(parser: argparse.ArgumentParser) -> None:
     )
     add_task(parser, "with --episodes: what is demonstrated, in words")
     add_duration(parser, "end after this time by the wall clock", number_type(0.0, 1e9, "s"))
+    parser.add_argument("--stamps", choices=CHOICES, help=f"{ABOUT_STAMPS} (default: robot)")
     viewers = parser.add_mutually_exclusive_group()
     viewers.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
     viewers.add_argument(
@@ -133,11 +135,12 @@ def _record(arguments: argparse.Namespace) -> int:
         arguments.foxglove,
         arguments.foxglove_origin,
         raw_only=arguments.raw_only,
+        stamps=arguments.stamps or "robot",
     )
 
 
 def _record_episodes(arguments: argparse.Namespace) -> int:
-    for name in ("out", "duration", "foxglove"):
+    for name in ("out", "duration", "foxglove", "stamps"):
         if getattr(arguments, name) is not None:
             raise ConfigError(
                 f"--{name} and --episodes: episodes are files in a folder, begun and ended by Enter",

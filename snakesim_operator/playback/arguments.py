@@ -11,6 +11,7 @@ from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.programs.arguments import add_json, add_namespace, add_out, add_set, add_task, number_type
 from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_operator.recording.stamps import ABOUT_STAMPS, CHOICES
 
 
 def add_span(parser: argparse.ArgumentParser) -> None:
@@ -93,6 +94,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
         "--images", action="store_true", help="lerobot: with the images of the cameras, in the recordings"
     )
     add_task(parser, "lerobot: the task, in words (default: the scenario's name)")
+    parser.add_argument("--stamps", choices=CHOICES, help=f"mcap: {ABOUT_STAMPS} (default: as recorded)")
     _add_fps(parser, number_type(1.0, 1000.0, "Hz"), None, "lerobot: frames a second (default: the robot's rate)")
 
 
@@ -166,6 +168,10 @@ def _export(arguments: argparse.Namespace) -> int:
         extras.require("report", f"--format {arguments.format}")
     from snakesim_operator.playback.export import export, export_dataset
 
+    if arguments.stamps is not None and arguments.format != "mcap":
+        raise ConfigError(
+            f"--stamps is for --format mcap, not {arguments.format}; leave it out", code="command/conflicting-options"
+        )
     if arguments.format == "lerobot":
         choice = {"images": arguments.images, "task": arguments.task, "fps": arguments.fps}
         return export_dataset(arguments.recordings, arguments.out, print_line, **choice)
@@ -174,7 +180,7 @@ def _export(arguments: argparse.Namespace) -> int:
             f"--images, --task and --fps are for --format lerobot, not {arguments.format}; leave them out",
             code="command/conflicting-options",
         )
-    return export(arguments.recordings, arguments.format, arguments.out, print_line)
+    return export(arguments.recordings, arguments.format, arguments.out, print_line, arguments.stamps)
 
 
 def _replay(arguments: argparse.Namespace) -> int:

@@ -20,6 +20,7 @@ from snakesim_hal.model.textfiles import exported
 from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording
+from snakesim_operator.recording.stamps import Stamps
 from snakesim_operator.results.missing_data import exit_code
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import find_recording
@@ -28,7 +29,9 @@ from snakesim_operator.results.signals import PARQUET_UNIT, arrays, table, unit_
 MISSING = b"snakesim.missing"  # metadata of a Parquet file: JSON
 
 
-def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine) -> int:
+def export(
+    runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine, stamps: Stamps | None = None
+) -> int:
     """Write one run as a file in another format.
 
     Args:
@@ -36,6 +39,7 @@ def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintL
         form: Format of the file: "csv", "parquet" or "npz" for a row each tick, "mcap" for a recording.
         out: The file; None: beside the recording.
         print_text: Prints a line.
+        stamps: With "mcap", the clock of the times in the file; None: as recorded.
 
     Returns:
         The exit code: 3 if the run is incomplete, otherwise 0.
@@ -52,7 +56,7 @@ def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintL
     path = _reserve(out or _default_path(run, form))
     if form == "mcap":
         with exported(path) as partial:
-            message_count, missing = recover_recording(find_recording(run), partial)
+            message_count, missing = recover_recording(find_recording(run), partial, stamps)
         print_text(f"{message_count} messages: {path}")
         return exit_code(run, missing)
 

@@ -14,6 +14,7 @@ from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, only_robot
 from snakesim_operator.recording.live import LiveServer
 from snakesim_operator.recording.recorder_process import record_to_file
+from snakesim_operator.recording.stamps import Stamps
 
 
 def record_robot(
@@ -24,6 +25,7 @@ def record_robot(
     foxglove_origins: Sequence[str] = (),
     *,
     raw_only: bool = False,
+    stamps: Stamps = "robot",
 ) -> int:
     """Record a robot until Ctrl-C, or for a time.
 
@@ -34,6 +36,7 @@ def record_robot(
         foxglove_port: Serve viewers on this port meanwhile; None: serve none.
         foxglove_origins: Origins of web pages that may be such viewers.
         raw_only: Write a file without topics for viewers.
+        stamps: The clock of the times in the file.
 
     Returns:
         The exit code: 1 if the disk was full.
@@ -60,7 +63,7 @@ def record_robot(
             if live is not None:
                 print_line(f"Foxglove: open connection {live.address}")
                 show = live.send
-            recorder = record_to_file(link, path, goes_on, show, raw_only=raw_only)
+            recorder = record_to_file(link, path, goes_on, show, raw_only=raw_only, stamps=stamps)
     finally:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)

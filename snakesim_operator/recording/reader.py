@@ -29,6 +29,7 @@ from snakesim_operator.recording.mcap_records import (
     read_summary,
 )
 from snakesim_operator.recording.message import RecordedMessage
+from snakesim_operator.recording.stamps import read_stamps
 from snakesim_operator.recording.writer import ABOUT, COPIED
 
 LATEST_NS = 2**62  # 146 years: no robot time is later
@@ -96,6 +97,8 @@ class RecordingReader:
 
     def read_records(self) -> Iterator[McapRecord]:
         """Yield every schema, channel, message and metadata that can be read, a channel before its messages.
+
+        The log time of a message is robot time, and its publish time the wall clock, whatever the stamps of the file.
 
         Raises:
             ConfigError: The file is no MCAP file, or cannot be read.
@@ -181,6 +184,7 @@ class RecordingReader:
             case Message():
                 if record.channel_id not in self._channels:
                     yield from self._restore_channel(record.channel_id)
+                self._use_robot_time(record)
                 if self._count_message(record):
                     yield record
             case Channel():
@@ -195,6 +199,12 @@ class RecordingReader:
                 yield record
             case _:
                 yield record
+
+    def _use_robot_time(self, message: Message) -> None:
+        """Let a message have robot time as its log time, and the wall clock as its publish time."""
+        channel = self._channels.get(message.channel_id)
+        if channel is not None and read_stamps(channel.metadata) == "wall":
+            message.log_time, message.publish_time = message.publish_time, message.log_time
 
     def _open_channel(self, channel: Channel) -> Iterator[McapRecord]:
         """Yield the channel, behind its schema if that was lost and the summary repeats it."""

@@ -36,8 +36,10 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.recording.message import RAW_ONLY, RECORDING
+from snakesim_operator.recording.shown_messages import Show
+from snakesim_operator.recording.stamps import Stamps
 from snakesim_operator.recording.tap import Tap
-from snakesim_operator.recording.writer import RecordingWriter, Show
+from snakesim_operator.recording.writer import RecordingWriter
 
 CYCLE_S = 0.02
 LAST_MESSAGES_TIMEOUT_S = 2.0  # at the end, for messages that are on their way
@@ -50,13 +52,14 @@ EXIT_DISK_FULL = 4
 class Recorder:
     """Writes a robot's messages into a file, and begins a new file when the robot gets a new host."""
 
-    def __init__(self, path: Path, shown_as: str | None, show: Show | None = None) -> None:
-        """Begin the first file. The arguments are those of Recording. Raises OSError if it cannot be created."""
+    def __init__(self, path: Path, shown_as: str | None, show: Show | None = None, stamps: Stamps = "robot") -> None:
+        """Begin the first file. The arguments are those of RecordingWriter. Raises OSError if it cannot be created."""
         self.path = path
         self._shown_as = shown_as
         self._show = show
+        self._stamps: Stamps = stamps
         self._began = datetime.now(UTC)
-        self.recording = RecordingWriter(path, shown_as, show)
+        self.recording = RecordingWriter(path, shown_as, show, stamps)
 
         # What a new host changes: its description comes, and robot time starts over, in either order.
         self._latched: dict[str, Arrival] = {}  # newest messages that each file begins with, by key
@@ -114,7 +117,7 @@ class Recorder:
         self._host_count += 1
         self.close({})
         self.path.rename(self._find_free_path())
-        self.recording = RecordingWriter(self.path, self._shown_as, self._show)
+        self.recording = RecordingWriter(self.path, self._shown_as, self._show, self._stamps)
         for arrival in (*self._latched.values(), clock):
             self.recording.write_arrival(arrival)
 
@@ -135,6 +138,7 @@ def record_to_file(
     *,
     raw_only: bool = False,
     after_host: bool = False,
+    stamps: Stamps = "robot",
 ) -> Recorder:
     """Record a robot until the caller ends it or the disk is full.
 
@@ -145,6 +149,7 @@ def record_to_file(
         show: Gets each message that is made for viewers.
         raw_only: Record messages as on the wire alone, without topics for viewers.
         after_host: At the end, wait until the robot's host has left the network.
+        stamps: The clock of the log times.
 
     Returns:
         The recorder with its closed file.
@@ -196,7 +201,7 @@ def _record_session(
     if not raw_only:
         shown_as = link.namespace or "robot"
     try:
-        recorder = Recorder(path, shown_as, show)
+        recorder = Recorder(path, shown_as, show, stamps)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
     tap = Tap(session)

@@ -9,7 +9,6 @@ is killed loses no more than that.
 import json
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,10 +21,10 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.foxglove import FoxgloveChannels
-from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, make_schema
 from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.robot_time import MessageClock
+from snakesim_operator.recording.shown_messages import Show, ShownMessages
+from snakesim_operator.recording.stamps import Stamps, mark_stamps, order_times
 
 FLUSH_S = 0.5
 MAX_EARLY_SAMPLES = 1000  # of custom sensors before the description; further ones get no schema of their own
@@ -33,25 +32,26 @@ MAX_ENCODING_NAME = 200  # characters; it comes from the network
 ABOUT = "snakesim"  # the name of the metadata record
 COPIED = "lacked_before_copy"  # entry of that record: what the recording lacked that this one was copied from
 
-Show = Callable[[FoxgloveMessage, int], None]  # gets a message for viewers, and its robot time in ns
-
 
 class RecordingWriter:
     """A file that is being written. A full disk ends it (see `failure`), and raises nothing."""
 
-    def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:
+    def __init__(
+        self, path: Path, shown_as: str | None = None, show: Show | None = None, stamps: Stamps = "robot"
+    ) -> None:
         """Create an MCAP file for a robot's messages, and write its beginning.
 
         Args:
             path: The new file.
             shown_as: The robot's name in topics for viewers; None: record only the messages as on the wire.
             show: Gets each message that is made for viewers.
+            stamps: The clock of the log times.
 
         Raises:
             OSError: The file cannot be created; FileExistsError if it exists.
         """
         self.path = path
-        self._show = show
+        self._stamps: Stamps = stamps
         self.failure = ""  # why nothing is written any more
         self.time = MessageClock()
         self._wall_offset_ns = time.time_ns() - time.monotonic_ns()  # wall clock minus monotonic clock
@@ -59,7 +59,7 @@ class RecordingWriter:
         # The file.
         self._file = GrowingFile(path)
         self._mcap = McapFile(self._file)
-        self._channels: dict[str, int] = {}  # channel numbers, by key and by topic
+        self._channels: dict[str, int] = {}  # channel numbers, by key
         self._schemas: dict[str, int] = {}  # schema numbers, by the schema's name or text
         self._next_flush_s = 0.0
 
@@ -69,10 +69,9 @@ class RecordingWriter:
         self._early_samples: list[Arrival] | None = []  # of custom sensors; None once the description is known
 
         # Messages made for viewers.
-        self._foxglove: FoxgloveChannels | None = None
+        self._shown: ShownMessages | None = None
         if shown_as is not None:
-            self._foxglove = FoxgloveChannels(shown_as)
-        self._shown_counts: Counter[str] = Counter()  # by topic
+            self._shown = ShownMessages(self._mcap, shown_as, stamps, show)
 
         self.flush()
 
@@ -136,30 +135,11 @@ class RecordingWriter:
             return
         robot_ns = self.time.date(arrival.key, arrival.payload)
         wall_ns = arrival.monotonic_ns + self._wall_offset_ns
+        log_ns, publish_ns = order_times(robot_ns, wall_ns, self._stamps)
         self.counts[arrival.key] += 1
-        self._mcap.add(channel, robot_ns, wall_ns, self.counts[arrival.key], arrival.payload)
-        if self._foxglove is not None:
-            for message in self._foxglove.convert(arrival.key, arrival.payload, robot_ns):
-                self._write_shown(message, robot_ns, wall_ns)
-
-    def _write_shown(self, message: FoxgloveMessage, robot_ns: int, wall_ns: int) -> None:
-        """Write one message for viewers, and show it."""
-        channel = self._channels.get(message.topic)
-        if channel is None:
-            channel = self._open_shown_channel(message)
-        self._shown_counts[message.topic] += 1
-        self._mcap.add(channel, robot_ns, wall_ns, self._shown_counts[message.topic], message.payload)
-        if self._show is not None:
-            self._show(message, robot_ns)
-
-    def _open_shown_channel(self, message: FoxgloveMessage) -> int:
-        """Return the number of a new channel for a topic of viewers."""
-        schema = make_schema(message.message_type)
-        if schema.name not in self._schemas:
-            self._schemas[schema.name] = self._mcap.add_schema(schema.name, schema.schema_encoding, schema.data)
-        channel = self._mcap.add_channel(message.topic, schema.message_encoding, self._schemas[schema.name])
-        self._channels[message.topic] = channel
-        return channel
+        self._mcap.add(channel, log_ns, publish_ns, self.counts[arrival.key], arrival.payload)
+        if self._shown is not None:
+            self._shown.write(arrival.key, arrival.payload, log_ns, publish_ns)
 
     def _open_channel(self, arrival: Arrival) -> int | None:
         """Return the number of a new channel for a key, or None if the key is not in the key space."""
@@ -171,7 +151,7 @@ class RecordingWriter:
             schema = self._add_published_schema(message_type.__name__)
         else:
             schema = self._add_custom_schema(custom_type)
-        metadata = {"encoding": arrival.encoding[:MAX_ENCODING_NAME]}
+        metadata = mark_stamps({"encoding": arrival.encoding[:MAX_ENCODING_NAME]}, self._stamps)
         channel = self._mcap.add_channel(arrival.key, "msgpack", schema, metadata)
         self._channels[arrival.key] = channel
         return channel

@@ -4,9 +4,11 @@ import argparse
 import re
 
 from snakesim_hal.base.errors import ConfigError, shorten
+from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.endpoint import check_endpoint
-from snakesim_hal.programs.arguments import add_network, number_type
+from snakesim_hal.programs.arguments import add_network, add_out, number_type
 from snakesim_hal.programs.commands import Command, Commands
+from snakesim_operator.playback.arguments import add_recording
 
 ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
 MAX_DOMAIN = 232  # as with DDS
@@ -77,7 +79,43 @@ def check(arguments: argparse.Namespace) -> None:
         )
 
 
+def _add_rosbag(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `snakesim recording rosbag`."""
+    add_recording(parser)
+    add_out(parser, "folder of the bag (default: beside the recording)")
+    parser.add_argument(
+        "--stamps",
+        choices=["robot", "wall"],
+        default="robot",
+        help="robot: robot time, with /clock; wall: the wall clock of the computer that recorded (default: robot)",
+    )
+
+
+def _run_rosbag(arguments: argparse.Namespace) -> int:
+    """Run `snakesim recording rosbag`, and return its exit code."""
+    from snakesim_operator.base import extras
+
+    extras.require("record", "`snakesim recording rosbag`")
+    extras.require("ros2", "`snakesim recording rosbag`")
+    from snakesim_operator.features.ros2.bag import convert_recording
+
+    wall_time = arguments.stamps == "wall"
+    return convert_recording(arguments.recording, arguments.out, print_line, wall_time=wall_time)
+
+
 COMMANDS: Commands = (
+    Command(
+        name="recording rosbag",
+        help="Write a recording as a ROS 2 bag, with contact forces as WrenchStamped; needs no ROS.",
+        add=_add_rosbag,
+        run=_run_rosbag,
+        details="Writes joint states, transforms, contact forces, IMUs, the robot's URDF, diagnostics and /clock, with "
+        "the topics of the bridge. Exit code: 0; 2 wrong input; 3 written, but something is missing in the recording.",
+        examples=(
+            "recording rosbag runs/demo --out demo-bag",
+            "recording rosbag test.mcap --stamps wall",
+        ),
+    ),
     Command(
         name="start ros2",
         help="Start a ROS 2 node for a robot, through the router of rmw_zenoh. Needs no ROS.",

@@ -33,6 +33,7 @@ NUMBERS = _define_type("std_msgs/msg/Float64MultiArray")
 STRING = _define_type("std_msgs/msg/String")
 CLOCK = _define_type("rosgraph_msgs/msg/Clock")
 TWIST = _define_type("geometry_msgs/msg/Twist")
+WRENCH = _define_type("geometry_msgs/msg/WrenchStamped")
 DIAGNOSTICS = _define_type("diagnostic_msgs/msg/DiagnosticArray")
 
 Triple = tuple[float, float, float]

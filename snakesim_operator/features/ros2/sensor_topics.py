@@ -13,6 +13,7 @@ from snakesim_hal.wire import messages as m
 from snakesim_hal.wire.custom_sample import find_custom_messages, find_message_type
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
+from snakesim_operator.features.ros2.contact_wrenches import encode_wrenches
 from snakesim_operator.features.ros2.frames import Frames, make_ros_name
 from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
 from snakesim_operator.features.ros2.messages import Transform
@@ -91,6 +92,8 @@ class SensorTopics:
         """
         relays: list[Relay[Any]] = []
         sensor_keys = {sensor.key for sensor in self._robot.sensors}
+        if keys.CONTACTS in sensor_keys:
+            relays.append(self._relay_contacts())
         if keys.IMU in sensor_keys:
             relays.append(ImuRelay(self._session, self._forward_imus))
         for key in sorted(sensor_keys):
@@ -110,6 +113,20 @@ class SensorTopics:
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
         return self._node.declare_publisher(Topic(f"/{self._prefix}{name}", ros_type, **quality))
+
+    def _relay_contacts(self) -> Relay[Any]:
+        """Return the relay of the contact forces, with a topic for each link."""
+        names = [make_ros_name(link.name) for link in self._robot.links]
+        publishers = [self._declare_publisher(f"{name}/contact", ros.WRENCH) for name in names]
+
+        def forward(sample: m.Contacts) -> None:
+            frames = [self._frames.get_link_frame(link) for link in range(len(publishers))]
+            timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
+            for publisher, encoded in zip(publishers, encode_wrenches(timestamp_ns, frames, sample), strict=True):
+                publisher.publish(encoded)
+
+        every_cycle = 1
+        return NewestRelay(self._session, keys.CONTACTS, m.Contacts, every_cycle, forward)
 
     def _relay_depth_camera(self, key: str, every_cycles: int) -> Relay[Any]:
         """Return the relay of a depth camera; its topics are named as image_transport names them."""

@@ -36,7 +36,7 @@ def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     assert ended.code == 0, ended.err
     written = words(out)
     assert {"[rad]", "torque_nm [N·m]", "contact_count", "time [s]"} <= set(written)
-    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.0", "2.5"} <= set(written)
+    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.0", "2.4"} <= set(written)
     light = out.read_text()
     assert snakesim("recording", "plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
     white = "fill: #ffffff"  # the ground, or all that is written on it

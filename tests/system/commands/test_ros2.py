@@ -289,6 +289,9 @@ def _sees(ros: RosSide) -> None:
     imu = ros.first("link_7/imu", "sensor_msgs/msg/Imu")
     assert imu.header.frame_id == "link_7_imu_frame"
     assert 8 < imu.linear_acceleration.z < 12
+    wrench = ros.first("link_3/contact", "geometry_msgs/msg/WrenchStamped")
+    assert wrench.header.frame_id == "link_3"
+    assert abs(wrench.wrench.force.y) < 1000
     info = ros.first("head/depth/camera_info", "sensor_msgs/msg/CameraInfo")
     assert info.header.frame_id == image.header.frame_id
     assert info.k[0] == info.p[0] > 0

@@ -1,0 +1,34 @@
+"""Units in the metadata of columns of Parquet files, read with pyarrow."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.playback.export import export
+from snakesim_operator.run.in_process import simulate
+
+parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
+
+
+def test_every_column_of_an_export_has_its_unit(tmp_path: Path) -> None:
+    simulate(load("triplet", [parse_set("duration_s=0.3")]).config, tmp_path / "run")
+    assert export([tmp_path / "run"], "parquet", tmp_path / "a.parquet", lambda _line: None) == 0
+    schema = parquet.read_schema(tmp_path / "a.parquet")
+    units = {column.name: column.metadata[b"unit"].decode() for column in schema}
+    assert units["time_s"] == "s"
+    assert units["torque_nm.joint_3"] == "N·m"
+    assert units["velocity_b_m_s.x"] == "m/s"
+    assert units["link_force_l_n.link_3.y"] == "N"
+    table = parquet.read_table(tmp_path / "a.parquet")
+    assert table.num_rows == 30
+    assert table["time_s"].to_pylist()[1] == pytest.approx(0.01, abs=0.011)
+
+
+def test_table_of_an_evaluation_has_units(tmp_path: Path) -> None:
+    from snakesim_operator.features.evaluate.store import PARQUET, write_tables
+
+    write_tables(tmp_path, [], {})
+    schema = parquet.read_schema(tmp_path / PARQUET)
+    assert schema.field("displacement_m_s").metadata[b"unit"] == b"m/s"
+    assert schema.field("controller").metadata is None
