@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 import can
 
-from benchmarks.table import HEADER, format_row
+from benchmarks.table import RATIO_HEADER, format_row
 from snakesim_can_backend.bus.bus import drain_socket, is_up
 from snakesim_can_backend.bus.load import BIT_RATE, FRAME_BITS
 from snakesim_can_backend.driver.reports import ModuleReports
@@ -63,7 +63,7 @@ def report_frame_costs(report: Callable[[str], None], repeats: int) -> float:
             python_can_us.append(_measure_python_can_us())
     carrier = CHANNEL if on_vcan else "a local socket pair"
     subject = f"driver: receive, check, decode and store a frame, on {carrier}"
-    report(HEADER)
+    report(RATIO_HEADER)
     report(format_row(subject, "bare `recv_into` + `struct` loop", driver_us, bare_us, 3.0))
     if python_can_us:
         report(format_row(subject, "python-can + cantools", driver_us, python_can_us, 1.0))

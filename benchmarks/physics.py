@@ -22,6 +22,10 @@ from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.runs.whole_run import run as run_in_process
 
 TICKS_A_BLOCK = 50  # measured in one go, before the next kind of measurement has its turn
+# What decides the forces of MuJoCo itself: everything except the memory of our laws.
+STATE_WITHOUT_LAWS = int(mujoco.mjtState.mjSTATE_INTEGRATION) & ~int(
+    mujoco.mjtState.mjSTATE_PLUGIN | mujoco.mjtState.mjSTATE_USERDATA
+)
 LONG_NUMBER = 10**6  # a tick and sequence number of a run of some hours: it takes more bytes than 0
 
 
@@ -60,37 +64,41 @@ class BareSimulation:
         self._backend = open_simulator(config, laws)
 
     def measure_physics_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
-        """Return the mean time of a control period over these setpoints, without the handing over of setpoints."""
+        """Return the mean CPU time of a control period over these setpoints, without the handing over of setpoints."""
         physics = self._backend.physics
         steps = self._backend.sim.steps_per_tick
         spent_s = 0.0
         for tick_setpoints in setpoints:
             self._backend.enact(tick_setpoints, "armed")
-            begin_s = time.perf_counter()
+            began_s = time.thread_time()
             physics.step(steps)
-            spent_s += time.perf_counter() - begin_s
+            spent_s += time.thread_time() - began_s
         return spent_s / len(setpoints) * 1e6
 
-    def measure_mujoco_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
-        """Return the mean time of `mj_step` for a control period, from the states of the same motion.
 
-        With the Python version of the laws, `mj_step` alone leaves out ground and friction. So each period is first
-        measured, then reset to its beginning and done again with them.
-        """
-        model = self._backend.sim.model
-        data = self._backend.data
-        steps = self._backend.sim.steps_per_tick
-        state_kind = mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(model, state_kind))
+class BareMujoco:
+    """Repeats a motion, and measures `mj_step` from its states in a model without our laws."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._moving = open_simulator(config)
+        self._bare = open_simulator(config, "python")  # its model has no plugins, so `mj_step` computes no laws
+        self._state = np.empty(mujoco.mj_stateSize(self._bare.sim.model, STATE_WITHOUT_LAWS))
+
+    def measure_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
+        """Return the mean CPU time of `mj_step` for a control period over these setpoints."""
+        moving = self._moving
+        bare = self._bare
+        steps = bare.sim.steps_per_tick
         spent_s = 0.0
         for tick_setpoints in setpoints:
-            self._backend.enact(tick_setpoints, "armed")
-            mujoco.mj_getState(model, data, state, state_kind)
-            begin_s = time.perf_counter()
-            mujoco.mj_step(model, data, steps)
-            spent_s += time.perf_counter() - begin_s
-            mujoco.mj_setState(model, data, state, state_kind)
-            self._backend.physics.step(steps)
+            moving.enact(tick_setpoints, "armed")
+            bare.enact(tick_setpoints, "armed")
+            mujoco.mj_getState(moving.sim.model, moving.data, self._state, STATE_WITHOUT_LAWS)
+            mujoco.mj_setState(bare.sim.model, bare.data, self._state, STATE_WITHOUT_LAWS)
+            began_s = time.thread_time()
+            mujoco.mj_step(bare.sim.model, bare.data, steps)
+            spent_s += time.thread_time() - began_s
+            moving.physics.step(steps)
         return spent_s / len(setpoints) * 1e6
 
 
@@ -113,9 +121,10 @@ def record_motion(config: RunConfig) -> tuple[list[SafeSetpoints], float]:
 
 @dataclass
 class TickTimes:
-    """Mean times of a tick in µs, one entry for each block of ticks."""
+    """Mean CPU times of a tick in µs, one entry for each block of ticks."""
 
     published_us: list[float] = field(default_factory=list[float])  # with all sensors published
+    own_us: list[float] = field(default_factory=list[float])  # the same without the physics
     physics_us: list[float] = field(default_factory=list[float])  # of the physics alone
     python_us: list[float] = field(default_factory=list[float])  # of the physics with the Python version of the laws
     mujoco_us: list[float] = field(default_factory=list[float])  # of `mj_step` alone
@@ -126,7 +135,7 @@ def measure_tick_times(config: RunConfig) -> TickTimes:
     full = open_simulator(config)
     physics = BareSimulation(config)
     python = BareSimulation(config, "python")
-    bare_mujoco = BareSimulation(config, "python")
+    bare_mujoco = BareMujoco(config)
     setpoints, _ = record_motion(config)
     times = TickTimes()
     endpoint = free_endpoint()  # published messages really go over the network
@@ -137,16 +146,19 @@ def measure_tick_times(config: RunConfig) -> TickTimes:
         tick = 0
         for start in range(0, len(setpoints) - TICKS_A_BLOCK + 1, TICKS_A_BLOCK):
             block = setpoints[start : start + TICKS_A_BLOCK]
-            begin_s = time.perf_counter()
+            began_s = time.thread_time()
             for tick_setpoints in block:
                 tick += 1
                 publisher.publish(tick, full.sample(tick, tick * config.period_ns))
                 full.enact(tick_setpoints, "armed")
                 full.advance()
-            times.published_us.append((time.perf_counter() - begin_s) / TICKS_A_BLOCK * 1e6)
-            times.physics_us.append(physics.measure_physics_us(block))
+            published_us = (time.thread_time() - began_s) / TICKS_A_BLOCK * 1e6
+            physics_us = physics.measure_physics_us(block)
+            times.published_us.append(published_us)
+            times.physics_us.append(physics_us)
+            times.own_us.append(published_us - physics_us)
             times.python_us.append(python.measure_physics_us(block))
-            times.mujoco_us.append(bare_mujoco.measure_mujoco_us(block))
+            times.mujoco_us.append(bare_mujoco.measure_us(block))
         assert all(reader.drain() for reader in readers), "a published message did not arrive"
     full.close()
     return times

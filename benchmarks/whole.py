@@ -3,11 +3,14 @@
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import msgspec
 
 from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_operator.results.run_reader import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 
@@ -15,6 +18,8 @@ ATTEMPTS = 3  # a machine that pauses for 50 ms stops a run in real time
 RUN_TIMEOUT_S = 300
 RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
 MIN_ANSWERED_FRACTION = 0.99  # of the ticks, for a rate that counts as reached
+IN_PROCESS_SCENARIO = "peg_row"
+IN_PROCESS_S = 20.0  # of robot time
 CONTROL_IN_HOST = ("--set", "services.control.process=host")
 
 
@@ -42,16 +47,34 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
         return msgspec.json.decode(summary, type=RunSummary)
 
 
-def measure_lockstep_tick_us(timestep_s: str, *arguments: str) -> float:
+def measure_tick_us(*arguments: str) -> float:
     """Return the wall time of one tick of a lockstep run with all services and the recorder as processes.
 
     Args:
-        timestep_s: step of the physics, as text for `--set`.
         arguments: further arguments of `snakesim run`.
     """
-    timestep = f"backends.sim.timestep_s={timestep_s}"
-    summary = run("--clock-mode", "lockstep", "--duration", "10", "--set", timestep, *arguments)
+    summary = run("--clock-mode", "lockstep", "--duration", "10", *arguments)
     return summary.wall_s / summary.ticks * 1e6
+
+
+def measure_speed_in_process(*arguments: str) -> float:
+    """Return how many times faster than real time a run in one process is.
+
+    Args:
+        arguments: further arguments of `snakesim run`.
+    """
+    summary = run("--in-process", "--duration", f"{IN_PROCESS_S:g}", *arguments, scenario=IN_PROCESS_SCENARIO)
+    return IN_PROCESS_S / summary.wall_s
+
+
+def measure_loop_in_process() -> float:
+    """Return how many seconds of robot time a run without a recording makes in a second of CPU time."""
+    config = load(IN_PROCESS_SCENARIO, [parse_set(f"duration_s={IN_PROCESS_S:g}")]).config
+    with InProcessRun(config) as in_process_run:
+        began_s = time.process_time()
+        for _ in in_process_run.iterate_ticks():
+            pass
+        return IN_PROCESS_S / (time.process_time() - began_s)
 
 
 def measure_latency_us(*arguments: str) -> float:

@@ -102,9 +102,15 @@ class RecentAngles:
             self._entries.append((timestamp_ns, angles_rad))
 
     def nearest_to(self, timestamp_ns: int) -> list[float]:
-        """Return the angles that were measured nearest to a time."""
-        _, angles_rad = min(self._entries, key=lambda entry: abs(entry[0] - timestamp_ns))
-        return angles_rad
+        """Return the angles that were measured nearest to a time; of two that are equally near, the older ones."""
+        nearest_ns, nearest_rad = self._entries[-1]
+        # From the newest on they come nearer, and then go away again. Poses are rarely older than a few ticks.
+        for measured_ns, angles_rad in reversed(self._entries):
+            if abs(measured_ns - timestamp_ns) > abs(nearest_ns - timestamp_ns):
+                break
+            nearest_ns = measured_ns
+            nearest_rad = angles_rad
+        return nearest_rad
 
 
 def pose_time_ns(world: World) -> int:

@@ -225,8 +225,10 @@ def _yaw_only_frames(
     base_x, base_y, base_z = base_rotation.T
     forward = cosine * base_x + sine * base_y
     left = cosine * base_y - sine * base_x
-    up = np.broadcast_to(base_z, forward.shape)
-    rotations = np.stack([forward, left, up], axis=2)
+    rotations = np.empty((len(forward), 3, 3))
+    rotations[:, :, 0] = forward
+    rotations[:, :, 1] = left
+    rotations[:, :, 2] = base_z
 
     link_vectors = forward[:-1] * np.asarray(link_lengths_m)[:-1, None]
     origins = np.empty_like(forward)

@@ -58,9 +58,14 @@ class Thermal:
         self._loss_w = np.array([joint.heat.loss_at_rated_w for joint in joints])
         self._board_fraction = np.array([joint.heat.board_fraction for joint in joints])
 
+        # The fraction of the way to its settled temperature that a winding covers in a period; the same every time.
+        self._settling_s = 0.0
+        self._settling_fraction: Floats = np.zeros(len(joints))
+
         # State.
         self.winding_c: Floats = self._ambient_c.copy()
         self._held = np.zeros(len(joints), dtype=np.bool_)  # an injected fault keeps the temperature
+        self._holds_any = False
         self._derates = False  # whether any motor was derated when `remaining_fraction` was last called
 
     def pass_time(self, seconds: float, torque_squared: Floats) -> None:
@@ -72,9 +77,13 @@ class Thermal:
             seconds: how long.
             torque_squared: mean square of each torque in this time, N²·m², (n_joints,).
         """
+        if seconds != self._settling_s:
+            self._settling_s = seconds
+            self._settling_fraction = -np.expm1(seconds / self._minus_time_s)
         settled_c = self._ambient_c + self._rise * torque_squared
-        self.winding_c += (settled_c - self.winding_c) * -np.expm1(seconds / self._minus_time_s)
-        np.copyto(self.winding_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._held)
+        self.winding_c += (settled_c - self.winding_c) * self._settling_fraction
+        if self._holds_any:
+            np.copyto(self.winding_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._held)
 
     def inject(self, motor: int, *, heat: bool, hold: bool) -> None:
         """Change the temperature of one winding as an injected fault.
@@ -87,6 +96,7 @@ class Thermal:
         if heat:
             self.winding_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
         self._held[motor] = hold
+        self._holds_any = bool(self._held.any())
 
     def remaining_fraction(self) -> Floats | None:
         """Return the fraction of its torque that each motor may use, (n_joints,), if it may have changed.
