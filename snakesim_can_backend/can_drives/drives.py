@@ -44,6 +44,7 @@ class CanDrivesContext:
     emulated: bool  # True: no real motor moves
     answer_s: float  # time that a reading waits for answers
     bring_up_s: float  # time that drives have to answer in bring-up
+    cycle_ns: int  # from one setpoint to the next
     report_period_ns: int  # from one report of a drive's state to the next
     clock_ns: Callable[[], int]
 
@@ -120,6 +121,11 @@ class CanDrives(Drives):
     def find_mismatch(self, i: int) -> str:
         """Return why an identified drive cannot be used; empty if it can."""
 
+    def find_start_problem(self, i: int) -> str:
+        """Return why a drive whose settings were written cannot be used; empty if it can, or if that is not known yet."""
+        del i
+        return ""
+
     @abstractmethod
     def clear_leftover_errors(self, i: int) -> None:
         """Clear the errors that a driver that was killed leaves behind, and no others."""
@@ -185,7 +191,10 @@ class CanDrives(Drives):
             self.send_command(i, "idle")
             self.clear_leftover_errors(i)
             self.write_settings(i)
-        self._request_until(self.readings.is_known, self.request_motion)
+        self._request_until(self._is_started, self.request_motion)
+        problems = [f"  {self.states.drives[i].label} {self.find_start_problem(i)}" for i in drives if self.find_start_problem(i)]
+        if problems:
+            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
         silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
         if silent:
             raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled", code="drive/silent")
@@ -336,6 +345,10 @@ class CanDrives(Drives):
                 f"answers with {len(serials)} serial numbers, {' and '.join(serials)}: give each drive its own id"
             )
         return problems
+
+    def _is_started(self, i: int) -> bool:
+        """Return whether the start of a drive is over: it has sent motion and torque, or it cannot be used."""
+        return self.readings.is_known(i) or bool(self.find_start_problem(i))
 
     # --- inside: the bus --------------------------------------------------------------------------------------
 
