@@ -122,7 +122,7 @@ class CanDrives(Drives):
         """Return why an identified drive cannot be used; empty if it can."""
 
     def find_start_problem(self, i: int) -> str:
-        """Return why a drive whose settings were written cannot be used; empty if it can, or if that is not known yet."""
+        """Return why a drive cannot be used although its settings were written; empty if it can, or may."""
         del i
         return ""
 
@@ -147,6 +147,10 @@ class CanDrives(Drives):
     @abstractmethod
     def request_motion(self, i: int) -> bool:
         """Request motion and torque. Returns whether the bus accepted the request."""
+
+    def awaits_answers(self) -> bool:
+        """Return whether a drive is about to answer something else, for which a control cycle may wait as well."""
+        return False
 
     @abstractmethod
     def request_health(self, i: int) -> None:
@@ -192,7 +196,8 @@ class CanDrives(Drives):
             self.clear_leftover_errors(i)
             self.write_settings(i)
         self._request_until(self._is_started, self.request_motion)
-        problems = [f"  {self.states.drives[i].label} {self.find_start_problem(i)}" for i in drives if self.find_start_problem(i)]
+        start_problems = {i: self.find_start_problem(i) for i in drives}
+        problems = [f"  {self.states.drives[i].label} {problem}" for i, problem in start_problems.items() if problem]
         if problems:
             raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
         silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
@@ -242,7 +247,7 @@ class CanDrives(Drives):
         self._health_turn = (self._health_turn + 1) % len(self.nodes)
         self.request_health(self._health_turn)
         end_s = time.monotonic() + self._context.answer_s
-        while self.readings.is_incomplete():
+        while self.readings.is_incomplete() or self.awaits_answers():
             left_s = end_s - time.monotonic()
             if left_s <= 0 or not wait([self.wire], left_s):
                 break

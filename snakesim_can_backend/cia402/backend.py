@@ -28,7 +28,7 @@ class Cia402Backend(CanDriveBackend):
     reserved_ids = "0 means all nodes, and 127 is the host's as shipped"
     report_period_s = 0.1  # a drive reports with every SYNC, but its way to Operation enabled takes a while
     traffic = CycleTraffic(
-        each_drive=(8, 8, 7, 1),  # a setpoint, two answers to SYNC, and perhaps a change of the mode
+        each_drive=(8, 8, 7),  # a setpoint and two answers to SYNC; a change of the mode is rare
         one_drive=(0, 1, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8),  # SYNC and heartbeat; five reads of health and serial number
         heartbeats_hz=10.0,
     )

@@ -68,6 +68,7 @@ from snakesim_hal.wire.messages import Mode
 MAX_MISSED_HEARTBEATS = 5  # of a drive that still answers SYNC
 MIN_PRE_OPERATIONAL_HEARTBEATS = 2  # one may be from before the start of the drive
 NEEDS_COMMUNICATION_RESET = (HEARTBEAT_LOST, 0x8120)  # errors that some drives keep until their communication restarts
+MAX_START_NS = 1_000_000_000  # after which a drive that does not complete its start counts as silent
 MAX_BOOT_NS = 1_000_000_000  # after which a drive is configured whose boot-up message has not arrived
 
 _log = logging.getLogger("snakesim.drivers")
@@ -395,14 +396,22 @@ class Cia402Drives(CanDrives):
     # --- a control cycle --------------------------------------------------------------------------------------
 
     def request_motion(self, i: int) -> bool:
-        """Send one SYNC for all drives, and repeat SDO requests that were not answered."""
+        """Send one SYNC for all drives, and repeat SDO requests that were not answered.
+
+        Returns:
+            Whether the bus accepted the SYNC, and the drive can answer it: one that is being configured cannot.
+        """
         servo = self.servos[i]
         if i == 0:
             self._send_sync()
         servo.queue.repeat_if_late()
         if servo.phase == "booting" and self._now_ns() - servo.phase_ns > MAX_BOOT_NS:
             self._configure(i)
-        return self._sync_accepted
+        return self._sync_accepted and not self._is_starting(servo)
+
+    def awaits_answers(self) -> bool:
+        """Return whether a drive is being configured: it takes many answers."""
+        return any(self._is_starting(servo) and servo.queue.awaits_answer for servo in self.servos)
 
     def request_health(self, i: int) -> None:
         """Read voltage, current and temperatures; and the serial number, to notice a second drive with this id."""
@@ -455,12 +464,20 @@ class Cia402Drives(CanDrives):
         findings = super().findings()
         limit_ns = MAX_MISSED_HEARTBEATS * self._settings.heartbeat_s * 1e9
         for i, servo in enumerate(self.servos):
+            if servo.phase != "ready" or self.readings.unanswered_requests(i):
+                servo.heartbeat_ns = self._now_ns()  # it is silent anyhow: the time counts from its next answer on
             age_ns = self._now_ns() - servo.heartbeat_ns
-            is_answering = servo.phase == "ready" and not self.readings.unanswered_requests(i)
-            if is_answering and age_ns > limit_ns:
-                cause = f"{self.states.drives[i].label} answers SYNC, but has sent no heartbeat for {age_ns * 1e-6:.0f} ms"
+            if age_ns > limit_ns:
+                cause = (
+                    f"{self.states.drives[i].label} answers SYNC, but has sent no heartbeat for {age_ns * 1e-6:.0f} ms"
+                )
                 findings.append(Finding("drive_silent", cause, i, alone=True))
         return findings
+
+    def _is_starting(self, servo: Servo) -> bool:
+        """Return whether a drive boots or is configured, and has time left for it."""
+        is_due = servo.phase in ("booting", "configuring") and not servo.failure
+        return is_due and self._now_ns() - servo.phase_ns <= MAX_START_NS
 
     def _send_sync(self) -> None:
         for servo in self.servos:

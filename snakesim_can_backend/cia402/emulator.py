@@ -1,4 +1,4 @@
-"""Emulated CiA 402 drives: objects, state machine, PDOs, heartbeats and emergency messages, on a body of a physics model.
+"""Emulated CiA 402 drives: objects, state machine, PDOs, heartbeats and emergency messages, on a simulated body.
 
 They do *not* simulate segmented and block transfers, storing of parameters, homing, profile and interpolated modes,
 ramps of a shutdown and of a fault reaction, the tuning of real position and velocity loops, arbitration and bit rate.
@@ -24,7 +24,7 @@ from snakesim_can_backend.cia402.frames import (
     encode_read_answer,
     split_id,
 )
-from snakesim_can_backend.cia402.limits import MODES, REVOLUTION_RAD, THOUSANDTHS, Scaling, shaft_range_rad
+from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, Scaling, shaft_range_rad
 from snakesim_can_backend.cia402.node import Address, Node
 from snakesim_can_backend.cia402.objects import (
     ABORT_CONNECTION,
@@ -85,7 +85,7 @@ NO_HEARTBEAT = Emergency(HEARTBEAT_LOST, 0x11)  # generic and communication
 STAYS_IN_QUICK_STOP = 5  # from this option code on
 AT_REST_RAD_S = 0.05  # shaft speed at which a quick stop ends
 TORQUE_OFF = 0  # quick stop option code
-DRIVE_MODES = {
+DRIVE_MODES: dict[int, Mode] = {
     OperationMode.CYCLIC_POSITION: Mode.POSITION,
     OperationMode.CYCLIC_VELOCITY: Mode.VELOCITY,
     OperationMode.CYCLIC_TORQUE: Mode.TORQUE,
@@ -327,7 +327,7 @@ class EmulatedCia402(CanEmulator):
         target = 0.0
         match drive.state:
             case PowerState.ENABLED:
-                mode = DRIVE_MODES.get(_signed_mode(drive), Mode.PASSIVE)
+                mode = DRIVE_MODES.get(_read_signed(drive, MODE), Mode.PASSIVE)
                 target = self._read_target(drive, mode)
             case PowerState.QUICK_STOP:
                 mode = Mode.VELOCITY
@@ -406,8 +406,3 @@ def _address(entry: Entry) -> Address:
 
 def _read_signed(drive: EmulatedDrive, entry: Entry) -> int:
     return entry.decode(drive.objects.get(_address(entry)).to_bytes(entry.size, "little"))
-
-
-def _signed_mode(drive: EmulatedDrive) -> OperationMode | None:
-    number = _read_signed(drive, MODE)
-    return OperationMode(number) if number in MODES.values() else None

@@ -121,8 +121,8 @@ def find_objections(values: Values, scaling: Scaling, settings: Cia402Settings, 
     if torque_nm > max_torque_nm * (1 + ROUNDING):
         yield (
             f"has a torque limit ({MAX_TORQUE.address}) of {max_torque_nm:.3g} N·m, and its joint may command "
-            f"{torque_nm:.3g} N·m: raise the one, or lower `torque_nm`. If a driver was killed, it may have left a lower "
-            f"limit: restart the drive"
+            f"{torque_nm:.3g} N·m: raise the one, or lower `torque_nm`. A driver that was killed may have left a "
+            f"lower limit: restart the drive"
         )
     if MAX_SPEED in values:
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear
@@ -173,7 +173,7 @@ def _find_unit_objections(values: Values, settings: Cia402Settings, joint: Joint
 
 
 def _find_range_objections(values: Values, scaling: Scaling, joint: Joint) -> Iterator[str]:
-    """Yield position limits that stop the drive within the range of its joint. Equal limits mean that there are none."""
+    """Yield position limits that stop the drive within the range of its joint. Equal ones mean that there are none."""
     if MIN_POSITION not in values or MAX_POSITION not in values:
         return
     if values[MIN_POSITION] >= values[MAX_POSITION]:

@@ -185,7 +185,9 @@ class Node:
             offset += size
 
     def _pack(self, mapping_index: int) -> bytes:
-        return b"".join(self.get(address).to_bytes(size, "little") for address, size in self._list_mapped(mapping_index))
+        return b"".join(
+            self.get(address).to_bytes(size, "little") for address, size in self._list_mapped(mapping_index)
+        )
 
     def _check_mapping(self, address: Address, value: int) -> None:
         """Refuse a change of an active mapping, and objects that cannot be mapped. Raises SdoAbortError."""

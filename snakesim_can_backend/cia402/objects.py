@@ -7,10 +7,11 @@ Temperatures are no objects of the profile: the settings name them.
 import struct
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 
-class Entry(NamedTuple):
+@dataclass(frozen=True)
+class Entry:
     """One entry of an object dictionary."""
 
     index: int

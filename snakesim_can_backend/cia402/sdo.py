@@ -108,6 +108,11 @@ class SdoQueue:
         """Whether every step is done."""
         return self._current is None and not self._steps
 
+    @property
+    def awaits_answer(self) -> bool:
+        """Whether a request is without an answer, but not late."""
+        return self._current is not None and self._now_ns() - self._sent_ns < REPEAT_NS
+
     def add(self, steps: Iterable[Step]) -> None:
         """Add steps, and begin with the first one if no other step is in progress."""
         self._steps.extend(steps)

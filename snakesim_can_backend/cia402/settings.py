@@ -19,10 +19,10 @@ class MountedCia402(Mounted, frozen=True, kw_only=True):
     """How an emulated drive is mounted and configured, where that is not what the robot file needs."""
 
     max_torque_nm: RatedTorque | None = None
-    """Torque limit (6072h) that the emulated drive is configured with, at its shaft; none: what the robot file needs."""
+    """Torque limit (6072h) of the emulated drive at its shaft; none: what the robot file needs."""
 
     max_speed_rad_s: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "rad/s"})] | None = None
-    """Speed limit (6080h) that the emulated drive is configured with, at its shaft; none: what the robot file needs."""
+    """Speed limit (6080h) of the emulated drive at its shaft; none: what the robot file needs."""
 
     min_position: Counts | None = None
     """Lower position limit (607Dh:1) of the emulated drive in position units; none: a little beyond the joint's."""
@@ -32,9 +32,7 @@ class MountedCia402(Mounted, frozen=True, kw_only=True):
 
 
 class Cia402Settings(CanDriveSettings, frozen=True, kw_only=True):
-    """The scenario's `[backends.cia402]` section. `watchdog_s` is written to the drives as the consumer heartbeat time
-    (1016h).
-    """
+    """The scenario's `[backends.cia402]` section. `watchdog_s` is written to the drives (1016h)."""
 
     host_id: Annotated[int, Meta(ge=1, le=127)] = 127
     """Node id of the host, with which it sends heartbeats. No drive may have it."""

@@ -47,7 +47,7 @@ class Control(IntEnum):
 
 
 class OperationMode(IntEnum):
-    """The modes of operation that the driver uses, in 6060h and 6061h. Bit n - 1 of 6502h is whether there is mode n."""
+    """The modes of operation that the driver uses. Bit n - 1 of 6502h is whether a drive has mode n."""
 
     CYCLIC_POSITION = 8
     CYCLIC_VELOCITY = 9

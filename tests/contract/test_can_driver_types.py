@@ -45,6 +45,7 @@ class Family:
     firmware: str = ""
     unheard: str = ""
     too_fast_hz: float = 0.0
+    bring_up_s: float = 0.5
 
 
 def law_of(emulator: Any, joint: int) -> tuple[float, float]:
@@ -88,6 +89,7 @@ FAMILIES = {
         "1.0",
         "does not answer SDO requests: .*another node id",
         500,
+        bring_up_s=3.0,  # a hundred SDO transfers for each drive
     ),
     "dynamixel": Family(
         DynamixelBackend,
@@ -110,7 +112,7 @@ class Robot(DriveRig):
     def __init__(self, driver_type: Family, **settings: Any) -> None:
         self.driver_type = driver_type
         config = run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
-        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 0.5}
+        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": driver_type.bring_up_s}
         super().__init__(config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings)))
 
     @property
