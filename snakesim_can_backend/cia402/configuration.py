@@ -46,7 +46,7 @@ FAULT_ON_ABORT = 1  # 6007h
 TORQUE_OFF_ON_FAULT = 0  # 605Eh
 STAY_OPERATIONAL = 1  # 1029h: the drive still reports its state
 QUICK_STOPS = {"torque_off": 0, "ramp": 2}  # 605Ah
-CYCLE_EXPONENTS = (-3, -4, -5, -6)  # of 10, in seconds
+CYCLE_EXPONENTS = (-3, -4, -5, -6, -2, -1)  # of 10, in seconds
 MAX_CYCLE_VALUE = 255
 
 REQUIRED = (DEVICE_TYPE, VENDOR, STATUSWORD, SUPPORTED_MODES, MAX_TORQUE)
