@@ -27,6 +27,18 @@ CHANNEL_ABOUT = "SocketCAN interface such as can0, or INTERFACE:CHANNEL such as 
 def add_scan(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a scan of a CAN bus."""
     add_channels(parser, CHANNEL_ABOUT)
+    _add_bit_rate(parser)
+    add_duration(parser, "seconds to listen on each bus (default: 1)", number_type(0.001, 3600, "s"), 1.0)
+    parser.add_argument("--anyway", action="store_true", help="send requests also where others use the bus")
+
+
+def add_canopen_scan(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of a scan of a CANopen bus."""
+    add_channels(parser, CHANNEL_ABOUT)
+    _add_bit_rate(parser)
+
+
+def _add_bit_rate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bit-rate",
         type=number_type(10_000, 1_000_000, "bit/s"),
@@ -34,8 +46,6 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
         metavar="BIT/S",
         help="of an adapter (default: 1000000)",
     )
-    add_duration(parser, "seconds to listen on each bus (default: 1)", number_type(0.001, 3600, "s"), 1.0)
-    parser.add_argument("--anyway", action="store_true", help="send requests also where others use the bus")
 
 
 def add_module_load(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""The commands `snakesim drive` for joint modules, ODrives and moteus. Importable without the extra `can`."""
+"""The commands `snakesim drive` for all drives on CAN. Importable without the extra `can`."""
 
 import argparse
 
@@ -64,6 +64,26 @@ def _load_moteus(arguments: argparse.Namespace) -> int:
     from snakesim_can_backend.moteus.backend import MoteusBackend
 
     return print_load(MoteusBackend, arguments)
+
+
+def _scan_cia402(arguments: argparse.Namespace) -> int:
+    from snakesim_can_backend.cia402.scan import scan_channels
+
+    return scan_channels(arguments)
+
+
+def _emulate_cia402(arguments: argparse.Namespace) -> int:
+    from snakesim_can_backend.can_drives.command import emulate
+    from snakesim_can_backend.cia402.backend import Cia402Backend
+
+    return emulate(Cia402Backend, arguments)
+
+
+def _load_cia402(arguments: argparse.Namespace) -> int:
+    from snakesim_can_backend.can_drives.command import print_load
+    from snakesim_can_backend.cia402.backend import Cia402Backend
+
+    return print_load(Cia402Backend, arguments)
 
 
 def _add_emulation(parser: argparse.ArgumentParser) -> None:
@@ -141,5 +161,30 @@ COMMANDS: Commands = (
         add=options.add_load,
         run=_load_moteus,
         examples=("drive load moteus triplet", "drive load moteus triplet --set rate_hz=50 --json"),
+    ),
+    Command(
+        name="drive scan cia402",
+        help="List every CANopen node that answers; only reads objects, and enables nothing.",
+        add=options.add_canopen_scan,
+        run=_scan_cia402,
+        details="Exit code: 0 a node answers, 1 none does, 2 wrong input.",
+        examples=("drive scan cia402 can0", "drive scan cia402 can0 --bit-rate 500000 --json"),
+    ),
+    Command(
+        name="drive emulate cia402",
+        help="Emulate the CiA 402 drives of a robot, as a process on CAN buses.",
+        add=_add_emulation,
+        run=_emulate_cia402,
+        examples=(
+            "drive emulate cia402 triplet",
+            "drive emulate cia402 triplet --set 'backend.eds=[\"drive.eds\"]'",
+        ),
+    ),
+    Command(
+        name="drive load cia402",
+        help="Print the load of a bus with the CiA 402 drives of a scenario.",
+        add=options.add_load,
+        run=_load_cia402,
+        examples=("drive load cia402 triplet", "drive load cia402 triplet --set rate_hz=50 --json"),
     ),
 )

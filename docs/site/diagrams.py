@@ -42,6 +42,15 @@ WIRINGS = {
         'channels = ["can0"]',
         "star or bars; absorbs the power\nthat braking returns",
     ),
+    "wiring-cia402.svg": Wiring(
+        "Wiring of CiA 402 drives on CANopen",
+        "CAN adapter\nof python-can",
+        "classic CAN, 1 Mbit/s, twisted pair with ground",
+        "CiA 402",
+        "120 Ω",
+        'channels = ["can0"]',
+        "star or bars; absorbs the power\nthat braking returns",
+    ),
     "wiring-dynamixel.svg": Wiring(
         "Wiring of Dynamixel servos on a serial bus",
         "U2D2, or adapter\nfor TTL or RS-485",
@@ -226,7 +235,7 @@ def draw_contract() -> Drawing:
     backends = (
         ("sim", "plain"),
         ("can", "drive"),
-        ("odrive, moteus", "drive"),
+        ("odrive, moteus, cia402", "drive"),
         ("dynamixel, mixed", "drive"),
         ("your backend", "yours"),
     )

@@ -194,6 +194,7 @@ class CanDriveBackend(DriverTypeBackend):
                 emulated=body is not None or is_emulated(channel),
                 answer_s=answer_limit_s(config, settings.decimation),
                 bring_up_s=settings.bring_up_limit_s,
+                cycle_ns=config.period_ns * settings.decimation,
                 report_period_ns=report_period_ns,
                 clock_ns=clock.now_ns,
             )

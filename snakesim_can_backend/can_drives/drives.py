@@ -44,6 +44,7 @@ class CanDrivesContext:
     emulated: bool  # True: no real motor moves
     answer_s: float  # time that a reading waits for answers
     bring_up_s: float  # time that drives have to answer in bring-up
+    cycle_ns: int  # from one setpoint to the next
     report_period_ns: int  # from one report of a drive's state to the next
     clock_ns: Callable[[], int]
 
@@ -124,6 +125,11 @@ class CanDrives(Drives):
     def find_mismatch(self, i: int) -> str:
         """Return why an identified drive cannot be used; empty if it can."""
 
+    def find_start_problem(self, i: int) -> str:
+        """Return why a drive cannot be used although its settings were written; empty if it can, or may."""
+        del i
+        return ""
+
     @abstractmethod
     def clear_leftover_errors(self, i: int) -> None:
         """Clear the errors that a driver that was killed leaves behind, and no others."""
@@ -145,6 +151,10 @@ class CanDrives(Drives):
     @abstractmethod
     def request_motion(self, i: int) -> bool:
         """Request motion and torque. Returns whether the bus accepted the request."""
+
+    def awaits_answers(self) -> bool:
+        """Return whether a drive is about to answer something else, for which a control cycle may wait as well."""
+        return False
 
     @abstractmethod
     def request_health(self, i: int) -> None:
@@ -189,7 +199,11 @@ class CanDrives(Drives):
             self.send_command(i, "idle")
             self.clear_leftover_errors(i)
             self.write_settings(i)
-        self._request_until(self.readings.is_known, self.request_motion)
+        self._request_until(self._is_started, self.request_motion)
+        start_problems = {i: self.find_start_problem(i) for i in drives}
+        problems = [f"  {self.states.drives[i].label} {problem}" for i, problem in start_problems.items() if problem]
+        if problems:
+            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
         silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
         if silent:
             raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled", code="drive/silent")
@@ -237,7 +251,7 @@ class CanDrives(Drives):
         self._health_turn = (self._health_turn + 1) % len(self.nodes)
         self.request_health(self._health_turn)
         end_s = time.monotonic() + self._context.answer_s
-        while self.readings.is_incomplete():
+        while self.readings.is_incomplete() or self.awaits_answers():
             left_s = end_s - time.monotonic()
             if left_s <= 0 or not wait([self.wire], left_s):
                 break
@@ -340,6 +354,10 @@ class CanDrives(Drives):
                 f"answers with {len(serials)} serial numbers, {' and '.join(serials)}: give each drive its own id"
             )
         return problems
+
+    def _is_started(self, i: int) -> bool:
+        """Return whether the start of a drive is over: it has sent motion and torque, or it cannot be used."""
+        return self.readings.is_known(i) or bool(self.find_start_problem(i))
 
     # --- inside: the bus --------------------------------------------------------------------------------------
 

@@ -3,6 +3,8 @@
 from contextlib import ExitStack
 from typing import Any
 
+from snakesim_can_backend.cia402.emulator import EmulatedCia402
+from snakesim_can_backend.cia402.state_machine import PowerState
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.emulator import EmulatedOdrive
@@ -59,6 +61,8 @@ def enabled_drives(emulator: Any) -> list[bool]:
     match emulator:
         case EmulatedOdrive():
             return [axis.state == AxisState.CLOSED_LOOP for axis in emulator.axes]
+        case EmulatedCia402():
+            return [drive.state in (PowerState.ENABLED, PowerState.QUICK_STOP) for drive in emulator.drives]
         case EmulatedMoteus():
             return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
         case EmulatedDynamixel():

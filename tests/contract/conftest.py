@@ -73,6 +73,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("can-virtual", "can", mute=cut_off, drives=DrivesOfModules),
         Bench("odrive", "odrive", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("cia402", "cia402", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_emulated_drive),
         Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),

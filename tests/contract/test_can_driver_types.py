@@ -11,6 +11,8 @@ from typing import Any
 import can
 import pytest
 
+from snakesim_can_backend.cia402.backend import Cia402Backend
+from snakesim_can_backend.cia402.state_machine import PowerState
 from snakesim_can_backend.moteus.backend import MoteusBackend
 from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
@@ -43,6 +45,7 @@ class Family:
     firmware: str = ""
     unheard: str = ""
     too_fast_hz: float = 0.0
+    bring_up_s: float = 0.5
 
 
 def law_of(emulator: Any, joint: int) -> tuple[float, float]:
@@ -75,6 +78,19 @@ FAMILIES = {
         "does not report its register map: .*another id",
         2000,
     ),
+    "cia402": Family(
+        Cia402Backend,
+        lambda emulator: emulator.drives,
+        lambda drive: drive.state == PowerState.ENABLED,
+        law_of,
+        "error 0x8130, communication: no heartbeat of the host: its watchdog expired",
+        "error 0x4210, temperature",
+        "00000000-00000402-4020000{}",
+        "1.0",
+        "does not answer SDO requests: .*another node id",
+        500,
+        bring_up_s=3.0,  # a hundred SDO transfers for each drive
+    ),
     "dynamixel": Family(
         DynamixelBackend,
         lambda emulator: emulator.servos,
@@ -87,7 +103,7 @@ FAMILIES = {
         "overheating",
     ),
 }
-on_can = pytest.mark.parametrize("driver_type", ["odrive", "moteus"], indirect=True)
+on_can = pytest.mark.parametrize("driver_type", ["odrive", "moteus", "cia402"], indirect=True)
 
 
 class Robot(DriveRig):
@@ -96,7 +112,7 @@ class Robot(DriveRig):
     def __init__(self, driver_type: Family, **settings: Any) -> None:
         self.driver_type = driver_type
         config = run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
-        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 0.5}
+        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": driver_type.bring_up_s}
         super().__init__(config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings)))
 
     @property
@@ -306,6 +322,8 @@ def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> N
     command = can.Message(arbitration_id=2 << 5 | 7, data=[8, 0, 0, 0], is_extended_id=False)
     if robot.driver_type.backend is MoteusBackend:
         command = can.Message(arbitration_id=2, data=[1, 0, 10], is_fd=True, is_extended_id=False)
+    if robot.driver_type.backend is Cia402Backend:
+        command = can.Message(arbitration_id=0x602, data=[0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0], is_extended_id=False)
     protocol = can.CanProtocol.CAN_FD if command.is_fd else can.CanProtocol.CAN_20
     with can.Bus(interface="virtual", channel=channel, protocol=protocol) as bus:
         bus.send(command)

@@ -31,6 +31,7 @@ DRIVE_TYPES: dict[str, DriveType] = {
     "can": DriveType("can", "channels"),
     "odrive": DriveType("can", "channels"),
     "moteus": DriveType("can", "channels", is_can_fd=True),
+    "cia402": DriveType("can", "channels"),
     "dynamixel": DriveType("serial", "ports"),
 }
 

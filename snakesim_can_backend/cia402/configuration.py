@@ -1,0 +1,149 @@
+"""What the driver reads from a drive before it writes anything, and what it then writes and reads back. Pure."""
+
+import math
+from collections.abc import Iterator
+
+from snakesim_can_backend.cia402.frames import NmtCommand
+from snakesim_can_backend.cia402.objects import (
+    ABORT_CONNECTION,
+    COB_ID_MASK,
+    CONSUMER_HEARTBEAT,
+    CONTROLWORD,
+    CYCLE_INDEX,
+    CYCLE_VALUE,
+    DEVICE_TYPE,
+    ENCODER_INCREMENTS,
+    ENCODER_REVOLUTIONS,
+    ERROR_BEHAVIOR,
+    ERROR_CODE,
+    FAULT_REACTION,
+    MAX_POSITION,
+    MAX_SPEED,
+    MAX_TORQUE,
+    MIN_POSITION,
+    PDO_OFF,
+    PDOS,
+    PRODUCER_HEARTBEAT,
+    PRODUCT,
+    QUICK_STOP_OPTION,
+    RATED_CURRENT,
+    RATED_TORQUE,
+    REVISION,
+    SERIAL,
+    STATUSWORD,
+    SUPPORTED_MODES,
+    UNUSED_PDOS,
+    VENDOR,
+    Entry,
+    Pdo,
+    encode_mapping,
+)
+from snakesim_can_backend.cia402.sdo import Nmt, Read, Step, Write
+from snakesim_can_backend.cia402.settings import Cia402Settings
+from snakesim_can_backend.cia402.state_machine import Control
+
+FAULT_ON_ABORT = 1  # 6007h
+TORQUE_OFF_ON_FAULT = 0  # 605Eh
+STAY_OPERATIONAL = 1  # 1029h: the drive still reports its state
+QUICK_STOPS = {"torque_off": 0, "ramp": 2}  # 605Ah
+CYCLE_EXPONENTS = (-3, -4, -5, -6, -2, -1)  # of 10, in seconds
+MAX_CYCLE_VALUE = 255
+
+REQUIRED = (DEVICE_TYPE, VENDOR, STATUSWORD, SUPPORTED_MODES, MAX_TORQUE)
+OPTIONAL = (
+    *(PRODUCT, REVISION, SERIAL, ERROR_CODE, ABORT_CONNECTION, RATED_CURRENT, RATED_TORQUE, MAX_SPEED),
+    *(MIN_POSITION, MAX_POSITION, ENCODER_INCREMENTS, ENCODER_REVOLUTIONS),
+)
+
+
+def list_identification() -> list[Read]:
+    """Return the steps that read identity, limits and units of a drive, and change nothing."""
+    required = [Read(entry) for entry in REQUIRED]
+    optional = [Read(entry, optional=True) for entry in OPTIONAL]
+    return required + optional
+
+
+def list_switch_off() -> list[Step]:
+    """Return the steps that switch a drive off which has no PDOs yet."""
+    return [Write(CONTROLWORD, Control.DISABLE_VOLTAGE)]
+
+
+def list_fault_reset() -> list[Step]:
+    """Return the steps of a fault reset: it works when its bit changes from 0 to 1."""
+    return [
+        Write(CONTROLWORD, Control.DISABLE_VOLTAGE),
+        Write(CONTROLWORD, Control.FAULT_RESET),
+        Write(CONTROLWORD, Control.DISABLE_VOLTAGE),
+    ]
+
+
+def list_configuration(node: int, settings: Cia402Settings, period_s: float) -> list[Step]:
+    """Return the steps that make a drive ready for control cycles. Each value is read back.
+
+    Args:
+        node: The drive.
+        settings: The settings of the driver type.
+        period_s: Time from one setpoint to the next.
+    """
+    steps: list[Step] = [Nmt(NmtCommand.ENTER_PRE_OPERATIONAL)]
+    steps += _write_and_check(CONSUMER_HEARTBEAT, encode_consumer_heartbeat(settings))
+    steps += _write_and_check(PRODUCER_HEARTBEAT, round(settings.heartbeat_s * 1000))
+    steps += _write_and_check(ERROR_BEHAVIOR, STAY_OPERATIONAL, optional=True)
+    steps += _write_and_check(ABORT_CONNECTION, FAULT_ON_ABORT, optional=settings.allow_unverified_watchdog)
+    # Many drives have one reaction only, so a refusal is no failure.
+    steps.append(Write(FAULT_REACTION, TORQUE_OFF_ON_FAULT, optional=True))
+    steps.append(Write(QUICK_STOP_OPTION, QUICK_STOPS[settings.quick_stop], optional=True))
+    value, exponent = encode_cycle(period_s)
+    steps.append(Write(CYCLE_VALUE, value, optional=True))
+    steps.append(Write(CYCLE_INDEX, exponent, optional=True))
+    for pdo in PDOS:
+        steps += _list_pdo(pdo, node)
+    for pdo in UNUSED_PDOS:
+        steps.append(Write(pdo.cob_id_entry(), PDO_OFF | pdo.base | node, optional=True))
+    steps.append(Nmt(NmtCommand.START))
+    return steps
+
+
+def encode_consumer_heartbeat(settings: Cia402Settings) -> int:
+    """Return the value of 1016h: the node of the host, and the time in ms after which its silence is an error."""
+    return settings.host_id << 16 | round(settings.watchdog_s * 1000)
+
+
+def encode_cycle(period_s: float) -> tuple[int, int]:
+    """Return a period as 60C2h has it: a value of 8 bits, and an exponent of 10 in seconds.
+
+    The first exponent with which the period is exact to 0.1 % is taken, or else the most exact one.
+    """
+    best = (MAX_CYCLE_VALUE, CYCLE_EXPONENTS[0])
+    best_error = math.inf
+    for exponent in CYCLE_EXPONENTS:
+        value = round(period_s / 10**exponent)
+        if not 1 <= value <= MAX_CYCLE_VALUE:
+            continue
+        error = abs(value * 10**exponent - period_s) / period_s
+        if error < best_error - 1e-3:
+            best = (value, exponent)
+            best_error = error
+    return best
+
+
+def _write_and_check(entry: Entry, value: int, *, optional: bool = False) -> Iterator[Step]:
+    yield Write(entry, value, optional=optional)
+    yield Read(entry, expected=value, optional=optional)
+
+
+def _list_pdo(pdo: Pdo, node: int) -> Iterator[Step]:
+    """Yield the steps that map a PDO: a drive allows it only while the PDO is off and its number of entries is 0."""
+    cob_id = pdo.base | node
+    yield Write(pdo.cob_id_entry(), PDO_OFF | cob_id)
+    yield Write(pdo.mapping_entry(0), 0)
+    for sub, entry in enumerate(pdo.entries, start=1):
+        yield Write(pdo.mapping_entry(sub), encode_mapping(entry))
+    yield Write(pdo.mapping_entry(0), len(pdo.entries))
+    yield Write(pdo.transmission_entry(), pdo.transmission_type)
+    yield Write(pdo.cob_id_entry(), cob_id)
+    for sub, entry in enumerate(pdo.entries, start=1):
+        yield Read(pdo.mapping_entry(sub), expected=encode_mapping(entry))
+    yield Read(pdo.mapping_entry(0), expected=len(pdo.entries))
+    yield Read(pdo.transmission_entry(), expected=pdo.transmission_type)
+    yield Read(pdo.cob_id_entry(), expected=cob_id, mask=COB_ID_MASK)

@@ -1,0 +1,408 @@
+"""Emulated CiA 402 drives: objects, state machine, PDOs, heartbeats and emergency messages, on a simulated body.
+
+They do *not* simulate segmented and block transfers, storing of parameters, homing, profile and interpolated modes,
+ramps of a shutdown and of a fault reaction, the tuning of real position and velocity loops, arbitration and bit rate.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
+from snakesim_can_backend.cia402.eds import BUNDLED, read_eds
+from snakesim_can_backend.cia402.frames import (
+    HEARTBEAT_LOST,
+    RECEIVE_PDOS,
+    SYNC_ID,
+    UPLOAD_ANSWER,
+    Emergency,
+    Function,
+    NmtCommand,
+    NmtState,
+    decode_sdo,
+    encode_emergency,
+    encode_heartbeat,
+    encode_read_answer,
+    split_id,
+)
+from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, Scaling, shaft_range_rad
+from snakesim_can_backend.cia402.node import Address, Node
+from snakesim_can_backend.cia402.objects import (
+    ABORT_CONNECTION,
+    CONSUMER_HEARTBEAT,
+    CONTROLWORD,
+    CURRENT,
+    ENCODER_INCREMENTS,
+    ENCODER_REVOLUTIONS,
+    ERROR_BEHAVIOR,
+    ERROR_CODE,
+    ERROR_REGISTER,
+    MAX_POSITION,
+    MAX_SPEED,
+    MAX_TORQUE,
+    MIN_POSITION,
+    MODE,
+    MODE_DISPLAY,
+    POSITION,
+    PRODUCER_HEARTBEAT,
+    PRODUCT,
+    QUICK_STOP_OPTION,
+    RATED_CURRENT,
+    RATED_TORQUE,
+    REVISION,
+    SERIAL,
+    STATUSWORD,
+    TARGET_POSITION,
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    TORQUE,
+    VELOCITY,
+    VENDOR,
+    VOLTAGE,
+    Entry,
+)
+from snakesim_can_backend.cia402.servo import EMULATED_BOARD_TEMPERATURE, EMULATED_MOTOR_TEMPERATURE
+from snakesim_can_backend.cia402.settings import Cia402Settings, MountedCia402
+from snakesim_can_backend.cia402.state_machine import (
+    FAULT_STATES,
+    OperationMode,
+    PowerState,
+    apply_control,
+    encode_statusword,
+)
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.wire.messages import Mode
+
+BROADCAST = 0  # the node of NMT commands to all nodes, SYNC and heartbeats
+COUNTS_PER_TURN = 65_536  # of the encoder
+EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of drives whose robot file names none
+POSITION_MARGIN = 0.02  # of a joint's range: how far the position limits of a drive are beyond it
+EMULATED_REVISION = 0x0001_0000
+FIRST_SERIAL = 0x4020_0001
+DUPLICATE_SERIAL_BITS = 0x0100_0000  # in which the serial number of a second drive with the same id differs
+OVER_TEMPERATURE = Emergency(0x4210, 0x09)  # generic and temperature
+NO_HEARTBEAT = Emergency(HEARTBEAT_LOST, 0x11)  # generic and communication
+STAYS_IN_QUICK_STOP = 5  # from this option code on
+AT_REST_RAD_S = 0.05  # shaft speed at which a quick stop ends
+TORQUE_OFF = 0  # quick stop option code
+DRIVE_MODES: dict[int, Mode] = {
+    OperationMode.CYCLIC_POSITION: Mode.POSITION,
+    OperationMode.CYCLIC_VELOCITY: Mode.VELOCITY,
+    OperationMode.CYCLIC_TORQUE: Mode.TORQUE,
+}
+
+
+@dataclass
+class EmulatedDrive:
+    """One drive: its objects, and its state."""
+
+    node: int  # id
+    objects: Node
+    scaling: Scaling
+    state: PowerState = PowerState.SWITCH_ON_DISABLED
+    controlword: int = 0
+    error: Emergency | None = None  # that led to the fault
+    is_booting: bool = True
+    heartbeat_us: float = -math.inf  # when it sent one last
+    host_heartbeat_us: float | None = None  # when it received one last; None: none since the start
+    saved: dict[Entry, int] = field(default_factory=dict[Entry, int])  # in its nonvolatile memory
+
+
+class EmulatedCia402(CanEmulator):
+    """All drives of a driver type."""
+
+    broadcast_id = BROADCAST
+
+    def __init__(self, context: CanEmulatorContext) -> None:
+        """Start all drives."""
+        super().__init__(context)
+        self._settings: Cia402Settings = context.settings
+        paths = self._settings.eds or [str(BUNDLED)]
+        self._eds = read_eds(paths[0])
+        self._joints = context.joints
+        self.drives = [self._make_drive(i) for i in range(len(context.joints))]
+        self.on_step(0.0)
+
+    def find_addressee(self, frame: Frame) -> int:
+        """Return the node that a frame is for; all nodes receive NMT commands to all, SYNC and heartbeats."""
+        function, node = split_id(frame)
+        if frame.id == Function.NMT:
+            return frame.data[1]
+        if function in RECEIVE_PDOS or function == Function.SDO_REQUEST:
+            return node
+        return BROADCAST
+
+    def duplicate_frame(self, frame: Frame) -> Frame:
+        """Return the frame of a second drive: it has another serial number."""
+        function, _ = split_id(frame)
+        if function != Function.SDO_ANSWER:
+            return frame
+        answer = decode_sdo(frame.data)
+        if answer.kind != UPLOAD_ANSWER or (answer.index, answer.sub) != (SERIAL.index, SERIAL.sub):
+            return frame
+        serial = SERIAL.decode(answer.data) ^ DUPLICATE_SERIAL_BITS
+        return Frame(frame.id, encode_read_answer(answer.index, answer.sub, SERIAL.encode(serial)))
+
+    def restart(self, i: int) -> None:
+        """Restart a drive: it loses all settings that it has not saved, and sends its boot-up message later."""
+        node = self.drives[i].node
+        self.drives[i] = self._make_drive(i)
+        self.drives[i].node = node
+        self._drive_motor(i)
+
+    def handle_frame(self, i: int, frame: Frame) -> None:
+        """Obey an NMT command, answer SYNC or a request, apply a PDO, or note the heartbeat of the host."""
+        drive = self.drives[i]
+        function, node = split_id(frame)
+        if drive.is_booting:
+            return
+        if frame.id == SYNC_ID:
+            for cob_id, data in drive.objects.list_synchronous():
+                self.send_frame(i, Frame(cob_id & ~0x7F | drive.node, data))
+        elif frame.id == Function.NMT:
+            self._obey_nmt(i, frame.data[0])
+        elif function == Function.SDO_REQUEST:
+            answer = drive.objects.answer_sdo(decode_sdo(frame.data))
+            self.send_frame(i, Frame(Function.SDO_ANSWER | drive.node, answer))
+        elif function == Function.HEARTBEAT:
+            if node == self._consumer(drive)[0]:
+                drive.host_heartbeat_us = self.body.now_us
+        elif function in RECEIVE_PDOS:
+            self._receive_pdo(i, frame)
+
+    def on_step(self, now_us: float) -> None:
+        """Let drives boot, watch the host, stop when they are too hot, and send heartbeats."""
+        for i, drive in enumerate(self.drives):
+            if self.body.is_booting(i):
+                continue
+            if drive.is_booting:
+                drive.is_booting = False
+                drive.heartbeat_us = now_us
+                self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
+            self._watch_host(i, now_us)
+            if self.body.is_too_hot(i) and drive.state not in FAULT_STATES:
+                self._fail(i, OVER_TEMPERATURE)
+            self._end_quick_stop(i)
+            period_us = drive.objects.get(_address(PRODUCER_HEARTBEAT)) * 1000
+            if period_us and now_us - drive.heartbeat_us >= period_us:
+                drive.heartbeat_us = now_us
+                self.send_frame(i, encode_heartbeat(drive.node, drive.objects.nmt_state))
+
+    # --- what happens to a drive ------------------------------------------------------------------------------
+
+    def _make_drive(self, i: int) -> EmulatedDrive:
+        joint = self._joints[i]
+        node = Node(
+            eds=self._eds,
+            node=self.body.joints[i].id,
+            on_write=lambda address, value: self._apply_write(i, address, value),
+            read_live=lambda address: self._read_live(i, address),
+        )
+        mounted = self._settings.mounted.get(joint.name, MountedCia402())
+        rated_mnm = max(math.ceil(joint.limits.torque_nm / joint.drive.gear * 1000), 1)
+        if self._settings.rated_torque_nm is not None:
+            rated_mnm = max(round(self._settings.rated_torque_nm * 1000), 1)
+        counts = round(self._settings.counts_per_turn or COUNTS_PER_TURN)
+        scaling = Scaling(counts, self._settings.velocity_units_per_turn_s or counts, rated_mnm / 1000)
+        saved = make_saved_values(joint, mounted, scaling, self._settings.max_speed_units_per_turn_s)
+        saved |= {
+            VENDOR: self._eds.vendor,
+            PRODUCT: self._eds.product,
+            REVISION: EMULATED_REVISION,
+            SERIAL: FIRST_SERIAL + i,
+        }
+        for entry, value in saved.items():
+            if _address(entry) in node.values:
+                node.values[_address(entry)] = int.from_bytes(entry.encode(value), "little")
+        return EmulatedDrive(node.node, node, scaling, saved=saved)
+
+    def _obey_nmt(self, i: int, command: int) -> None:
+        drive = self.drives[i]
+        if not drive.objects.apply_nmt(command):
+            return
+        if command == NmtCommand.RESET_NODE:
+            self.restart(i)
+            return
+        drive.objects.reset_communication()
+        for entry in (VENDOR, PRODUCT, REVISION, SERIAL):
+            drive.objects.values[_address(entry)] = drive.saved[entry]
+        drive.objects.nmt_state = NmtState.PRE_OPERATIONAL
+        drive.host_heartbeat_us = None
+        self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
+
+    def _receive_pdo(self, i: int, frame: Frame) -> None:
+        drive = self.drives[i]
+        for address, value in drive.objects.find_received(frame.id, frame.data) or []:
+            drive.objects.values[address] = value
+            self._apply_write(i, address, value)
+        self._drive_motor(i)
+
+    def _apply_write(self, i: int, address: Address, value: int) -> None:
+        """Let a value that a host has written take effect."""
+        drive = self.drives[i]
+        if address == _address(CONTROLWORD):
+            was_fault = drive.state == PowerState.FAULT
+            drive.state = apply_control(drive.state, value, drive.controlword)
+            drive.controlword = value
+            if was_fault and drive.state != PowerState.FAULT:
+                drive.error = None
+                self.send_frame(i, encode_emergency(drive.node, Emergency(0, 0)))
+        elif address == _address(CONSUMER_HEARTBEAT):
+            drive.host_heartbeat_us = None  # the watch begins with the next heartbeat
+        self._end_quick_stop(i)
+        self._drive_motor(i)
+
+    def _watch_host(self, i: int, now_us: float) -> None:
+        drive = self.drives[i]
+        _, limit_ms = self._consumer(drive)
+        if not limit_ms or drive.host_heartbeat_us is None:
+            return
+        if now_us - drive.host_heartbeat_us <= limit_ms * 1000:
+            return
+        drive.host_heartbeat_us = None
+        if not drive.objects.get(_address(ERROR_BEHAVIOR)):
+            drive.objects.nmt_state = NmtState.PRE_OPERATIONAL
+        if drive.objects.get(_address(ABORT_CONNECTION)) and drive.state not in FAULT_STATES:
+            self._fail(i, NO_HEARTBEAT)
+
+    def _consumer(self, drive: EmulatedDrive) -> tuple[int, int]:
+        """Return the node whose heartbeats a drive watches, and the time in ms; 0: it does not watch."""
+        value = drive.objects.get(_address(CONSUMER_HEARTBEAT))
+        return value >> 16 & 0x7F, value & 0xFFFF
+
+    def _fail(self, i: int, error: Emergency) -> None:
+        drive = self.drives[i]
+        drive.state = PowerState.FAULT
+        drive.error = error
+        self.send_frame(i, encode_emergency(drive.node, error))
+        self._drive_motor(i)
+
+    def _end_quick_stop(self, i: int) -> None:
+        """Switch a drive off at the end of a quick stop, unless its option code lets it stay in it."""
+        drive = self.drives[i]
+        if drive.state != PowerState.QUICK_STOP:
+            return
+        option = drive.objects.get(_address(QUICK_STOP_OPTION))
+        is_at_rest = abs(self.body.read_shaft(i).velocity_rad_s) < AT_REST_RAD_S
+        if option == TORQUE_OFF or (option < STAYS_IN_QUICK_STOP and is_at_rest):
+            drive.state = PowerState.SWITCH_ON_DISABLED
+            self._drive_motor(i)
+
+    # --- what a drive measures and does -----------------------------------------------------------------------
+
+    def _read_live(self, i: int, address: Address) -> int | None:
+        """Return a value that changes by itself; None for all others."""
+        drive = self.drives[i]
+        match address:
+            case (STATUSWORD.index, 0):
+                return encode_statusword(drive.state)
+            case (MODE_DISPLAY.index, 0):
+                return drive.objects.values.get(_address(MODE), 0)
+            case (ERROR_CODE.index, 0):
+                return 0 if drive.error is None else drive.error.code
+            case (ERROR_REGISTER.index, 0):
+                return 0 if drive.error is None else drive.error.register
+            case (POSITION.index, 0):
+                return drive.scaling.to_position(self.body.read_shaft(i).angle_rad)
+            case (VELOCITY.index, 0):
+                return drive.scaling.to_velocity(self.body.read_shaft(i).velocity_rad_s)
+            case (TORQUE.index, 0) | (CURRENT.index, 0):
+                return drive.scaling.to_torque(self.body.read_shaft(i).torque_nm)
+            case (VOLTAGE.index, 0):
+                return round(self.body.read_supply(i)[0] * 1000)
+            case (EMULATED_MOTOR_TEMPERATURE.index, EMULATED_MOTOR_TEMPERATURE.sub):
+                return round(self.body.read_temperatures(i)[0] * 10)
+            case (EMULATED_BOARD_TEMPERATURE.index, EMULATED_BOARD_TEMPERATURE.sub):
+                return round(self.body.read_temperatures(i)[1] * 10)
+            case _:
+                return None
+
+    def _drive_motor(self, i: int) -> None:
+        """Apply the mode and the target of a drive to its motor."""
+        drive = self.drives[i]
+        joint = self._joints[i]
+        gear = joint.drive.gear
+        scaling = drive.scaling
+        mode = Mode.PASSIVE
+        target = 0.0
+        match drive.state:
+            case PowerState.ENABLED:
+                mode = DRIVE_MODES.get(_read_signed(drive, MODE), Mode.PASSIVE)
+                target = self._read_target(drive, mode)
+            case PowerState.QUICK_STOP:
+                mode = Mode.VELOCITY
+            case _:
+                pass
+        damping = joint.motor.damping_nm_s_per_rad
+        if mode == Mode.VELOCITY:
+            damping = joint.motor.velocity_gain_nm_s_per_rad
+        max_speed = drive.objects.get(_address(MAX_SPEED))
+        self.body.drive_motor(
+            i,
+            mode,
+            target,
+            limit_nm=scaling.to_torque_nm(drive.objects.get(_address(MAX_TORQUE))),
+            stiffness=joint.motor.stiffness_nm_per_rad / gear**2,
+            damping=damping / gear**2,
+            speed_rad_s=max_speed / self._settings.max_speed_units_per_turn_s * REVOLUTION_RAD,
+        )
+
+    def _read_target(self, drive: EmulatedDrive, mode: Mode) -> float:
+        """Return the target of a mode in rad, rad/s or N·m. Positions end at the software position limits."""
+        match mode:
+            case Mode.POSITION:
+                position = _read_signed(drive, TARGET_POSITION)
+                low = _read_signed(drive, MIN_POSITION)
+                high = _read_signed(drive, MAX_POSITION)
+                if low < high:
+                    position = min(max(position, low), high)
+                return drive.scaling.to_angle_rad(position)
+            case Mode.VELOCITY:
+                return drive.scaling.to_velocity_rad_s(_read_signed(drive, TARGET_VELOCITY))
+            case Mode.TORQUE:
+                return drive.scaling.to_torque_nm(_read_signed(drive, TARGET_TORQUE))
+            case _:
+                return 0.0
+
+
+def make_saved_values(
+    joint: Joint, mounted: MountedCia402, scaling: Scaling, max_speed_units_per_turn_s: float
+) -> dict[Entry, int]:
+    """Return what a drive is configured with: what its joint in the robot file needs, unless `mounted` differs.
+
+    Args:
+        joint: The joint, as the robot file describes it.
+        mounted: How the drive is really configured.
+        scaling: The units of the drive.
+        max_speed_units_per_turn_s: Units of its speed limit for one turn/s.
+    """
+    gear = joint.drive.gear
+    rated_a = scaling.rated_torque_nm / (joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A)
+    max_torque_nm = mounted.max_torque_nm or joint.limits.torque_nm / gear
+    max_speed_rad_s = mounted.max_speed_rad_s or joint.limits.speed_rad_s * gear
+    lower_rad, upper_rad = shaft_range_rad(joint)
+    margin_rad = POSITION_MARGIN * (upper_rad - lower_rad)
+    min_position = mounted.min_position
+    if min_position is None:
+        min_position = scaling.to_position(lower_rad - margin_rad)
+    max_position = mounted.max_position
+    if max_position is None:
+        max_position = scaling.to_position(upper_rad + margin_rad)
+    return {
+        ENCODER_INCREMENTS: round(scaling.counts_per_turn),
+        ENCODER_REVOLUTIONS: 1,
+        RATED_TORQUE: round(scaling.rated_torque_nm * 1000),
+        RATED_CURRENT: round(rated_a * 1000),
+        MAX_TORQUE: math.ceil(max_torque_nm / scaling.rated_torque_nm * THOUSANDTHS - 1e-6),
+        MAX_SPEED: math.ceil(max_speed_rad_s / REVOLUTION_RAD * max_speed_units_per_turn_s - 1e-6),
+        MIN_POSITION: min_position,
+        MAX_POSITION: max_position,
+    }
+
+
+def _address(entry: Entry) -> Address:
+    return entry.index, entry.sub
+
+
+def _read_signed(drive: EmulatedDrive, entry: Entry) -> int:
+    return entry.decode(drive.objects.get(_address(entry)).to_bytes(entry.size, "little"))

@@ -1,0 +1,323 @@
+"""Our CANopen against the PyPI library `canopen`: it is a second master of the emulated drives, and a drive of ours."""
+
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import canopen
+import pytest
+from canopen.emcy import EmcyError
+from canopen.profiles.p402 import BaseNode402, OperationMode, State402
+from canopen.sdo import SdoAbortedError
+
+from snakesim_can_backend.can_drives.drives import CanDrivesContext
+from snakesim_can_backend.cia402 import objects
+from snakesim_can_backend.cia402.backend import Cia402Backend
+from snakesim_can_backend.cia402.drives import Cia402Drives
+from snakesim_can_backend.cia402.eds import BUNDLED, SIZES, read_eds
+from snakesim_can_backend.cia402.frames import ABORTS, SYNC_ID, describe_error
+from snakesim_can_backend.cia402.state_machine import Control, PowerState, decode_statusword
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_drivers.kit.drive_backend import DriverClock
+from snakesim_drivers.kit.drives import BusCommand
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_hal.wire.messages import Mode
+from snakesim_testing.can.driver_loop import config
+
+JOINTS = 2
+CONFIG = config(JOINTS, backend="cia402")
+EDS = str(BUNDLED)
+
+
+class LibraryWire:
+    """Our end of a bus whose other end is a network of the library, in the same thread and without waiting."""
+
+    channel = "library"
+
+    def __init__(self) -> None:
+        self.network = LibraryNetwork(self)
+        self.arrived: list[Frame] = []
+        self.when_sent: Callable[[Frame], None] = lambda _frame: None
+        self.when_arrived: Callable[[], None] = lambda: None
+
+    def send(self, frame: Frame) -> bool:
+        self.network.notify(frame.id, bytearray(frame.data), 0.0)
+        self.when_sent(frame)
+        return True
+
+    def receive(self) -> list[Frame]:
+        frames, self.arrived = self.arrived, []
+        return frames
+
+    def errors(self) -> list[Any]:
+        return []
+
+    def fileno(self) -> None:
+        return None
+
+    def idle(self) -> float | None:
+        return 0.0 if self.arrived else None
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        raise NotImplementedError(kind, begins)
+
+    def close(self) -> None:
+        return
+
+
+class LibraryNetwork(canopen.Network):
+    """A network whose frames are sent to our end."""
+
+    def __init__(self, wire: LibraryWire) -> None:
+        super().__init__()
+        self._wire = wire
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        assert not remote
+        self._wire.arrived.append(Frame(can_id, bytes(data)))
+        self._wire.when_arrived()
+
+    def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> Any:
+        """Send nothing: a heartbeat would need a thread."""
+        del can_id, data, period, remote
+        return SimpleNamespace(stop=lambda: None, update=lambda _data: None)
+
+
+class Master:
+    """The library as the master of our emulated drives."""
+
+    def __init__(self) -> None:
+        self.wire = LibraryWire()
+        self.clock = DriverClock(CONFIG)
+        settings = Cia402Backend.Settings(physics_model="inertia")
+        self.emulator: Any = Cia402Backend.emulator_on(CONFIG, settings, [self.wire], self.clock, None)
+        self.wire.when_arrived = self.emulator
+        self.node = BaseNode402(1, EDS)
+        self.wire.network.add_node(self.node)
+        self.pass_time(0.02)
+
+    @property
+    def drive(self) -> Any:
+        return self.emulator.drives[0]
+
+    def pass_time(self, seconds: float) -> None:
+        self.clock.robot_ns += round(seconds * 1e9)
+        self.emulator()
+
+    def enable(self, mode: str) -> None:
+        self.node.sdo["Modes of operation"].raw = OperationMode.NAME2CODE[mode]
+        self.node.state = "OPERATION ENABLED"
+
+
+@pytest.fixture
+def master() -> Iterator[Master]:
+    one = Master()
+    yield one
+    one.emulator.close()
+
+
+def test_states_and_commands_are_those_of_the_library() -> None:
+    for name, (_, bits) in State402.SW_MASK.items():
+        ours = decode_statusword(bits)
+        assert ours.value.upper().removesuffix(" ACTIVE") == name.removesuffix(" ACTIVE"), name
+        assert decode_statusword(bits | 0xFF90) == ours, "bits that do not belong to the state"
+    assert {Control(word) for word in State402.CW_CODE_COMMANDS} == set(Control)
+
+
+def test_abort_codes_and_errors_are_those_of_the_library() -> None:
+    assert set(ABORTS) <= set(SdoAbortedError.CODES)
+    for code in (0x2310, 0x3210, 0x4210, 0x8130):
+        theirs = EmcyError(code, 0, b"", 0.0).get_desc().lower()
+        assert theirs.split()[0] in describe_error(code) or theirs == "monitoring"
+
+
+def test_bundled_eds_is_read_equally_by_the_library() -> None:
+    theirs = canopen.import_od(EDS, 5)
+    ours = read_eds(EDS)
+    for (index, sub), described in ours.objects.items():
+        found: Any = theirs[index]
+        variable = found if isinstance(found, canopen.objectdictionary.ODVariable) else found[sub]
+        assert described.size == SIZES[variable.data_type], variable.name
+        assert described.mappable == variable.pdo_mappable, variable.name
+        assert described.default_value(5) == (variable.default or 0), variable.name
+    device: Any = theirs.device_information
+    assert (ours.vendor, ours.product) == (device.vendor_number, device.product_number)
+
+
+def test_every_object_of_the_driver_has_the_type_of_the_eds() -> None:
+    theirs = canopen.import_od(EDS, 5)
+    for entry in vars(objects).values():
+        if not isinstance(entry, objects.Entry):
+            continue
+        found: Any = theirs[entry.index]
+        variable = found if isinstance(found, canopen.objectdictionary.ODVariable) else found[entry.sub]
+        assert (variable.data_type in (2, 3, 4)) == entry.format.islower(), entry.name
+        assert SIZES[variable.data_type] == entry.size, entry.name
+
+
+def test_library_reads_identity_and_limits_of_an_emulated_drive(master: Master) -> None:
+    sdo = master.node.sdo
+    assert sdo[0x1000].raw & 0xFFFF == 402
+    assert sdo["Identity object"]["Serial number"].raw == 0x4020_0001
+    assert master.node.is_op_mode_supported("CYCLIC SYNCHRONOUS POSITION")
+    rated_nm = sdo["Motor rated torque"].raw / 1000
+    assert rated_nm * sdo["Max torque"].raw / 1000 == pytest.approx(CONFIG.robot.limits.torque_nm)
+    with pytest.raises(SdoAbortedError) as refused:
+        sdo.download(0x6041, 0, b"\0\0")
+    assert refused.value.code == 0x0601_0002
+    with pytest.raises(SdoAbortedError) as missing:
+        sdo.upload(0x6099, 1)
+    assert missing.value.code == 0x0602_0000
+
+
+def test_library_leads_an_emulated_drive_through_its_states(master: Master) -> None:
+    master.enable("CYCLIC SYNCHRONOUS TORQUE")
+    assert master.drive.state == PowerState.ENABLED
+    master.node.sdo["Target torque"].raw = 100
+    master.pass_time(0.05)
+    assert master.node.sdo["Torque actual value"].raw == pytest.approx(100, abs=10)
+    master.node.controlword = Control.QUICK_STOP
+    master.pass_time(0.5)
+    assert master.drive.state == PowerState.SWITCH_ON_DISABLED
+    assert master.node.sdo["Torque actual value"].raw == 0
+
+
+def test_library_maps_pdos_and_receives_them_after_sync(master: Master) -> None:
+    node = master.node
+    node.nmt.state = "PRE-OPERATIONAL"
+    pdo = node.tpdo[1]
+    pdo.read()
+    pdo.clear()
+    pdo.add_variable("Statusword")
+    pdo.add_variable("Position actual value")
+    pdo.trans_type = 1
+    pdo.enabled = True
+    pdo.save()
+    node.nmt.state = "OPERATIONAL"
+    received: list[int] = []
+    pdo.add_callback(lambda mapping: received.append(mapping["Statusword"].raw))
+    master.wire.network.sync.transmit()
+    assert [decode_statusword(word) for word in received] == [PowerState.SWITCH_ON_DISABLED]
+    with pytest.raises(SdoAbortedError) as refused:
+        node.sdo[0x1A00][1].raw = 0x6041_0010
+    assert refused.value.code == 0x0800_0022, "a mapping in use"
+
+
+def test_drive_stops_by_itself_without_heartbeats_and_reports_it(master: Master) -> None:
+    node = master.node
+    node.sdo[0x1016][1].raw = 127 << 16 | 100
+    node.sdo["Abort connection option code"].raw = 1
+    master.enable("CYCLIC SYNCHRONOUS POSITION")
+    for _ in range(5):
+        master.wire.network.send_message(0x700 + 127, b"\x05")
+        master.pass_time(0.05)
+    assert master.drive.state == PowerState.ENABLED
+    master.pass_time(0.15)
+    assert node.state == "FAULT"
+    [error] = node.emcy.active
+    assert (error.code, error.register) == (0x8130, 0x11)
+    assert node.sdo["Error code"].raw == 0x8130
+    node.sdo["Controlword"].raw = Control.ENABLE_OPERATION
+    assert node.state == "FAULT", "only a fault reset ends it"
+    node.sdo["Controlword"].raw = Control.FAULT_RESET
+    assert node.state == "SWITCH ON DISABLED"
+    assert node.emcy.active == []
+
+
+class LibraryDrives:
+    """Drives of the library, which our driver brings up and drives."""
+
+    def __init__(self) -> None:
+        self.wire = LibraryWire()
+        joints = CONFIG.robot.joint_table
+        self.nodes: list[Any] = [canopen.LocalNode(joint.id, EDS) for joint in joints]
+        self.words = [0x0040] * JOINTS
+        for i, node in enumerate(self.nodes):
+            self.wire.network.add_node(node)
+            node.sdo["Identity object"]["Serial number"].raw = 7 + i
+            node.sdo["Motor rated torque"].raw = 5000
+            node.sdo["Motor rated current"].raw = 5000
+            node.sdo["Max torque"].raw = 900
+            node.sdo["Max motor speed"].raw = 3000
+            node.sdo["Position encoder resolution"]["Encoder increments"].raw = 4096
+            node.sdo["Statusword"].raw = 0x0040
+            node.sdo["Error code"].raw = 0
+        self.readings = DriveReadings(joints, lambda: 0)
+        self.driver = Cia402Drives(
+            CanDrivesContext(
+                all_joints=joints,
+                joints=joints,
+                settings=Cia402Backend.Settings(),
+                wire=self.wire,
+                readings=self.readings,
+                emulator=None,
+                emulated=False,
+                answer_s=0.1,
+                bring_up_s=2.0,
+                cycle_ns=10_000_000,
+                report_period_ns=100_000_000,
+                clock_ns=lambda: 0,
+            )
+        )
+        self.wire.when_sent = self._answer_sync
+
+    def _answer_sync(self, frame: Frame) -> None:
+        if frame.id != SYNC_ID:
+            return
+        for i, node in enumerate(self.nodes):
+            if node.nmt.state != "OPERATIONAL":
+                continue
+            node.tpdo.read()
+            node.tpdo[1]["Statusword"].raw = self.words[i]
+            node.tpdo[1]["Position actual value"].raw = 1024
+            node.tpdo[1]["Torque actual value"].raw = -500
+            node.tpdo[2]["Velocity actual value"].raw = 2048
+            node.tpdo[2]["Modes of operation display"].raw = 8
+            node.tpdo[2]["Error code"].raw = 0
+            node.tpdo[1].transmit()
+            node.tpdo[2].transmit()
+
+
+def test_our_driver_configures_drives_of_the_library() -> None:
+    drives = LibraryDrives()
+    drives.driver.bring_up()
+    for node in drives.nodes:
+        assert node.nmt.state == "OPERATIONAL"
+        assert node.sdo[0x1016][1].raw == 127 << 16 | 100
+        assert node.sdo["Producer heartbeat time"].raw == 100
+        node.rpdo.read()
+        mapped = {pdo.cob_id - node.id: [variable.name for variable in pdo] for pdo in node.rpdo.values()}
+        assert mapped == {
+            0x200: ["Controlword", "Target position", "Max torque"],
+            0x300: ["Controlword", "Target velocity", "Max torque"],
+            0x400: ["Controlword", "Target torque", "Max torque"],
+            0x500: ["Modes of operation"],
+        }
+        assert [pdo.trans_type for pdo in node.rpdo.values()] == [255] * 4
+        assert [node.tpdo[number].trans_type for number in (1, 2)] == [1, 1]
+        assert not node.tpdo[3].enabled
+    assert drives.readings.angle_rad == pytest.approx([1.5708] * JOINTS, abs=1e-4)
+    assert drives.readings.velocity_rad_s == pytest.approx([3.1416] * JOINTS, abs=1e-4)
+    assert drives.readings.torque_nm == pytest.approx([-2.5] * JOINTS)
+    assert drives.readings.serials == ["00000000-00000402-00000007", "00000000-00000402-00000008"]
+
+
+def test_our_setpoints_are_decoded_by_drives_of_the_library() -> None:
+    drives = LibraryDrives()
+    drives.driver.bring_up()
+    received: list[tuple[int, ...]] = []
+    node = drives.nodes[0]
+    node.rpdo.read()
+    node.rpdo[1].add_callback(lambda pdo: received.append(tuple(variable.raw for variable in pdo)))
+    everybody = frozenset(range(JOINTS))
+    targets = drives.readings.angle_rad * 0 + 3.14159265
+    limits = drives.readings.angle_rad * 0 + 2.0
+    command = BusCommand(everybody, [Mode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False)
+    for word in (0x0040, 0x0021, 0x0023, 0x0027):
+        drives.words = [word] * JOINTS
+        drives.readings.count_request()
+        drives.driver.read()
+        drives.driver.send_setpoints(command)
+    controls = [values[0] for values in received]
+    assert controls == [0x00, Control.SWITCH_ON, Control.ENABLE_OPERATION, Control.ENABLE_OPERATION]
+    assert {values[1:] for values in received} == {(2048, 400)}
