@@ -159,7 +159,9 @@ def record_to_file(
         NotConnectedError: There was no network at the link until the end. No file is created.
     """
     with _connect(link, goes_on) as session:
-        return _record_session(session, link, path, goes_on, show, raw_only=raw_only, after_host=after_host)
+        return _record_session(
+            session, link, path, goes_on, show, raw_only=raw_only, after_host=after_host, stamps=stamps
+        )
 
 
 @contextlib.contextmanager
@@ -195,6 +197,7 @@ def _record_session(
     *,
     raw_only: bool,
     after_host: bool,
+    stamps: Stamps,
 ) -> Recorder:
     """Record over a session that is open. The arguments are those of `record_to_file`."""
     shown_as = None
