@@ -21,7 +21,7 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
     *("param set", "fault inject", "sim pause", "sim resume", "sim step", "sim speed", "sim reset"),
     *("drive emulate can", "drive emulate odrive", "drive emulate moteus", "drive emulate dynamixel"),
     *("drive replay can", "drive dbc"),
-    *("recording report", "recording export", "recording video", "recording plot"),
+    *("recording report", "recording export", "recording video", "recording plot", "recording rosbag"),
     *("study evaluate", "study sweep", "study optimize", "policy train"),
     *("lab example", "lab render", "lab certs"),
     "topic echo",  # always JSON
