@@ -76,7 +76,7 @@ class _Copy:
         self._schemas: dict[int, int] = {}  # number in the copy, by number in the original
         self._channels: dict[int, int] = {}  # number in the copy, by number in the original
         self._keys: dict[int, str] = {}  # keys of the robot's own messages, by channel in the original
-        self._requested_stamps = stamps
+        self._requested_stamps: Stamps | None = stamps
         self._stamps: dict[int, Stamps] = {}  # in the copy, by channel in the original
         self._shown: ShownMessages | None = None  # makes the messages for viewers again; None: they are copied
         self.message_count = 0

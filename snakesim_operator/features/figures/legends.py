@@ -35,8 +35,9 @@ def _place_legend(axes: Axes, names: list[str]) -> float:
         )
         fits = legend.get_window_extent().width <= axes.get_window_extent().width
         if fits or column_count == 1:
+            font_size_pt = legend.get_texts()[0].get_fontproperties().get_size_in_points()
             row_count = math.ceil(len(names) / column_count)
-            return row_count * LINE_HEIGHT * legend.get_texts()[0].get_fontsize() / POINTS_PER_INCH
+            return row_count * LINE_HEIGHT * font_size_pt / POINTS_PER_INCH
         column_count -= 1
 
 

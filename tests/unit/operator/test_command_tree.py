@@ -27,7 +27,7 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
         "drive emulate dynamixel",
     ),
     *("drive replay can", "drive dbc"),
-    *("recording report", "recording export", "recording video", "recording plot"),
+    *("recording report", "recording export", "recording video", "recording plot", "recording rosbag"),
     *("study evaluate", "study sweep", "study optimize", "policy train"),
     *("lab example", "lab render", "lab certs"),
     "topic echo",  # always JSON
