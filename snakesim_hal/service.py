@@ -93,7 +93,7 @@ class ServiceLoop:
         service_type: type[Service],
         config: RunConfig,
         session: Session,
-        goes_on: Callable[[], bool] = lambda: False,
+        should_continue: Callable[[], bool] = lambda: False,
     ) -> None:
         """Construct the service, and wait for its robot.
 
@@ -101,7 +101,7 @@ class ServiceLoop:
             service_type: class of the service.
             config: configuration of the run.
             session: connection to the network.
-            goes_on: called after each attempt that found no robot; returns whether to try again.
+            should_continue: called after each attempt that found no robot; returns whether to try again.
 
         Raises:
             NotConnectedError: There is no robot.
@@ -119,7 +119,7 @@ class ServiceLoop:
         self._client = client
         with self._errors_named("__init__"):
             self.service = service_type(client, config)
-        robot = _wait_for_robot(client, goes_on)
+        robot = _wait_for_robot(client, should_continue)
         with self._errors_named("configure"):
             self.service.configure(robot)
         self._faults = create_service_faults(name, config, session, robot, lambda: client.newest_clock)
@@ -226,11 +226,11 @@ class ServiceLoop:
             raise ServiceError(f"{self._label}: {method}() {describe_exception(error, self._module)}") from error
 
 
-def _wait_for_robot(client: Client, goes_on: Callable[[], bool]) -> Description:
-    """Return the description of the robot. Raises NotConnectedError if there is none and `goes_on` returns False."""
+def _wait_for_robot(client: Client, should_continue: Callable[[], bool]) -> Description:
+    """Return the description of the robot. Raises NotConnectedError if `should_continue` returns False before."""
     while True:
         try:
             return client.description(CONNECT_ATTEMPT_S)
         except NotConnectedError:
-            if not goes_on():
+            if not should_continue():
                 raise

@@ -21,16 +21,16 @@ def import_mujoco() -> None:
     """Import MuJoCo, unless the program has done so. `mujoco.GLContext` is loaded when a program uses it."""
     if "mujoco" in sys.modules:
         return
-    wanted = os.environ.get(MUJOCO_GL)
+    requested_backend = os.environ.get(MUJOCO_GL)
     os.environ[MUJOCO_GL] = "off"
     try:
         for name in MODULES_WITH_CONTEXT:
             importlib.import_module(name)
     finally:
-        if wanted is None:
+        if requested_backend is None:
             del os.environ[MUJOCO_GL]
         else:
-            os.environ[MUJOCO_GL] = wanted
+            os.environ[MUJOCO_GL] = requested_backend
     for name in MODULES_WITH_CONTEXT:
         vars(sys.modules[name])["__getattr__"] = _load_context
 

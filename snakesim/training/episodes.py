@@ -43,7 +43,7 @@ _CACHED: list[_Cached] = []  # at most one
 class Episode:
     """The result of one episode."""
 
-    paid: float  # sum of rewards
+    total_reward: float  # sum of rewards
     advance_m: float
     energy_j: float  # sum over joints of |torque x velocity| over time
     time_s: float
@@ -156,21 +156,21 @@ def _run_together(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | N
         can_run[row] = _reset(environments, row, field)
     observations = environments.observe(can_run)
     targets_rad = np.zeros((count, len(setup.action_names)))
-    paid = np.zeros(count)
+    total_reward = np.zeros(count)
     energy_j = np.zeros(count)
     endings: dict[int, str] = {}
     while True:
-        goes_on = can_run & ~environments.is_over
-        rows = np.flatnonzero(goes_on).tolist()
+        is_active = can_run & ~environments.is_over
+        rows = np.flatnonzero(is_active).tolist()
         if not rows:
             break
         targets_rad = targets_rad.copy()
         for row in rows:
             targets_rad[row] = jobs[row][0].targets(observations[row])
-        result = environments.step(targets_rad, goes_on)
+        result = environments.step(targets_rad, is_active)
         observations = result.observations
-        paid = paid + np.where(goes_on, result.rewards, 0.0)
-        energy_j = energy_j + np.where(goes_on, result.energy_j, 0.0)
+        total_reward = total_reward + np.where(is_active, result.rewards, 0.0)
+        energy_j = energy_j + np.where(is_active, result.energy_j, 0.0)
         endings |= result.endings
     advance_m = environments.advance_m.tolist()
     time_s = environments.time_s.tolist()
@@ -180,7 +180,7 @@ def _run_together(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | N
             episodes.append(None)
             continue
         goal = endings[row] == "goal"
-        episodes.append(Episode(float(paid[row]), advance_m[row], float(energy_j[row]), time_s[row], goal))
+        episodes.append(Episode(float(total_reward[row]), advance_m[row], float(energy_j[row]), time_s[row], goal))
     for row in range(count):
         environments.close(row)
     return episodes

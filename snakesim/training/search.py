@@ -105,7 +105,7 @@ def _check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) -> C
     """Run a policy on the fields that nothing is searched on."""
     fields = range(CHECK_FIELD, CHECK_FIELD + effort.check_fields)
     ran = episodes.run([policy], fields)[0]
-    return Check(mean_of(ran, "paid"), mean_of(ran, "advance_m"), mean_of(ran, "goal"))
+    return Check(mean_of(ran, "total_reward"), mean_of(ran, "advance_m"), mean_of(ran, "goal"))
 
 
 def _run_generation(
@@ -119,7 +119,7 @@ def _run_generation(
     while not all(ran):  # no field of these has room for its obstacles
         first += OTHER_FIELDS
         ran = episodes.run(policies, range(first, first + effort.fields))
-    return [mean_of(of_policy, "paid") for of_policy in ran]
+    return [mean_of(of_policy, "total_reward") for of_policy in ran]
 
 
 def _row(number: int, done: KeptGeneration, effort: Effort) -> Generation:

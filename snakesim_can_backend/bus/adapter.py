@@ -88,10 +88,10 @@ def split_channel(channel: str) -> tuple[str, str]:
     if not colon:
         return "socketcan", channel
     if interface not in can.VALID_INTERFACES:
-        known = sorted(can.VALID_INTERFACES)
+        interfaces = sorted(can.VALID_INTERFACES)
         raise ConfigError(
-            f"channel {channel!r}: python-can has no interface {interface!r}; {suggest_word(interface, known)}it has "
-            f"{', '.join(known)}",
+            f"channel {channel!r}: python-can has no interface {interface!r}; "
+            f"{suggest_word(interface, interfaces)}it has {', '.join(interfaces)}",
             code="bus/invalid-channel",
         )
     if not name:

@@ -1,8 +1,8 @@
 """A limit on how long one step may take, for code that could compute without end, such as a controller.
 
 A thread watches the steps of another one, and raises StepTooLongError in it. That reaches Python code, also an endless
-loop. It does not reach compiled code that does not return: only another process can end that. A `Pulse` shows that
-process which step is too long.
+loop. It does not reach compiled code that does not return: only another process can end that. `SharedStepTimes` show
+that process which step is too long.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ class StepTooLongError(BaseException):
     """Raised in a step that takes too long. No `Exception`: what a controller catches must not catch it."""
 
 
-class Pulse:
+class SharedStepTimes:
     """When the present step began, and by when it should have ended, in memory that a forked process shares.
 
     Times are on the monotonic clock.
@@ -57,17 +57,17 @@ class StepLimit:
     """
 
     def __init__(
-        self, limit_s: float, pulse: Pulse | None = None, error: type[BaseException] = StepTooLongError
+        self, limit_s: float, step_times: SharedStepTimes | None = None, error: type[BaseException] = StepTooLongError
     ) -> None:
         """Limit steps to `limit_s` each.
 
         Args:
             limit_s: maximum wall time of a step.
-            pulse: shows another process when the present step began.
+            step_times: shows another process when the present step began.
             error: the class of what is raised. Two limits that are nested need different classes.
         """
         self.limit_s = limit_s
-        self._pulse = pulse
+        self._step_times = step_times
         self._error = error
         self._lock = threading.RLock()  # a signal handler may interrupt its own thread while that holds it
         self._closed = threading.Event()
@@ -89,8 +89,8 @@ class StepLimit:
         self._thread = threading.get_ident()
         self._interrupted_s = None
         self._began_s = now_s
-        if self._pulse is not None:
-            self._pulse.begin(now_s, now_s + self.limit_s)
+        if self._step_times is not None:
+            self._step_times.begin(now_s, now_s + self.limit_s)
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -106,8 +106,8 @@ class StepLimit:
             self._began_s = None
             if self._interrupted_s is not None:
                 _raise_in(self._thread, None)
-        if self._pulse is not None:
-            self._pulse.end()
+        if self._step_times is not None:
+            self._step_times.end()
 
     def hurry(self, grace_s: float) -> None:
         """Give the present step and each later one only `grace_s` from now on. A signal handler may call this."""

@@ -20,7 +20,7 @@ from typing import Self
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.base.errors import ConfigError, RefusedError, ServiceError, SnakesimError
-from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, describe_interrupted_line
+from snakesim_hal.base.step_limit import SharedStepTimes, StepLimit, StepTooLongError, describe_interrupted_line
 from snakesim_hal.base.terminal import report_error
 from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.host import Host, HostOptions
@@ -69,12 +69,14 @@ def check(config: RunConfig) -> None:
 class InProcessRun:
     """One run in this process. Its `with` opens and closes the backend and all services."""
 
-    def __init__(self, config: RunConfig, pulse: Pulse | None = None, turn_limit_s: float | None = None) -> None:
+    def __init__(
+        self, config: RunConfig, step_times: SharedStepTimes | None = None, turn_limit_s: float | None = None
+    ) -> None:
         """Check the configuration.
 
         Args:
             config: of the run.
-            pulse: shows another process that the run continues.
+            step_times: shows another process that the run continues.
             turn_limit_s: wall time that a part may take in one turn; None: as the configuration allows.
 
         Raises:
@@ -82,7 +84,7 @@ class InProcessRun:
         """
         check(config)
         self.config = config
-        self._limit = StepLimit(SERVICE_START_LIMIT_S, pulse)
+        self._limit = StepLimit(SERVICE_START_LIMIT_S, step_times)
         self._turn_limit_s = turn_limit_s or max(TURN_LIMIT_S, config.start_limit_s)
         self.network = LocalNetwork()
         self.failed: list[str] = []  # services that ended with an error, and the error

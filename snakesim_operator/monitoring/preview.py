@@ -137,17 +137,17 @@ def preview_of(image: DepthImage | ColorImage, width: int) -> Preview:
     file = io.BytesIO()
     if isinstance(image, DepthImage):
         counts = np.frombuffer(image.depth, dtype="<u2").reshape(image.height, image.width)
-        small = PIL.Image.fromarray(np.ascontiguousarray(counts[::step, ::step]))
-        small.save(file, "PNG")
+        reduced_image = PIL.Image.fromarray(np.ascontiguousarray(counts[::step, ::step]))
+        reduced_image.save(file, "PNG")
     else:
-        full = PIL.Image.frombytes("RGB", (image.width, image.height), image.rgb)
-        small = full.reduce(step)
-        small.save(file, "JPEG", quality=JPEG_QUALITY)
+        full_image = PIL.Image.frombytes("RGB", (image.width, image.height), image.rgb)
+        reduced_image = full_image.reduce(step)
+        reduced_image.save(file, "JPEG", quality=JPEG_QUALITY)
     return Preview(
         tick=image.tick,
         timestamp_ns=image.timestamp_ns,
-        width=small.width,
-        height=small.height,
+        width=reduced_image.width,
+        height=reduced_image.height,
         format="png" if isinstance(image, DepthImage) else "jpeg",
         scale_m=image.scale_m if isinstance(image, DepthImage) else None,
         data=file.getvalue(),

@@ -356,17 +356,17 @@ def _frames(episode: Episode, content: _Content, rows: NDArray[np.int64]) -> Fra
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]
     state += [record.position_w_m, record.orientation_wxyz] if content.posed else []
-    done = np.arange(len(rows)) == len(rows) - 1
+    is_last_frame = np.arange(len(rows)) == len(rows) - 1
     frames: Frames = {
         "observation.state": np.hstack(state)[rows].astype(np.float32),
         "action": np.hstack((record.target, record.mode))[rows].astype(np.float32),
-        "next.done": done,
+        "next.done": is_last_frame,
     }
     if content.rewarded and episode.reward_m is not None:
         reward_m = episode.reward_m[: episode.rows[-1] + 1]  # the last frame earns nothing beyond its episode
         frames["next.reward"] = np.add.reduceat(reward_m, rows).astype(np.float32)
     if content.judged:
-        frames["next.success"] = done & bool(episode.success)
+        frames["next.success"] = is_last_frame & bool(episode.success)
     return frames
 
 

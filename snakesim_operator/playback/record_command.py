@@ -48,7 +48,7 @@ def record_robot(
     on_stop_signal(lambda: stopped.append(True))
     began = time.monotonic()
 
-    def goes_on() -> bool:
+    def should_continue() -> bool:
         return not stopped and (duration_s is None or time.monotonic() < began + duration_s)
 
     try:
@@ -63,7 +63,7 @@ def record_robot(
             if live is not None:
                 print_line(f"Foxglove: open connection {live.address}")
                 show = live.send
-            recorder = record_to_file(link, path, goes_on, show, raw_only=raw_only, stamps=stamps)
+            recorder = record_to_file(link, path, should_continue, show, raw_only=raw_only, stamps=stamps)
     finally:
         for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)

@@ -133,7 +133,7 @@ class Recorder:
 def record_to_file(
     link: Link,
     path: Path,
-    goes_on: Callable[[], bool],
+    should_continue: Callable[[], bool],
     show: Show | None = None,
     *,
     raw_only: bool = False,
@@ -145,7 +145,7 @@ def record_to_file(
     Args:
         link: How to reach the robot.
         path: The new file.
-        goes_on: Returns whether to continue; called in each cycle.
+        should_continue: Returns whether to continue; called in each cycle.
         show: Gets each message that is made for viewers.
         raw_only: Record messages as on the wire alone, without topics for viewers.
         after_host: At the end, wait until the robot's host has left the network.
@@ -158,21 +158,21 @@ def record_to_file(
         ConfigError: The file exists or cannot be created.
         NotConnectedError: There was no network at the link until the end. No file is created.
     """
-    with _connect(link, goes_on) as session:
+    with _connect(link, should_continue) as session:
         return _record_session(
-            session, link, path, goes_on, show, raw_only=raw_only, after_host=after_host, stamps=stamps
+            session, link, path, should_continue, show, raw_only=raw_only, after_host=after_host, stamps=stamps
         )
 
 
 @contextlib.contextmanager
-def _connect(link: Link, goes_on: Callable[[], bool] = lambda: True) -> Iterator[Session]:
+def _connect(link: Link, should_continue: Callable[[], bool] = lambda: True) -> Iterator[Session]:
     """Connect as soon as there is a network, unless the recording ends before."""
     give_up_s = time.monotonic() + SERVICE_START_LIMIT_S
     is_stopped = False
 
     def keeps_waiting() -> bool:
         nonlocal is_stopped
-        is_stopped = not goes_on()
+        is_stopped = not should_continue()
         return not is_stopped and time.monotonic() < give_up_s
 
     with contextlib.ExitStack() as stack:
@@ -192,14 +192,30 @@ def _record_session(
     session: Session,
     link: Link,
     path: Path,
-    goes_on: Callable[[], bool],
+    should_continue: Callable[[], bool],
     show: Show | None = None,
     *,
     raw_only: bool,
     after_host: bool,
     stamps: Stamps,
 ) -> Recorder:
-    """Record over a session that is open. The arguments are those of `record_to_file`."""
+    """Record the messages of a robot over a session that is open, until the caller ends it or the disk is full.
+
+    Args:
+        session: Session on the robot's network.
+        link: How to reach the robot, with its namespace.
+        path: The new file.
+        should_continue: Called in every cycle; returns whether to continue.
+        show: Gets each message that is made for viewers.
+        raw_only: Whether to record only the messages as on the wire, without those for viewers.
+        after_host: Whether to record until the host's last messages have arrived.
+
+    Returns:
+        The recorder, whose file is closed.
+
+    Raises:
+        ConfigError: The file cannot be created.
+    """
     shown_as = None
     if not raw_only:
         shown_as = link.namespace or "robot"
@@ -211,7 +227,7 @@ def _record_session(
     hosts = _watch_hosts(session)
     session.declare_alive(RECORDER)
     show_process(session, own_entry(RECORDER))
-    while goes_on() and not recorder.recording.failure:
+    while should_continue() and not recorder.recording.failure:
         _write_arrivals(tap, recorder)
         time.sleep(CYCLE_S)
     if after_host:

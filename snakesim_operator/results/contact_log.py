@@ -55,9 +55,9 @@ class ContactCollector:
         """Return what was collected, in the order of the ticks. The last sample of a tick counts."""
         ticks = np.array(self._ticks, dtype=np.int64)
         unique_ticks, index_from_end = np.unique(ticks[::-1], return_index=True)
-        kept = len(ticks) - 1 - index_from_end
+        retained_rows = len(ticks) - 1 - index_from_end
         place = np.full(len(ticks), -1, dtype=np.int64)  # of each sample in the log
-        place[kept] = np.arange(len(kept))
+        place[retained_rows] = np.arange(len(retained_rows))
         sample = place[np.array(self._sample, dtype=np.int64)]
         rows = np.flatnonzero(sample >= 0)
         rows = rows[np.argsort(sample[rows], kind="stable")]

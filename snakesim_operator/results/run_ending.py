@@ -10,18 +10,18 @@ UNKNOWN = "unknown: "  # how a sentence begins that explains why the ending is n
 
 def describe_early_end(host: HostRecord, config: RunConfig) -> str:
     """Return how a run ended that was not complete, by the host's statistics; empty if it was complete."""
-    done = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
+    progress = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
     match host.ended:
         case "complete":
             return ""
         case "running":
-            return f"the record ends {done}, and may lack the last second"
+            return f"the record ends {progress}, and may lack the last second"
         case "finished" if config.mission.until_goal and host.ended_why.endswith(AT_GOAL):
             return ""
         case "stopped" | "finished":
-            return f"the host was {host.ended} {host.ended_why} {done}"
+            return f"the host was {host.ended} {host.ended_why} {progress}"
         case _:
-            return f"the run ended {done}: {host.ended_why}"
+            return f"the run ended {progress}: {host.ended_why}"
 
 
 def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float, *, finished: bool) -> str:
@@ -36,12 +36,12 @@ def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float
     for fault in host.faults:
         if fault.reach == "robot":
             return fault.cause
-    done = f"after {recorded_s:.2f} of {config.duration_s:g} s"
+    progress = f"after {recorded_s:.2f} of {config.duration_s:g} s"
     half_tick_s = 0.5 / config.rate_hz
     if recorded_s > config.duration_s - half_tick_s:
         return COMPLETE
     if not finished:
-        return f"{UNKNOWN}the recording breaks off {done}"
+        return f"{UNKNOWN}the recording breaks off {progress}"
     if host.lifecycle == "armed":
-        return f"{UNKNOWN}the recording was ended {done}, with the robot armed"
-    return f"{host.lifecycle} ({host.reason}) {done}"
+        return f"{UNKNOWN}the recording was ended {progress}, with the robot armed"
+    return f"{host.lifecycle} ({host.reason}) {progress}"

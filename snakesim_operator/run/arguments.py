@@ -22,7 +22,7 @@ from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.recording.message import RAW_ONLY
 
 if TYPE_CHECKING:
-    from snakesim_hal.base.step_limit import Pulse
+    from snakesim_hal.base.step_limit import SharedStepTimes
     from snakesim_hal.model.scenario import RunConfig
 
 
@@ -66,7 +66,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.in_process:
         from snakesim_operator.run.guarded_process import run_guarded  # before anything large is loaded
 
-        return run_guarded(lambda pulse: _run_in_process(arguments, pulse), owns_process=arguments.owns_process)
+        return run_guarded(
+            lambda step_times: _run_in_process(arguments, step_times), owns_process=arguments.owns_process
+        )
     config = _config_of(arguments)
 
     from snakesim_operator.run.run import RunRequest, run
@@ -90,7 +92,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return run(request)
 
 
-def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
+def _run_in_process(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
     config = _config_of(arguments)
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
@@ -105,7 +107,7 @@ def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int
         tune_garbage_collector()  # what has been imported by now is never garbage
     with tolerate_failed_output():
         return run_in_process(
-            config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only, pulse=pulse
+            config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only, step_times=step_times
         )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from snakesim_hal.base.process import die_with_parent, limit_memory, stop_signals
-from snakesim_hal.base.step_limit import Pulse
+from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_stderr
 
 CHECK_PERIOD_S = 0.25
@@ -25,13 +25,13 @@ EXIT_INTERRUPTED = 130  # as shells report a program that Ctrl-C has ended
 RECORD_HINT = "What was recorded until then is in the run's folder; `snakesim recording report FOLDER` shows it"
 
 
-def run_guarded(act: Callable[[Pulse | None], int], *, owns_process: bool) -> int:
+def run_guarded(act: Callable[[SharedStepTimes | None], int], *, owns_process: bool) -> int:
     """Call a function in a child process, which this process can end whatever the function does.
 
     Args:
-        act: the function; gets the pulse by which it shows its progress, and returns an exit code.
+        act: the function; gets the step times by which it shows its progress, and returns an exit code.
         owns_process: whether this process does nothing else. If it does, it must not be forked, and the function is
-            called in this process, without a pulse.
+            called in this process, without step times.
 
     Returns:
         The exit code of the command.
@@ -40,23 +40,23 @@ def run_guarded(act: Callable[[Pulse | None], int], *, owns_process: bool) -> in
         return act(None)
     sys.stdout.flush()
     sys.stderr.flush()
-    pulse = Pulse()
+    step_times = SharedStepTimes()
     command = os.getpid()
     child = os.fork()
     if child != 0:
-        return _Guard(child, pulse).wait()
+        return _Guard(child, step_times).wait()
     os.setsid()  # Ctrl-C then reaches the command alone, which forwards it
     die_with_parent(command)
     limit_memory()
-    return act(pulse)
+    return act(step_times)
 
 
 class _Guard:
     """Waits for the child in the process of the command, forwards signals to it, and kills it if it does not react."""
 
-    def __init__(self, child: int, pulse: Pulse) -> None:
+    def __init__(self, child: int, step_times: SharedStepTimes) -> None:
         self._child = child
-        self._pulse = pulse
+        self._step_times = step_times
         self._signalled_s: float | None = None
         self._handle = os.pidfd_open(child)
         for number in stop_signals():
@@ -99,7 +99,7 @@ class _Guard:
 
     def _find_kill_reason(self) -> str:
         """Return why the child is to be killed; empty while it makes progress."""
-        step_s = self._pulse.read_step_times()
+        step_s = self._step_times.read_step_times()
         if step_s is None:
             return ""
         began_s, due_s = step_s

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.base.arithmetic import is_pinned
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError
-from snakesim_hal.base.step_limit import Pulse
+from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_line, print_stderr
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.plugins import anything_offered
@@ -179,7 +179,7 @@ def run_in_process(
     give_up_s: float | None = None,
     record: bool = True,
     raw_only: bool = False,
-    pulse: Pulse | None = None,
+    step_times: SharedStepTimes | None = None,
 ) -> int:
     """Run a configuration for `snakesim run --in-process`, with progress and results on the terminal.
 
@@ -190,7 +190,7 @@ def run_in_process(
         give_up_s: as for `simulate`.
         record: whether to record all messages.
         raw_only: whether the recording is without topics for viewers.
-        pulse: shows another process whether the run makes progress.
+        step_times: shows another process whether the run makes progress.
 
     Returns:
         The exit code, as of a run in processes.
@@ -211,7 +211,7 @@ def run_in_process(
                     until_goal=until_goal,
                     give_up_s=give_up_s,
                     raw_only=raw_only,
-                    pulse=pulse,
+                    step_times=step_times,
                 )
             return conclude(config, files, ending, outcome)
 
@@ -230,7 +230,7 @@ def _run_to_end(
     until_goal: bool,
     give_up_s: float | None,
     raw_only: bool,
-    pulse: Pulse | None = None,
+    step_times: SharedStepTimes | None = None,
     turn_limit_s: float | None = None,
 ) -> tuple[InProcessRun, Outcome, bool]:
     """Run a configuration until it is over, with its record and its recording.
@@ -244,13 +244,13 @@ def _run_to_end(
         until_goal: as for `simulate`.
         give_up_s: as for `simulate`.
         raw_only: whether the recording is without topics for viewers.
-        pulse: shows another process whether the run makes progress.
+        step_times: shows another process whether the run makes progress.
         turn_limit_s: as for `simulate`.
 
     Returns:
         The run, what is known of it, and whether it was ended because the robot was stuck.
     """
-    run = InProcessRun(config, pulse, turn_limit_s)
+    run = InProcessRun(config, step_times, turn_limit_s)
     ending.on_interrupt = run.hurry
     with contextlib.redirect_stderr(_LogWriter(files)), run:
         host = run.host

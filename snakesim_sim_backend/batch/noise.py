@@ -72,8 +72,8 @@ class NoiseStreams:
             raise ValueError(f"{count} numbers at once; at most {BLOCK}")
         for robot, used in enumerate(self._next.tolist()):
             row = self._numbers[robot]
-            kept = BLOCK - used
-            row[:kept] = row[used:].copy()
-            row[kept:] = self._random[robot].standard_normal(used)
+            unused_count = BLOCK - used
+            row[:unused_count] = row[used:].copy()
+            row[unused_count:] = self._random[robot].standard_normal(used)
         self._next[:] = 0
         self._left = BLOCK

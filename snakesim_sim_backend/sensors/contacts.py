@@ -54,7 +54,11 @@ class ContactReader:
         )
 
     def _measure_contact(self, touch: Touch) -> Contact:
-        """Return a contact in the frame of its link, with noise."""
+        """Return a contact in the frame of its link, with noise on its position and its force.
+
+        Args:
+            touch: place, normal and force of the contact in the world, without noise.
+        """
         rotation = self._rotations[touch.link].tolist()  # world_from_link, row by row
         ox, oy, oz = self._origins[touch.link].tolist()
         x, y, z = touch.position_w

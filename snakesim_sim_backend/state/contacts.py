@@ -40,7 +40,7 @@ class TouchReader:
         self._link_of_geom: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
 
     def read(self) -> Iterator[Touch]:
-        """Yield all contacts of links with obstacles, in MuJoCo's order."""
+        """Yield all contacts of links with obstacles, with their places and forces in the world, in MuJoCo's order."""
         obstacle_geoms = self._obstacle_geoms
         pairs = self._forces.geom_pairs
         touching = self._find_touching(pairs)

@@ -190,7 +190,7 @@ class _JogSession:
             f"{joint.name}: from {target.lower_rad:+.3f} to {target.upper_rad:+.3f} rad, at {target.target_rad:+.3f}. "
             f"{HELP}"
         )
-        moved = False
+        was_moving = False
         while not self._stop_requested and not keyboard.gone:
             for key in keyboard.keys(0.0):
                 if key == "q":
@@ -200,9 +200,9 @@ class _JogSession:
             if clock.lifecycle != "armed":
                 self._read_status()
                 raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.reason}", code="robot/not-armed")
-            if moved and not target.moves:
+            if was_moving and not target.moves:
                 print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
-            moved = target.moves
+            was_moving = target.moves
 
     def _cycle(self) -> Clock:
         """Wait for the next tick and return it. If this process holds the lease, command the joint in it.

@@ -21,7 +21,7 @@ from snakesim_hal.programs.commands import Command, Commands
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from snakesim_hal.base.step_limit import Pulse
+    from snakesim_hal.base.step_limit import SharedStepTimes
 
 MAX_TITLE_CHARACTERS = 200  # of a suite
 
@@ -112,22 +112,24 @@ def _sweep(arguments: argparse.Namespace) -> int:
     return _guarded_if_one_run(arguments, _sweep_with)
 
 
-def _guarded_if_one_run(arguments: argparse.Namespace, act: "Callable[[argparse.Namespace, Pulse | None], int]") -> int:
+def _guarded_if_one_run(
+    arguments: argparse.Namespace, act: "Callable[[argparse.Namespace, SharedStepTimes | None], int]"
+) -> int:
     """Run a command; with `--only` in a child process, which can be ended whatever its controller does."""
     _check_extra()
     if arguments.only is None:
         return act(arguments, None)
     from snakesim_operator.run.guarded_process import run_guarded
 
-    return run_guarded(lambda pulse: act(arguments, pulse), owns_process=arguments.owns_process)
+    return run_guarded(lambda step_times: act(arguments, step_times), owns_process=arguments.owns_process)
 
 
-def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
+def _evaluate_with(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
     """Run `snakesim study evaluate`, and return its exit code.
 
     Args:
         arguments: The parsed command line.
-        pulse: Shows another process that a single run makes progress; None if no process watches.
+        step_times: Shows another process that a single run makes progress; None if no process watches.
     """
     from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
     from snakesim_operator.features.evaluate.suite import override_suite, read_suite
@@ -155,15 +157,15 @@ def _evaluate_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
         against=arguments.against,
         **_shared_values(arguments, command),
     )
-    return evaluate(request, pulse)
+    return evaluate(request, step_times)
 
 
-def _sweep_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
+def _sweep_with(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
     """Run `snakesim study sweep` as the evaluation of a suite that varies one scenario, and return its exit code.
 
     Args:
         arguments: The parsed command line.
-        pulse: Shows another process that a single run makes progress; None if no process watches.
+        step_times: Shows another process that a single run makes progress; None if no process watches.
     """
     from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
     from snakesim_operator.features.evaluate.suite import Suite, parse_vary
@@ -190,7 +192,7 @@ def _sweep_with(arguments: argparse.Namespace, pulse: "Pulse | None") -> int:
         fields=arguments.seeds,
         **_shared_values(arguments, command),
     )
-    return evaluate(request, pulse)
+    return evaluate(request, step_times)
 
 
 def _shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[str, Any]:

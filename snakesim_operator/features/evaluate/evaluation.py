@@ -11,7 +11,7 @@ import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.base.process import stop_signals_raise
-from snakesim_hal.base.step_limit import Pulse
+from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
@@ -56,18 +56,18 @@ class EvaluationRequest:
     workers: int | None = None
 
 
-def evaluate(request: EvaluationRequest, pulse: Pulse | None = None) -> int:
+def evaluate(request: EvaluationRequest, step_times: SharedStepTimes | None = None) -> int:
     """Run all cases of an evaluation that have no result yet, or one case as a run with its own folder.
 
     Args:
         request: the cases, the output folder, and the options of the command.
-        pulse: shows another process that a single run makes progress; None if no process watches.
+        step_times: shows another process that a single run makes progress; None if no process watches.
 
     Returns:
         The exit code: 0; 1 if a case could not run; 130 if the operator stopped it. Finished cases are never lost.
     """
     if request.only is not None:
-        return _run_one_case(request, request.only, pulse)
+        return _run_one_case(request, request.only, step_times)
     with stop_signals_raise():
         try:
             return _run_all_cases(request)
@@ -138,12 +138,12 @@ def choose_first_field(request: EvaluationRequest) -> int:
     return seed
 
 
-def _run_one_case(request: EvaluationRequest, only: str, pulse: Pulse | None) -> int:
+def _run_one_case(request: EvaluationRequest, only: str, step_times: SharedStepTimes | None) -> int:
     """Run one case in this process, with the whole folder of a run. Return the exit code of `snakesim run`."""
     case = find_case(request.suite, request.source, only)
     print_line(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
-    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, pulse=pulse)
+    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, step_times=step_times)
 
 
 def find_case(suite: Suite, source: str, only: str) -> Case:

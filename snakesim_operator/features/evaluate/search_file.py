@@ -91,12 +91,12 @@ def open_study(path: Path, command: SearchCommand) -> Study:
         path.parent.mkdir(parents=True, exist_ok=True)
         storage = _storage_in(path)
         summaries = optuna.get_all_study_summaries(storage)
-        begun = [summary for summary in summaries if summary.n_trials or COMMAND in summary.user_attrs]
-        if not begun:
+        started_searches = [summary for summary in summaries if summary.n_trials or COMMAND in summary.user_attrs]
+        if not started_searches:
             for summary in summaries:  # of a process that was killed before its first trial
                 optuna.delete_study(study_name=summary.study_name, storage=storage)
             return _begin_study(storage, command)
-        stored = begun[0]
+        stored = started_searches[0]
         _check_same_search(path, stored.user_attrs.get(COMMAND), command)
         study = optuna.load_study(study_name=stored.study_name, storage=storage)
     except STORAGE_ERRORS as error:

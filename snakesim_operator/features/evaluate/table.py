@@ -79,7 +79,7 @@ class ResultRow:
 
     @property
     def cells(self) -> list[str]:
-        """The texts of this row, below HEAD."""
+        """Return the texts of this row of the table of results, one for each heading in HEAD; some are UNKNOWN."""
         duration = "crossed_s" if self.crossed else "duration_s"
         return [
             self.setting,

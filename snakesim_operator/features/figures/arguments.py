@@ -8,7 +8,7 @@ from snakesim_operator.playback.arguments import add_span
 
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim recording plot`."""
+    """Add the options of `snakesim recording plot`, which draws signals, paths or the figures of the paper."""
     parser.add_argument(
         "arguments",
         nargs="+",
@@ -39,7 +39,7 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    """Run `snakesim recording plot`, and return its exit code."""
+    """Run `snakesim recording plot`: draw signals of one or several runs into a file. Return the exit code."""
     from snakesim_operator.base import extras
 
     extras.require("report", "`snakesim recording plot`")

@@ -151,7 +151,16 @@ def _draw_joints(
     span_s: tuple[float, float],
     plot_signal: DrawSignal,
 ) -> Figure:
-    """Draw a signal of some joints over time, with an arrow over each interval in which the joint propelled."""
+    """Draw a signal of some joints over time, with an arrow over each interval in which the joint propelled.
+
+    Args:
+        record: What was recorded of the run.
+        joints: Indices of the joints, one for each pair of axes.
+        intervals: Which joint propelled when.
+        width_in: Width of the figure in inches.
+        span_s: Begin and end of the part of the run to draw, in s on the time axis.
+        plot_signal: Plots the signal of one joint into a pair of axes.
+    """
     figure = Figure((width_in, 1.25 * len(joints) + 0.3))
     all_axes = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
     for axes, joint, letter in zip(all_axes, joints, "abcd", strict=False):

@@ -181,10 +181,10 @@ def _check_router(name: str, lab: Lab, folder: Path, findings: Findings) -> bool
     except NotConnectedError as error:
         findings.failed(f"{name}: {endpoint} lets {client.common_name} not in: {error}")
         return True
-    shown = _read_shown_certificate(endpoint, settings["transport"]["link"]["tls"])
+    presented = _read_shown_certificate(endpoint, settings["transport"]["link"]["tls"])
     stored = read_certificate(_certificate_path(router, folder))
-    if shown.serial_number != stored.serial_number:
-        _check_expiry(f"{name} shows an earlier certificate", shown, f"restart it on {router.machine}", findings)
+    if presented.serial_number != stored.serial_number:
+        _check_expiry(f"{name} shows an earlier certificate", presented, f"restart it on {router.machine}", findings)
     _check_refuses_unknown_clients(name, settings, findings)
     return True
 

@@ -119,14 +119,14 @@ def _values_of_other(urdf: Element, order: ImportOptions) -> Table:
 def _exported_values(urdf: Element) -> Table:
     """Return the values in <snakesim> elements, as an export has written them. Raises ConfigError."""
     table = Table({}, urdf.source)
-    seen: set[str] = set()
+    read_keys: set[str] = set()
     for element in urdf.all("snakesim"):
         key = element.get("key")
         if key.partition(".")[0] in GEOMETRY:
             raise element.error(f"has `key` = {shorten(key)!r}, which links and joints contain; remove this element")
-        if key in seen:
+        if key in read_keys:
             raise element.error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
-        seen.add(key)
+        read_keys.add(key)
         try:
             table.set_value(key, json.loads(element.get("value")), urdf.source)
         except ValueError as error:

@@ -74,18 +74,18 @@ def _describe_rates(a: RunRecord, b: RunRecord) -> str:
 
 def _sample_joints(record: RunRecord, time_s: Floats, grid: Floats) -> Joints:
     """Return what the joints of a run did at the times of a grid, (n,)."""
-    held = np.searchsorted(time_s, grid + SAME_INSTANT_S, side="right") - 1
-    on_grid = np.allclose(time_s[held], grid, rtol=0, atol=SAME_INSTANT_S)
+    newest_rows = np.searchsorted(time_s, grid + SAME_INSTANT_S, side="right") - 1
+    on_grid = np.allclose(time_s[newest_rows], grid, rtol=0, atol=SAME_INSTANT_S)
 
     def sample(series: Floats) -> Floats:
         if on_grid:
-            return series[held]
+            return series[newest_rows]
         return np.column_stack([np.interp(grid, time_s, column) for column in series.T])
 
     return Joints(
         angle_rad=sample(record.angle_rad),
         velocity_rad_s=sample(record.velocity_rad_s),
         torque_nm=sample(record.torque_nm),
-        mode=record.mode[held],
-        target=record.target[held],
+        mode=record.mode[newest_rows],
+        target=record.target[newest_rows],
     )

@@ -64,7 +64,17 @@ class Displacement:
 
     @staticmethod
     def from_run(record: RunRecord, advance: Advance | None, known_s: float, *, has_power: bool) -> "Displacement":
-        """Compute speed, energy use and slip along the net displacement. The arguments are those of HeadingEffort."""
+        """Compute speed, energy use and slip along the net displacement of the center of mass.
+
+        Args:
+            record: The recorded run.
+            advance: How the run advanced; None: the pose is unknown.
+            known_s: Time within which the pose was known, in s.
+            has_power: Whether torques and speeds are known, so that the energy can be computed.
+
+        Returns:
+            The values. All are None if the pose is unknown; those of energy are None without power.
+        """
         if advance is None or known_s <= 0:
             return Displacement()
         displacement_w = advance.center_w[-1] - advance.center_w[0]

@@ -72,16 +72,16 @@ def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
 @pytest.fixture
 def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
     """A disk that hangs until the event is set."""
-    goes_on, write = Event(), under_test.write_atomically
+    should_continue, write = Event(), under_test.write_atomically
 
     def slow(path: Path, content: bytes, *, durable: bool = False) -> None:
-        goes_on.wait(30)
+        should_continue.wait(30)
         write(path, content, durable=durable)
 
     monkeypatch.setattr(under_test, "write_atomically", slow)
     monkeypatch.setattr(under_test, "ANSWER_LIMIT_S", 0.3)
-    yield goes_on
-    goes_on.set()
+    yield should_continue
+    should_continue.set()
 
 
 def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Event) -> None:

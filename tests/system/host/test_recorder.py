@@ -100,7 +100,7 @@ class Disk:
     """A disk that takes `space` bytes of rows, and is then full, or hangs; everything else goes its way."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
-        self.space, self.hangs, self.goes_on = 2**30, False, Event()
+        self.space, self.hangs, self.should_continue = 2**30, False, Event()
         self.is_hanging = Event()
         self._memory, self._pwrite = memory, os.pwrite
         monkeypatch.setattr(under_test.os, "pwrite", self.pwrite)
@@ -113,7 +113,7 @@ class Disk:
         if room == 0 and content:
             if self.hangs:
                 self.is_hanging.set()
-                self.goes_on.wait(30)
+                self.should_continue.wait(30)
             raise OSError(errno.ENOSPC, "No space left on device")
         return self._pwrite(handle, content[:room], offset)
 
@@ -182,7 +182,7 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
             run.arm()
             wait_until(run.ended, "the end of the run")
             assert disk.is_hanging.wait(5.0)
-        assert not disk.goes_on.is_set()  # neither the run nor its recorder's end waited for it
+        assert not disk.should_continue.is_set()  # neither the run nor its recorder's end waited for it
         assert run.host.ended == "complete"
         assert not run.host.authority.faults
     last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
@@ -190,7 +190,7 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     assert last.armed_ticks == 75
     assert 0 < last.lost_ticks < 75
     assert "has not answered" in last.failure
-    disk.goes_on.set()
+    disk.should_continue.set()
 
 
 def test_without_a_folder_only_the_memory_knows(memory: int) -> None:

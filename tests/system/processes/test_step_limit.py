@@ -5,7 +5,7 @@ from contextlib import closing
 
 import pytest
 
-from snakesim_hal.base.step_limit import Pulse, StepLimit, StepTooLongError, describe_interrupted_line
+from snakesim_hal.base.step_limit import SharedStepTimes, StepLimit, StepTooLongError, describe_interrupted_line
 
 
 def endless() -> None:
@@ -46,11 +46,11 @@ def test_an_error_that_was_not_raised_yet_is_taken_back() -> None:
 
 
 def test_another_process_can_see_when_a_step_began() -> None:
-    pulse = Pulse()
-    with closing(StepLimit(60.0, pulse)) as limit:
-        assert pulse.read_step_times() is None
+    step_times = SharedStepTimes()
+    with closing(StepLimit(60.0, step_times)) as limit:
+        assert step_times.read_step_times() is None
         with limit:
-            step_s = pulse.read_step_times()
+            step_s = step_times.read_step_times()
             assert step_s is not None
             assert step_s[1] - step_s[0] == pytest.approx(60.0)
-        assert pulse.read_step_times() is None
+        assert step_times.read_step_times() is None
