@@ -61,8 +61,8 @@ wheels explains the difference, not the model of a wheel. The longer the wave, t
 ## Cost
 
 CPU time of one physics step of 2 ms, with a wave of 13 joints, as medians of {rounds} rounds of {steps} steps, on a
-busy machine. The times include what MuJoCo computes. In the Python version, laws that depend on direction cost more than
-isotropic friction, because each foot is computed alone.
+busy machine. The times include what MuJoCo computes. In the Python version, laws that depend on direction cost more
+than isotropic friction, because each foot is computed alone.
 
 {cost}
 """
