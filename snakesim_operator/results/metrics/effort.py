@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.friction import surface_friction
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, Advance, energy_j_per_m
@@ -70,13 +71,15 @@ def weight_n(record: RunRecord) -> float:
 def propulsive_efficiency(record: RunRecord, cost_of_transport: float | None) -> float | None:
     """Return the energy that dragging the robot over flat ground costs, over the energy that its joints used.
 
-    Dragging costs the weight times the friction. None: the cost of transport is unknown, or the ground is not flat.
+    Dragging costs the weight times the friction of sliding forward. None: the cost of transport is unknown, or the ground is not flat.
     """
     ground = record.config.scene.ground
     is_flat = ground.heightfield is None
     if cost_of_transport is None or cost_of_transport <= 0 or not is_flat:
         return None
-    return ground.friction / cost_of_transport
+    robot = record.config.robot
+    friction = surface_friction(ground.friction, ground, robot.skin, robot.wheels)
+    return friction.forward / cost_of_transport
 
 
 def _cost_of_transport(record: RunRecord, advance: Advance) -> float | None:
