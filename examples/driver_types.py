@@ -9,7 +9,7 @@ DURATION_S = float(sys.argv[1]) if len(sys.argv) > 1 else 8.0
 CONTROLLER = {"controller": sys.argv[2]} if len(sys.argv) > 2 else {}  # such as ./mine.py:Mine; else the scenario's
 
 simulated = None
-for backend in ("sim", "can", "odrive", "moteus", "dynamixel", "mixed"):
+for backend in ("sim", "can", "odrive", "moteus", "cia402", "dynamixel", "mixed"):
     robot = "planar13_mixed" if backend == "mixed" else "planar13"
     run = snakesim.run("triplet", duration=DURATION_S, backend=backend, set={"robot": robot}, **CONTROLLER)
     simulated = run if simulated is None else simulated

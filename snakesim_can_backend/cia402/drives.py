@@ -172,8 +172,9 @@ class Cia402Drives(CanDrives):
         servo = self.servos[i]
         servo.state = state
         self.readings.mark_checked(i)
-        if state == PowerState.ENABLED:
+        if state == PowerState.ENABLED and servo.is_stepping:
             servo.is_stepping = False
+            servo.has_arrived = True
         if state not in FAULT_STATES:
             servo.emergency = None
         self.states.note_report(i, enabled=state == PowerState.ENABLED, state=f"in the state {state.value!r}")
@@ -450,10 +451,12 @@ class Cia402Drives(CanDrives):
     def send_command(self, i: int, command: DriveCommand) -> None:
         """Let a drive step towards Operation enabled, switch it off, or stop it by its quick stop."""
         servo = self.servos[i]
-        servo.is_stepping = command == "follow"
+        if command == "follow":  # the next setpoints carry the commands
+            servo.is_stepping = not servo.has_arrived
+            return
+        servo.is_stepping = False
+        servo.has_arrived = False
         match command:
-            case "follow":
-                return  # the next setpoints carry the commands
             case "idle":
                 self._send_off(i, Control.DISABLE_VOLTAGE)
             case "stop":

@@ -49,6 +49,7 @@ class Servo:
     health: dict[Entry, int] = field(default_factory=dict[Entry, int])
     # What the driver does with it.
     is_stepping: bool = False  # towards Operation enabled
+    has_arrived: bool = False  # there, since it was switched off last: from then on it gets no further steps
     resets_fault: bool = False  # with the next configuration
     quick_stop_ns: int | None = None  # when it first reported the present quick stop
 

@@ -69,12 +69,16 @@ def test_external_modules_are_detected_and_driven_in_real_time(machine: Machine,
 @pytest.mark.quiet
 @pytest.mark.parametrize(
     ("driver_type", "command", "of"),
-    [pytest.param("odrive", "odrive", "axes", marks=pytest.mark.slow), ("moteus", "moteus", "controllers")],
+    [
+        pytest.param("odrive", "odrive", "axes", marks=pytest.mark.slow),
+        ("moteus", "moteus", "controllers"),
+        pytest.param("cia402", "cia402", "CiA 402 drives", marks=pytest.mark.slow),
+    ],
 )
 def test_external_drives_are_driven_as_mounted_in_robot_file(
     machine: Machine, tmp_path: Path, driver_type: str, command: str, of: str
 ) -> None:
-    """ODrives on classic CAN; moteus on CAN FD, with ids of 29 bits."""
+    """ODrives and CiA 402 drives on classic CAN; moteus on CAN FD, with ids of 29 bits."""
     built = ("robot.joints.joint_2.sign=-1", "robot.joints.joint_5.zero_rad=0.4")
     gains = ("backend.kp_nm_per_turn=1000", "backend.kd_nm_s_per_turn=100") if driver_type == "moteus" else ()
     sets = [word for text in (*built, *gains) for word in ("--set", text)]

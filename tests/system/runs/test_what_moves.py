@@ -49,7 +49,7 @@ def opened(config: RunConfig) -> Any:
     return factory(config, backend_settings(config, factory))
 
 
-@pytest.mark.parametrize("backend", ["can", "odrive", "moteus", "dynamixel", "mixed"])
+@pytest.mark.parametrize("backend", ["can", "odrive", "moteus", "cia402", "dynamixel", "mixed"])
 def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
     robot = opened(configured(backend))
     try:

@@ -89,6 +89,16 @@ def test_drive_that_leaves_operation_enabled_by_itself_stays_off(robot: Robot) -
     assert robot.drives[0].state == PowerState.SWITCH_ON_DISABLED
 
 
+def test_drive_that_leaves_operation_enabled_at_once_gets_no_second_chance(robot: Robot) -> None:
+    robot.run(5, "armed")
+    assert robot.drives[0].state == PowerState.ENABLED
+    robot.drives[0].state = PowerState.SWITCH_ON_DISABLED
+    robot.sent.clear()
+    faults = robot.run(70, "armed")
+    assert [(fault.what, fault.joint) for fault in faults] == [("drive_not_armed", "joint_1")]
+    assert Control.SHUTDOWN not in robot.controls(0)
+
+
 def test_fault_is_reset_by_the_operator_alone(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     robot.run(20, "armed")
     robot.driver._emulator._fail(0, Emergency(0x3210, 0x05))
@@ -179,11 +189,7 @@ def test_drive_with_unfitting_limits_is_refused_at_the_start(mounted: dict[str, 
     [
         ("[6007]\n", "[2007]\n", {}),
         ("[1A00sub2]\n", "[1A00sub9]\n", {}),
-        (
-            "ParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0006\nAccessType=rw",
-            "DataType=6\nAccessType=ro",
-            {},
-        ),
+        (HEARTBEAT_TIME + "rw", HEARTBEAT_TIME + "ro", {}),
     ],
     ids=["no abort connection option", "short mapping", "heartbeat not writable"],
 )

@@ -134,7 +134,7 @@ def test_each_mapping_is_written_while_off_and_read_back() -> None:
 
 @pytest.mark.parametrize(
     ("period_s", "encoded"),
-    [(0.01, (10, -3)), (0.02, (20, -3)), (0.0025, (25, -4)), (1 / 30, (33, -3)), (0.5, (255, -3))],
+    [(0.01, (10, -3)), (0.02, (20, -3)), (0.0025, (25, -4)), (1 / 30, (33, -3)), (0.5, (50, -2))],
 )
 def test_control_period_is_encoded_as_value_and_exponent(period_s: float, encoded: tuple[int, int]) -> None:
     assert encode_cycle(period_s) == encoded

@@ -23,6 +23,7 @@ ROBOTS = {
     "slcan": 'backend = "can"\ncan = ["slcan:/dev/ttyACM0"]',
     "odrive": 'backend = "odrive"\ncan = ["can0"]',
     "moteus": 'backend = "moteus"\ncan = ["can0"]\ndata_bitrate = 2000000',
+    "cia402": 'backend = "cia402"\ncan = ["can0"]\nbitrate = 500000',
     "virtual moteus": 'backend = "moteus"\ncan = ["vcan0"]',
     "dynamixel": f'backend = "dynamixel"\nserial = ["/dev/ttyUSB0", "{BY_ID}"]',
     "mixed": 'backend = "mixed"\ncan = ["can0", "can1"]\nserial = ["/dev/ttyUSB0"]\n'
@@ -35,6 +36,7 @@ BUSES = {  # as the host is to be given them
     "slcan": {"can": {"channels": ["slcan:/dev/ttyACM0"], "bit_rate": 1_000_000}},
     "odrive": {"odrive": {"channels": ["can0"], "bit_rate": 1_000_000}},
     "moteus": {"moteus": {"channels": ["can0"], "bit_rate": 1_000_000, "data_bit_rate": 2_000_000}},
+    "cia402": {"cia402": {"channels": ["can0"], "bit_rate": 500_000}},
     "virtual moteus": {"moteus": {"channels": ["vcan0"], "bit_rate": 1_000_000, "data_bit_rate": 5_000_000}},
     "dynamixel": {"dynamixel": {"ports": ["/dev/ttyUSB0", BY_ID]}},
     "mixed": {
@@ -50,6 +52,7 @@ BRING_UP = {
     "can": {"can0": "type can bitrate 500000 restart-ms", "can1": "type can bitrate 500000 restart-ms"},
     "odrive": {"can0": "type can bitrate 1000000 restart-ms"},
     "moteus": {"can0": CAN_FD.format(2_000_000)},
+    "cia402": {"can0": "type can bitrate 500000 restart-ms"},
     "virtual moteus": {"vcan0": "mtu 72"},
     "mixed": {"can0": "type can bitrate 1000000 restart-ms", "can1": CAN_FD.format(5_000_000)},
 }
