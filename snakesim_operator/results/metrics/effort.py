@@ -71,7 +71,8 @@ def weight_n(record: RunRecord) -> float:
 def propulsive_efficiency(record: RunRecord, cost_of_transport: float | None) -> float | None:
     """Return the energy that dragging the robot over flat ground costs, over the energy that its joints used.
 
-    Dragging costs the weight times the friction of sliding forward. None: the cost of transport is unknown, or the ground is not flat.
+    Dragging costs the weight times the friction of sliding forward. None: the cost of transport is unknown, or the
+    ground is not flat.
     """
     ground = record.config.scene.ground
     is_flat = ground.heightfield is None
