@@ -197,7 +197,7 @@ def _record_session(
     *,
     raw_only: bool,
     after_host: bool,
-    stamps: Stamps,
+    stamps: Stamps = "robot",
 ) -> Recorder:
     """Record the messages of a robot over a session that is open, until the caller ends it or the disk is full.
 
@@ -209,6 +209,7 @@ def _record_session(
         show: Gets each message that is made for viewers.
         raw_only: Whether to record only the messages as on the wire, without those for viewers.
         after_host: Whether to record until the host's last messages have arrived.
+        stamps: The clock of the log times.
 
     Returns:
         The recorder, whose file is closed.
