@@ -7,8 +7,9 @@ from typing import Any
 import canopen
 import pytest
 from canopen.emcy import EmcyError
+from canopen.objectdictionary import ODVariable
 from canopen.profiles.p402 import BaseNode402, OperationMode, State402
-from canopen.sdo import SdoAbortedError
+from canopen.sdo.exceptions import SdoAbortedError
 
 from snakesim_can_backend.can_drives.drives import CanDrivesContext
 from snakesim_can_backend.cia402 import objects
@@ -92,7 +93,7 @@ class Master:
         settings = Cia402Backend.Settings(physics_model="inertia")
         self.emulator: Any = Cia402Backend.emulator_on(CONFIG, settings, [self.wire], self.clock, None)
         self.wire.when_arrived = self.emulator
-        self.node = BaseNode402(1, EDS)
+        self.node: Any = BaseNode402(1, EDS)
         self.wire.network.add_node(self.node)
         self.pass_time(0.02)
 
@@ -136,7 +137,7 @@ def test_bundled_eds_is_read_equally_by_the_library() -> None:
     ours = read_eds(EDS)
     for (index, sub), described in ours.objects.items():
         found: Any = theirs[index]
-        variable = found if isinstance(found, canopen.objectdictionary.ODVariable) else found[sub]
+        variable: Any = found if isinstance(found, ODVariable) else found[sub]
         assert described.size == SIZES[variable.data_type], variable.name
         assert described.mappable == variable.pdo_mappable, variable.name
         assert described.default_value(5) == (variable.default or 0), variable.name
@@ -150,7 +151,7 @@ def test_every_object_of_the_driver_has_the_type_of_the_eds() -> None:
         if not isinstance(entry, objects.Entry):
             continue
         found: Any = theirs[entry.index]
-        variable = found if isinstance(found, canopen.objectdictionary.ODVariable) else found[entry.sub]
+        variable: Any = found if isinstance(found, ODVariable) else found[entry.sub]
         assert (variable.data_type in (2, 3, 4)) == entry.format.islower(), entry.name
         assert SIZES[variable.data_type] == entry.size, entry.name
 
