@@ -338,10 +338,10 @@ def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> No
     try:
         before = live_objects()
         use()
-        left = live_objects() - before
+        # A thread that has been stopped may still be about to end on a busy computer, and holds what it works on.
+        wait_until(lambda: not live_objects() - before, f"nothing left of {live_objects() - before}")
     finally:
         gc.enable()
-    assert not left, left
 
 
 @pytest.mark.slow
