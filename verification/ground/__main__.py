@@ -26,8 +26,8 @@ sideways.
 
 Stiff servos hold the joints to a wave. The momentum balance integrates links in the plane, with friction at the joints
 and ends, and without MuJoCo. A positive number is a motion towards the head. With the slow wave, the simulator agrees
-within 0.3 mm/s, and with wheels within 0.9 mm/s. With the fast wave, dry laws differ by 6 to 9 %, isotropic friction
-included. The balance is planar, and its loads are constant. Which of them causes the difference was not examined.
+within 0.3 mm/s, and with wheels within 0.9 mm/s. With the fast wave, isotropic friction and scales differ by 6
+to 8 %, and the others by less than 1 %. The balance is planar, and its loads are constant. The cause was not examined.
 
 {waves}
 
@@ -56,12 +56,13 @@ friction are the section `[wheels]` of a robot file.
 {wheels}
 
 Both models brake a rolling body equally, and neither creeps by more than 0.1 mm/s. In waves, wheels as bodies are 6 to
-13 % faster. The last column is the momentum balance with the same friction in the middle of the links, where the bodies
-have their wheels. It is slower still, so the position of the wheels is not the reason.
+13 % faster. The last columns are momentum balances with friction in the middle of the links, where the bodies have
+their wheels. With the same law, the balance is slower still. With separate limits along and across a link, it is 1 to
+7 % faster than the bodies.
 
-The likely reason is the law of sliding. A wheel rolls, so its tire slips sideways only, and its whole friction acts
+So the law of sliding is the main reason. A wheel rolls, so its tire slips sideways only, and its whole friction acts
 sideways. In the law of scales, a link that moves forward and slips a little sideways has only the sideways part of the
-velocity's direction. A law with separate limits along and across the link would describe wheels better.
+velocity's direction. A law with separate limits would describe wheels better.
 
 ## Cost
 

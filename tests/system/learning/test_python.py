@@ -21,6 +21,7 @@ from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.signals import UNITS
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.command import call
+from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY, sections
 
@@ -339,7 +340,7 @@ def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> No
         before = live_objects()
         use()
         # A thread that has been stopped may still be about to end on a busy computer, and holds what it works on.
-        wait_until(lambda: not live_objects() - before, f"nothing left of {live_objects() - before}")
+        wait_until(lambda: not live_objects() - before, "a run that leaves no object in memory")
     finally:
         gc.enable()
 
