@@ -140,7 +140,7 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
         self._drive_motor(i)
 
     def _drive_motor(self, i: int) -> None:
-        """Move the emulated body as the setpoint says, with the gains of the joint at the shaft of the drive."""
+        """Move the emulated body by the setpoint, with the gains of the joint at the shaft of the drive."""
         setpoint = self.drives[i].setpoint if self.drives[i].enabled else NO_SETPOINT
         joint = self.body.joints[i]
         gear = joint.drive.gear

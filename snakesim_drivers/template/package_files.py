@@ -74,6 +74,7 @@ SUBJECTS = (
     "lifecycle",
     "limits",
     "modes",
+    "recovery",
     "samples",
     "switching",
 )
