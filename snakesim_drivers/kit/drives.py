@@ -32,6 +32,7 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.start_up import StartUp
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
@@ -52,6 +53,7 @@ class Drives(ABC):
     """The drives of one driver type on one bus. Derive from it, and implement the abstract methods."""
 
     emulated: bool = False  # True: no real motor moves; set by the constructor
+    start_up: StartUp | None = None  # steps that take seconds, made by the constructor; None: bring-up is enough
 
     @abstractmethod
     def bring_up(self) -> None:
