@@ -11,6 +11,7 @@ from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily, DrivesOfModules
+from snakesim_testing.benches.homing_drives import HomingBackend
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 
@@ -75,6 +76,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_joint, drives=KitDrives),
+        Bench("homing-driver", HomingBackend, mute=mute_joint, drives=KitDrives),
         Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("threads", IN_REAL_TIME, sets=ALL_FAMILIES, mute=cut_drive_off, drives=DrivesOfAnyFamily),
     ]
