@@ -19,6 +19,12 @@ Time
     at most `drive_settings.answer_limit_s` for answers, half of that time. A bus that is slower delays neither the host
     nor other buses: its joint states become older, and after one lease they are invalid.
 
+Start-up
+    What takes seconds after `bring_up`, such as homing, goes into `start_up`, as steps with a time limit each. After
+    every `read`, the same thread calls the functions of the steps, each of which returns at once. Until a drive has
+    finished, it is not among `BusCommand.following`, and the robot cannot be armed. In lockstep all steps end before
+    the first control cycle.
+
 Errors
     An exception of any call ends the run safely. The bus first switches its drives off, by `send_setpoints` without
     followers, and then closes. A drive that is silent or reports an error is no exception but a `Finding`.

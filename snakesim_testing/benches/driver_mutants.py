@@ -119,7 +119,7 @@ class HasNoWatchdogAtAll(MinimalEmulator):
 
 @breaks(AFTER_WATCHDOG)
 class HasASlowWatchdog(MinimalEmulator):
-    """Drives switch off, but later than their watchdog's time says."""
+    """Drives switch off, but later than after their watchdog's time."""
 
     def __init__(self, *parts: Any) -> None:
         super().__init__(*parts)
