@@ -21,9 +21,8 @@ from snakesim_drivers.template.minimal_driver import MinimalBackend, MinimalDriv
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-HOMING_US = 400_000.0
 HOMING_RAD_S = 0.05
-HOMING_LIMIT_S = 2.0
+HOMING_MARGIN_S = 1.6  # until homing has failed
 RELEASE_S = 0.04
 ENGAGE_S = 0.02
 
@@ -33,6 +32,9 @@ class HomingSettings(DriveSettings, frozen=True, kw_only=True):
 
     home_at_start: bool = True
     """Whether the drives may move their joints at the start, to find their zeros."""
+
+    homing_s: float = 0.4
+    """Time that the emulated drives need to find their zeros."""
 
 
 class Inputs(NamedTuple):
@@ -61,6 +63,7 @@ class HomingEmulator(MinimalEmulator):
     def __init__(self, *parts: Any) -> None:
         self.extras: list[Extras] = []
         self.dropped: list[int] = []
+        self.homing_us = 0.0  # set by the driver type
         # Set by tests.
         self.without_index: set[int] = set()
         self.torque_off: set[int] = set()
@@ -89,7 +92,7 @@ class HomingEmulator(MinimalEmulator):
         extras = self.extras[i]
         match message:
             case "home":
-                extras.homing_until_us = self.body.now_us + HOMING_US
+                extras.homing_until_us = self.body.now_us + self.homing_us
                 self._drive_motor(i)
             case "stop_homing":
                 extras.homing_until_us = None
@@ -149,7 +152,7 @@ class HomingDrives(MinimalDrives):
         clock_ns: Callable[[], int],
         period_ns: int,
         *,
-        may_move: bool,
+        settings: HomingSettings,
     ) -> None:
         super().__init__(emulator, joints, readings, clock_ns, period_ns)
         self.inputs: list[Inputs | None] = [None] * len(joints)
@@ -157,13 +160,15 @@ class HomingDrives(MinimalDrives):
         self.brakes = HoldingBrakes(len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns)
         homing = StartUpStep(
             "homing",
-            limit_s=HOMING_LIMIT_S,
+            limit_s=settings.homing_s + HOMING_MARGIN_S,
             begin=lambda i: emulator.handle_extra(i, "home"),
             is_done=self.is_homed,
             abort=lambda i: emulator.handle_extra(i, "stop_homing"),
             moves=True,
         )
-        self.start_up: StartUp = StartUp(self.labels, readings, clock_ns, steps=[homing], may_move=may_move)
+        self.start_up: StartUp = StartUp(
+            self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start
+        )
 
     def is_homed(self, i: int) -> bool:
         """Return whether a drive knows its position."""
@@ -216,7 +221,7 @@ class HomingBackend(MinimalBackend):
             clock_ns = context.clock.now_ns
             emulator = HomingEmulator(context.body, clock_ns, context.settings.watchdog_s)
             period_ns = context.config.period_ns
-            may_move = context.settings.home_at_start
-            return HomingDrives(emulator, joints, readings, clock_ns, period_ns, may_move=may_move)
+            emulator.homing_us = context.settings.homing_s * 1e6
+            return HomingDrives(emulator, joints, readings, clock_ns, period_ns, settings=context.settings)
 
         return group_by_port(context.joints, context.settings, ["memory"], open_drives)

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.benches.homing_drives import HOMING_LIMIT_S, HomingBackend, HomingEmulator
+from snakesim_testing.benches.homing_drives import HomingBackend, HomingEmulator
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives
 from snakesim_testing.contract.rig import Rig
@@ -72,7 +72,7 @@ def test_homing_that_fails_names_step_and_reason(rig: Rig) -> None:
     rig.backend.inject(parse_injection("reboot:joint_2@0"), begins=True)
     rig.idle(2 * SECOND)
     rig.reset()
-    rig.idle(round(HOMING_LIMIT_S * SECOND) + SECOND)
+    rig.idle(3 * SECOND)
     assert rig.authority.state == "fault"
     assert "joint_2 (drive 2): homing failed: no index found" in unmet(rig)
     assert "drive_not_ready" in {fault.what for fault in rig.faults}
