@@ -180,6 +180,14 @@ class Backend(ABC):
         """
         return []
 
+    def list_arming_obstacles(self) -> list[str]:
+        """Return why the robot cannot be armed now, a sentence each; empty if nothing of the backend is against it.
+
+        Called in every control cycle after `sample`. For what is no fault, such as a drive that still looks for its
+        zero. The default is empty.
+        """
+        return []
+
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Begin or end an injected fault, where the backend can do so more realistically than the host.
 

@@ -35,6 +35,9 @@ class NoLimiter:
     def observe(self, joints: JointState, now_ns: int) -> None:
         """Ignore the joint states."""
 
+    def observe_obstacles(self, obstacles: list[str]) -> None:
+        """Ignore them: simulated robots are always ready."""
+
     def observe_power(self, power: Power, now_ns: int) -> None:
         """Ignore the power samples."""
 

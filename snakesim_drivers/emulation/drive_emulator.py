@@ -80,6 +80,13 @@ class DriveEmulator(ABC, Generic[BusEndT]):
     def on_step(self, now_us: float) -> None:
         """Let the drives act at a time of their own: watchdogs, heat, and reports that are due."""
 
+    def list_enabled(self) -> list[bool]:
+        """Return for each drive whether it would follow a setpoint now; the contract suite looks at it.
+
+        The default is for emulators that the contract suite knows.
+        """
+        raise NotImplementedError(f"{type(self).__name__}.list_enabled")
+
     def catch_up(self) -> None:
         """Simulate a pause of this process before anything that was sent since then is handled.
 

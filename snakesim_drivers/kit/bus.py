@@ -89,7 +89,7 @@ class InlineBus:
     def send(self, command: BusCommand) -> None:
         """Send setpoints. They replace earlier ones that are not sent yet."""
         self._recover_from_pause()
-        following = self._guard.drives_to_command(command.following, may_enable=command.may_enable)
+        following = self._guard.drives_to_command(self._select_ready(command), may_enable=command.may_enable)
         self.drives.send_setpoints(command._replace(following=following))
 
     def reset_faults(self, joints: frozenset[int]) -> None:
@@ -97,6 +97,8 @@ class InlineBus:
         self._recover_from_pause()
         self._guard.reset(joints)
         self.drives.reset_faults(joints)
+        if self.drives.start_up is not None:
+            self.drives.start_up.reset(joints)
 
     def poll(self) -> None:
         """Receive what has arrived."""
@@ -155,10 +157,23 @@ class InlineBus:
         self.readings.require_check(silent)
         self.readings.count_request()
         self.drives.read()
+        if self.drives.start_up is not None:
+            self.drives.start_up.update()
         self._guard.mark_active()
+
+    def _select_ready(self, command: BusCommand) -> frozenset[int]:
+        """Return the followers of a command whose drives are ready. An emergency stop ends the steps under way."""
+        start_up = self.drives.start_up
+        if start_up is None:
+            return command.following
+        if command.emergency:
+            start_up.abort("emergency stop")
+        return frozenset(i for i in command.following if start_up.is_ready(i))
 
     def _collect_findings(self) -> list[Finding]:
         findings = [*self._early_findings, *self.drives.findings()]
+        if self.drives.start_up is not None:
+            findings += self.drives.start_up.findings()
         self._early_findings = []
         self._guard.note_findings(findings)
         return findings

@@ -27,7 +27,12 @@ class Buses(Drives):
     """All buses of a robot, as one `Drives`. Joints are numbered as in the robot."""
 
     def __init__(
-        self, config: RunConfig, readings: DriveReadings, specs: Sequence[BusSpec], clock_ns: Callable[[], int]
+        self,
+        config: RunConfig,
+        readings: DriveReadings,
+        specs: Sequence[BusSpec],
+        clock_ns: Callable[[], int],
+        pass_time: Callable[[int], None] | None = None,
     ) -> None:
         """Open all buses of a robot; if one cannot be opened, close the others.
 
@@ -36,12 +41,15 @@ class Buses(Drives):
             readings: The readings of the whole robot, which this object fills.
             specs: The buses, which together have every joint once.
             clock_ns: Returns the driver's time.
+            pass_time: In lockstep, lets the driver's time pass by some ns, for start-up; None: time passes by itself.
 
         Raises:
             ConfigError: the settings do not suit a bus.
             BackendError: a bus cannot be opened.
         """
         self._readings = readings
+        self._pass_time = pass_time
+        self._period_ns = config.period_ns
         self._cycles = 0
         self.buses: list[InlineBus] = []
         try:
@@ -64,6 +72,8 @@ class Buses(Drives):
             lines = [line for error in errors for line in error.lines]
             distinct_lines = dict.fromkeys(lines)
             raise BackendError(*distinct_lines, code=errors[0].code)
+        if self._pass_time is not None:
+            self._run_start_up(self._pass_time)
         for bus in self.buses:
             self._readings.copy_from(bus.readings, bus.spec.joints)
 
@@ -154,6 +164,17 @@ class Buses(Drives):
                 closing.callback(bus.close, deadline_s)
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _run_start_up(self, pass_time: Callable[[int], None]) -> None:
+        """In lockstep, run the start-up of all drives to its end: later their time is paused until the robot is armed.
+
+        A drive whose start-up fails is not ready, as in real time.
+        """
+        while any(bus.drives.start_up is not None and bus.drives.start_up.can_continue() for bus in self.buses):
+            pass_time(self._period_ns)
+            for bus in self.buses:
+                bus.request_reading()
+                bus.poll()
 
     def _is_due(self, bus: InlineBus) -> bool:
         return self._cycles % bus.spec.decimation == 0

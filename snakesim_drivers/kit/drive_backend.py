@@ -37,10 +37,15 @@ class DriverClock:
     def __init__(self, config: RunConfig) -> None:
         self._lockstep = config.clock_mode == "lockstep"
         self.robot_ns = 0
+        self._start_up_ns = 0  # that has passed before the robot's time began
 
     def now_ns(self) -> int:
         """Return the present time in ns."""
-        return self.robot_ns if self._lockstep else time.monotonic_ns()
+        return self.robot_ns + self._start_up_ns if self._lockstep else time.monotonic_ns()
+
+    def pass_start_up_time(self, duration_ns: int) -> None:
+        """In lockstep, let time pass in which drives start up: the robot's own time is paused until it is armed."""
+        self._start_up_ns += duration_ns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,6 +179,14 @@ class DriveBackend(Backend):
                 new_findings.append(Finding("stop_not_sent", str(error)))
             self._lifecycle = "fault"  # from now on only a reset ends it, also one before the next control cycle
         return [finding.to_fault(self._tick, self._joint_names) for finding in new_findings]
+
+    def list_arming_obstacles(self) -> list[str]:
+        """Return why the robot cannot be armed: the drives that have not finished their start-up."""
+        obstacles: list[str] = []
+        for i, reason in enumerate(self._readings.not_ready):
+            if reason and i not in self._isolated:
+                obstacles.append(reason)
+        return obstacles
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Begin or end a fault of a bus or of a drive that is emulated here; return False for any other fault.

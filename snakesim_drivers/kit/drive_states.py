@@ -33,6 +33,7 @@ class DriveState:
     state: str = ""  # in the driver type's words
     reported_ns: int = -1
     errors: str = ""  # in words; empty: none
+    safe_torque_off: bool = False  # whether the input of this name keeps the motor off
 
 
 class DriveStates:
@@ -105,7 +106,10 @@ class DriveStates:
         """Return a finding for each drive that reports errors, or that does not follow although it should."""
         findings: list[Finding] = []
         for i, drive in enumerate(self.drives):
-            if drive.errors:
+            if drive.safe_torque_off:
+                cause = f"{drive.label}: its safe-torque-off input is active; release it, then reset and arm"
+                findings.append(Finding("safe_torque_off", cause, i))
+            elif drive.errors:
                 findings.append(Finding("drive_fault", f"{drive.label} reports {drive.errors}", i, alone=True))
             elif drive.should_follow and self._is_settled(drive) and not drive.enabled:
                 cause = f"{drive.label} does not follow: it is {drive.state or 'in an unknown state'}"

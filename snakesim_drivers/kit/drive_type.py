@@ -134,7 +134,8 @@ class BusesBackend(DriveBackend):
                 part_body = body.select(list(part.joints)) if body is not None else None
                 context = DriverTypeContext(config, part.settings, part.joints, clock, part_body)
                 specs += part.driver_type.plan_buses(context)
-            return Buses(config, readings, specs, clock.now_ns)
+            pass_time = clock.pass_start_up_time if config.clock_mode == "lockstep" else None
+            return Buses(config, readings, specs, clock.now_ns, pass_time)
 
         backend_parts = DriveBackendParts(
             name=self.name,

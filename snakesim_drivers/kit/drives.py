@@ -19,6 +19,12 @@ Time
     at most `drive_settings.answer_limit_s` for answers, half of that time. A bus that is slower delays neither the host
     nor other buses: its joint states become older, and after one lease they are invalid.
 
+Start-up
+    What takes seconds after `bring_up`, such as homing, goes into `start_up`, as steps with a time limit each. After
+    every `read`, the same thread calls the functions of the steps, each of which returns at once. Until a drive has
+    finished, it is not among `BusCommand.following`, and the robot cannot be armed. In lockstep all steps end before
+    the first control cycle.
+
 Errors
     An exception of any call ends the run safely. The bus first switches its drives off, by `send_setpoints` without
     followers, and then closes. A drive that is silent or reports an error is no exception but a `Finding`.
@@ -32,6 +38,7 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.start_up import StartUp
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Mode
@@ -52,6 +59,7 @@ class Drives(ABC):
     """The drives of one driver type on one bus. Derive from it, and implement the abstract methods."""
 
     emulated: bool = False  # True: no real motor moves, set by the constructor
+    start_up: StartUp | None = None  # steps that take seconds, made by the constructor; None: bring-up is enough
 
     @abstractmethod
     def bring_up(self) -> None:

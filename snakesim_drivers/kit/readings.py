@@ -49,6 +49,8 @@ class DriveReadings:
         # Identity; empty: the drive does not report it.
         self.serials = [""] * count
         self.firmware = [""] * count
+        # Why a drive is not ready to be armed, for the operator; empty: it is.
+        self.not_ready = [""] * count
         # Requests, by their number.
         self._request = MAX_AWAITED_REQUESTS  # the newest one
         self._motion_request = [0] * count  # the newest one that was answered
@@ -68,6 +70,15 @@ class DriveReadings:
         """
         self.serials[i] = serial or self.serials[i]
         self.firmware[i] = firmware or self.firmware[i]
+
+    def set_not_ready(self, i: int, reason: str) -> None:
+        """Store why the robot cannot be armed because of a drive.
+
+        Args:
+            i: Index of the drive.
+            reason: For the operator, with the name of the drive; empty if it is ready.
+        """
+        self.not_ready[i] = reason
 
     def count_request(self) -> None:
         """Note that all drives are requested to send motion and torque."""
@@ -154,6 +165,7 @@ class DriveReadings:
             self._health_ns[j] = source._health_ns[i]
             self.serials[j] = source.serials[i]
             self.firmware[j] = source.firmware[i]
+            self.not_ready[j] = source.not_ready[i]
 
     # --- drives that may have switched themselves off ---------------------------------------------------------
 

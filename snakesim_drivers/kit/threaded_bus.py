@@ -70,6 +70,7 @@ class ThreadedBus(InlineBus):
         self._error: Exception | None = None
         # Readings.
         self._published = DriveReadings([joints[j] for j in spec.joints], clock_ns)
+        self._published.copy_from(self.readings, range(len(spec.joints)))  # also which drives are not ready yet
         self._request_time_s: float | None = None  # when a reading was requested; None: it is complete
         self._request_pending = False  # requested again meanwhile: the bus reads again at once, at its own rate
         self._read_duration_s = 0.0

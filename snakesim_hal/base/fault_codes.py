@@ -63,6 +63,21 @@ FAULT_CODES = {
     "drive_not_armed": ErrorCode(
         "A drive does not follow, or has stopped by itself.", "It restarted, or has an error.", "Clear, then arm."
     ),
+    "drive_not_ready": ErrorCode(
+        "The start-up of a drive failed, or counts no more.",
+        "The cause names the step, such as homing.",
+        "Correct it, then reset: the start-up begins again.",
+    ),
+    "safe_torque_off": ErrorCode(
+        "The safe-torque-off input of a drive has switched its motor off.",
+        "A safety relay or an emergency stop button.",
+        "Release it, then reset and arm.",
+    ),
+    "limit_switch": ErrorCode(
+        "A joint has reached a limit switch.",
+        "A wrong zero, or a limit outside the travel.",
+        "Reset, and move the joint away from it.",
+    ),
     "duplicate_node": ErrorCode(
         "Two devices have the same id.", "Ids were not changed after delivery.", "Give each device its own id."
     ),

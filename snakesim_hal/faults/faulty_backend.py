@@ -76,6 +76,9 @@ class FaultyBackend(Backend):
     def faults(self) -> list[Fault]:
         return self._inner.faults()
 
+    def list_arming_obstacles(self) -> list[str]:
+        return self._inner.list_arming_obstacles()
+
     def close(self) -> None:
         self._inner.close()
 

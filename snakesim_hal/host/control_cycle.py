@@ -33,6 +33,10 @@ class SafetyCore(Protocol):
         """Take the newest joint state."""
         ...
 
+    def observe_obstacles(self, obstacles: list[str]) -> None:
+        """Take the reasons of the backend why the robot cannot be armed now."""
+        ...
+
     def observe_power(self, power: Power, now_ns: int) -> None:
         """Take the newest power sample."""
         ...
@@ -72,6 +76,7 @@ class ControlCycle(Generic[SafetyCoreT]):
             now_ns: Safety time, in which leases and ages count.
         """
         self.safety.observe(samples.joints, now_ns)
+        self.safety.observe_obstacles(self.backend.list_arming_obstacles())
         power = samples.others.get(keys.POWER)
         if isinstance(power, Power):
             self.safety.observe_power(power, now_ns)

@@ -91,6 +91,10 @@ class GuardedBackend(Backend):
         return self._inner.faults()
 
     @_guarded
+    def list_arming_obstacles(self) -> list[str]:
+        return self._inner.list_arming_obstacles()
+
+    @_guarded
     def close(self) -> None:
         self._inner.close()
 

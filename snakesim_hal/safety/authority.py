@@ -100,6 +100,7 @@ class Authority:
         self._plausibility = PlausibilityCheck(self.limits)
         self._measured = self._plausibility.measured
         self._implausible: ImplausibleState | None = self._unknown_state("no joint state yet")
+        self._backend_obstacles: list[str] = []  # why the backend cannot be armed now
         self._isolation = Isolation(description)
         self._derating = Derating(description, awaits_reports=awaits_reports)
 
@@ -138,6 +139,10 @@ class Authority:
     def observe_power(self, power: Power, now_ns: int) -> None:
         """Process the newest power sample: supply, heat and leaks. `check_deadlines` acts on it."""
         self._derating.update(power, now_ns)
+
+    def observe_obstacles(self, obstacles: list[str]) -> None:
+        """Process why the backend cannot be armed now; empty if nothing is against it."""
+        self._backend_obstacles = obstacles
 
     def replace_unreadable(self, joints: JointState) -> JointState:
         """Return a joint state for publishing: without NaN or infinity."""
@@ -455,6 +460,7 @@ class Authority:
             if fault.what != "undervoltage" and not self._is_of_isolated_joint(fault):
                 reasons.append(fault.cause)
         reasons += self._derating.find_supply_problems(now_ns)
+        reasons += self._backend_obstacles
         if self.arm_session and not self._stop_sent:
             reasons.append("the motors have not received the stop yet; ask again in a period")
         return reasons

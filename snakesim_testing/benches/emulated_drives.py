@@ -1,6 +1,5 @@
 """The emulated drives of a backend under test, for clauses about what drives do without their driver."""
 
-from contextlib import ExitStack
 from typing import Any
 
 from snakesim_can_backend.cia402.emulator import EmulatedCia402
@@ -10,50 +9,60 @@ from snakesim_can_backend.moteus.protocol import MoteusMode
 from snakesim_can_backend.odrive.emulator import EmulatedOdrive
 from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_can_backend.protocol.definitions import ModuleState
+from snakesim_drivers.template.minimal_driver import MinimalDrives, MinimalEmulator
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_testing.can.driver_loop import chain_of
+from snakesim_testing.contract.bench import TorqueSwitch
+from snakesim_testing.contract.kit_drives import KitDrives
 
-POLL_S = 0.02
 
+class DrivesOfAnyFamily(KitDrives):
+    """Drives of the driver types that are part of SnakeSIM."""
 
-class DrivesOfAnyFamily:
-    """Drives of the driver kit, on one bus or on several: a `snakesim_testing.contract.bench.EmulatedDrives`."""
+    def find_emulator(self, drives: Any) -> Any:
+        if isinstance(drives, MinimalDrives):
+            return drives.emulator
+        return drives._emulator
 
-    def __init__(self, backend: Any) -> None:
-        self._backend, self._buses = backend, backend._drives.buses
-
-    def enabled(self) -> list[bool]:
-        found: dict[int, bool] = {}
-        for bus in self._buses:
-            found |= dict(zip(bus.spec.joints, enabled_drives(bus.drives._emulator), strict=True))
-        return [found[joint] for joint in range(len(found))]
-
-    def freeze_driver(self, seconds: float, sleep: Any) -> None:
-        with ExitStack() as held:
-            for bus in self._buses:
-                if hasattr(bus, "_condition"):  # a bus in a thread: it can do nothing without this
-                    held.enter_context(bus._condition)
-            self._backend._clock.robot_ns += round(seconds * 1e9)
-            sleep(seconds)
-            for bus in self._buses:
-                bus.drives._emulator()
+    def list_enabled(self, emulator: Any) -> list[bool]:
+        return enabled_drives(emulator)
 
 
 class DrivesOfModules:
     """Joint modules on a virtual bus."""
 
+    DRIVEN = (ModuleState.ARMED, ModuleState.STOPPING)
+
     def __init__(self, backend: Any) -> None:
+        """Begin to log, whenever modules have been polled, which of them are driven."""
         self._chain = chain_of(backend)
+        self._is_on = self.enabled()
+        self._log: list[TorqueSwitch] = []
+        follow_module = self._chain._follow_module
+
+        def follow_and_log(slot: Any) -> None:
+            follow_module(slot)
+            is_on = slot.module.state in self.DRIVEN
+            if slot.drives and is_on != self._is_on[slot.joint]:
+                self._is_on[slot.joint] = is_on
+                self._log.append(TorqueSwitch(self.now_s(), slot.joint, on=is_on))
+
+        self._chain._follow_module = follow_and_log
 
     def enabled(self) -> list[bool]:
-        driven = ModuleState.ARMED, ModuleState.STOPPING
-        return [slot.module.state in driven for slot in self._chain.slots]
+        return [slot.module.state in self.DRIVEN for slot in self._chain.slots if slot.drives]
 
     def freeze_driver(self, seconds: float, sleep: Any) -> None:
         sleep(seconds)
         assert self._chain._sync_time is not None
         self._chain._step_to(self._chain._sync_time + round(seconds * 1e6))
+
+    def now_s(self) -> float:
+        return self._chain.now_us * 1e-6
+
+    def torque_log(self) -> list[TorqueSwitch]:
+        return list(self._log)
 
 
 def enabled_drives(emulator: Any) -> list[bool]:
@@ -67,5 +76,7 @@ def enabled_drives(emulator: Any) -> list[bool]:
             return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
         case EmulatedDynamixel():
             return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
+        case MinimalEmulator():
+            return emulator.list_enabled()
         case _:
             raise TypeError(f"drives of an unknown driver type: {emulator}")

@@ -7,7 +7,6 @@ import dataclasses
 import random
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -19,21 +18,13 @@ from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
+from snakesim_testing.benches.driver_mutants import DRIVER_MUTANTS
+from snakesim_testing.benches.mutant import Mutant, name_clauses
 from snakesim_testing.benches.workbench import DrivesWorkbench, Workbench, WorkbenchDrives, mute
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.hal.small_robots import pose
 
-
-@dataclass(frozen=True)
-class Mutant:
-    """A broken backend."""
-
-    name: str
-    backend: Any
-    breaks: tuple[str, ...]
-
-
-MUTANTS: list[Mutant] = []
+MUTANTS: list[Mutant] = [*DRIVER_MUTANTS]
 
 
 class Liar(Workbench):
@@ -67,7 +58,11 @@ def breaks(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
 
     def register(broken: Any) -> Any:
         backend = type(broken.__name__, (Liar,), {lie: staticmethod(broken)}) if lie else broken
-        MUTANTS.append(Mutant(backend.__name__, backend, tuple(f"test_{clause}" for clause in clauses)))
+        MUTANTS.append(
+            Mutant(
+                name=backend.__name__, backend=backend, breaks=name_clauses(clauses), mute=mute, drives=WorkbenchDrives
+            )
+        )
         return broken
 
     return register
@@ -549,7 +544,7 @@ class ModulesThatTellThemselvesASimulator(Liar):
 
 def pytest_snakesim_benches() -> list[Bench]:
     """Every mutant on a bench of its own."""
-    return [Bench(mutant.name, mutant.backend, mute=mute, drives=WorkbenchDrives) for mutant in MUTANTS]
+    return [Bench(mutant.name, mutant.backend, mute=mutant.mute, drives=mutant.drives) for mutant in MUTANTS]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

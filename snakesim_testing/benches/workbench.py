@@ -14,6 +14,7 @@ from snakesim_drivers.kit.braking import AT_REST_RAD_S
 from snakesim_drivers.kit.drive_backend import LATCHED_STATES
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
+from snakesim_testing.contract.bench import TorqueSwitch
 
 # Resolution of what `BusWorkbench` sends and measures.
 ANGLE_DECIMALS = 4  # of rad
@@ -89,6 +90,26 @@ class WorkbenchDrives:
 
     def __init__(self, backend: Any) -> None:
         self._backend = backend
+        self._steps = 0
+        self._is_on = self.enabled()
+        self._log: list[TorqueSwitch] = []
+        step = backend.step
+
+        def step_and_log() -> None:
+            step()
+            self._steps += 1
+            for joint, is_on in enumerate(self.enabled()):
+                if is_on != self._is_on[joint]:
+                    self._log.append(TorqueSwitch(self.now_s(), joint, on=is_on))
+            self._is_on = self.enabled()
+
+        backend.step = step_and_log
+
+    def now_s(self) -> float:
+        return self._steps * example.STEP_S
+
+    def torque_log(self) -> list[TorqueSwitch]:
+        return list(self._log)
 
     def enabled(self) -> list[bool]:
         return self._backend.enabled.tolist()

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
@@ -18,6 +18,14 @@ SCENARIO = str(Path(__file__).parent / "scenario.toml")
 Mute = Callable[[Any, int], None]
 
 
+class TorqueSwitch(NamedTuple):
+    """One entry of the drives' own log: a drive has switched its torque."""
+
+    time_s: float  # the drives' own time
+    joint: int
+    on: bool
+
+
 class EmulatedDrives(Protocol):
     """The emulated drives of an open backend, for clauses about what drives do while their driver does nothing."""
 
@@ -30,6 +38,14 @@ class EmulatedDrives(Protocol):
 
         A driver with threads holds them meanwhile. `sleep` waits where the drives' time is that of a clock.
         """
+        ...
+
+    def now_s(self) -> float:
+        """Return the drives' own time, which also passes while their driver does nothing."""
+        ...
+
+    def torque_log(self) -> list[TorqueSwitch]:
+        """Return when drives have switched their torque on and off since this object was made, by `now_s`."""
         ...
 
 

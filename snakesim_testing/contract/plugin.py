@@ -34,6 +34,7 @@ SUBJECTS = (
     "lifecycle",
     "faults",
     "drives",
+    "recovery",
     "host",
     "closing",
 )

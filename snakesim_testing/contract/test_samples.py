@@ -12,9 +12,11 @@ from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.custom_sample import find_custom_message
-from snakesim_hal.wire.messages import MountedSample
+from snakesim_hal.wire.messages import MountedSample, Power
 from snakesim_hal.wire.outgoing import find_wrong_value
 from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract.bench import Bench
+from snakesim_testing.contract.faults import inject_or_skip
 from snakesim_testing.contract.rig import Record, Rig
 
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
@@ -104,3 +106,42 @@ def test_readings_follow_the_motion(healthy: Record) -> None:
     for i in range(angles.shape[1]):
         fresh = len(np.unique(angles[:, i]))
         assert fresh > len(angles) // 3, f"joint {i}: only {fresh} different readings in {len(angles)} ticks"
+
+
+def test_supply_and_temperatures_are_in_volts_and_degrees(bench: Bench, rig: Rig) -> None:
+    """Every joint that measures them reports a voltage near the robot file's, and the temperatures of a cool motor."""
+    power = read_power(rig)
+    for i, joint in enumerate(bench.config.robot.joint_table):
+        name = rig.robot.joints[i].name
+        if "voltage" in rig.robot.joints[i].measures:
+            assert power.valid[i], f"{name} has not reported its supply"
+            difference = abs(power.voltage_v[i] / joint.supply.voltage_v - 1)
+            assert difference <= t.SUPPLY_SHARE, f"{name}: {power.voltage_v[i]} V, on {joint.supply.voltage_v:g} V"
+        if "temperature" in rig.robot.joints[i].measures:
+            for temperature_c in (power.motor_c[i], power.board_c[i]):
+                limit_c = rig.robot.joints[i].derate_from_c
+                assert t.COLDEST_C < temperature_c < limit_c, f"{name}: {temperature_c} °C, and it has not worked yet"
+
+
+def test_a_sagging_supply_is_reported_at_its_joint(rig: Rig) -> None:
+    """The supply of one drive sags: its reported voltage drops, and the robot is stopped."""
+    if "voltage" not in rig.robot.joints[1].measures:
+        pytest.skip(f"{rig.robot.joints[1].name} does not measure its supply")
+    before_v = read_power(rig).voltage_v
+    inject_or_skip(rig, "undervoltage:joint_2@0-9")
+    rig.spoiled = True
+    sagging_v = read_power(rig).voltage_v
+    assert before_v[1] - sagging_v[1] > t.SAG_V, f"it sags from {before_v[1]} V, and is reported as {sagging_v[1]} V"
+    assert rig.authority.state == "fault", "a supply below `min_voltage_v`, and the robot may be armed"
+
+
+def read_power(rig: Rig) -> Power:
+    """Return the newest power sample after every drive had time for a report; skip without a power sensor."""
+    if not any(sensor.key == keys.POWER for sensor in rig.robot.sensors):
+        pytest.skip("this robot has no power sensor")
+    record = rig.idle(rig.count_periods(t.POWER_S))
+    samples = [sample.others[keys.POWER] for sample in record.samples if keys.POWER in sample.others]
+    assert samples, f"no power sample in {t.POWER_S} s"
+    newest = samples[-1]
+    assert isinstance(newest, Power)
+    return newest

@@ -12,6 +12,7 @@ AGE_PERIODS = 1  # every joint is read every tick: a reading is of this tick, or
 LAPSE_PERIODS = 3  # without commands, when setpoints have to hold; less than a lease of five
 SENSOR_PERIODS = 3  # a sensor with its own rate may start late by this much, besides its delay and one interval
 HELD_PERIODS = 5  # how long setpoints have to hold without being handed over again: a lease
+OFF_PERIODS = 4  # from a stop to torque off: transport, and a command that drives confirm
 CLOSING_PERIODS = 5  # for how long a closed backend is observed
 
 # --- mechanics, in seconds -------------------------------------------------------------------------------------
@@ -20,6 +21,8 @@ SETTLE_S = 0.6  # bench4, released at CRUISE, is at rest after 0.3 s; a reached 
 CRUISE_S = 0.3  # long enough to reach CRUISE_RAD_S, short enough to stay inside the limits of the joint
 PUSH_S = 0.5  # against a stop: the impact is over
 FROZEN_S = 1.0  # that a host does nothing: ten times a watchdog
+RESTART_S = 1.0  # a drive that restarts answers again after half a second
+WATCHDOG_OFF_S = 0.25  # from the last setpoint: the watchdog, as long again for modules that brake, and a period
 BRAKES_S = 0.1  # after a fault: the greatest watchdog of the bench's drives
 
 # --- commands --------------------------------------------------------------------------------------------------
@@ -31,6 +34,13 @@ BEYOND_RAD = 1.0  # the stop: the target of a joint that can push only by its po
 PUSH_SHARE = 0.08  # of full torque, in torque mode against the stop
 LIMIT_SHARE = 0.1  # of full torque, as the limit in the setpoints...
 DEMAND_SHARE = 0.25  # ... while velocity mode asks for this much
+
+# --- supply and heat ---------------------------------------------------------------------------------------------
+
+POWER_S = 2.0  # in which every drive has reported supply and temperatures: joint modules take half a second
+SUPPLY_SHARE = 0.2  # of the supply's voltage in the robot file: cables and load
+COLDEST_C = -20.0
+SAG_V = 1.0  # by which a reported supply drops at least if it sags by several volts
 
 # --- tolerances ------------------------------------------------------------------------------------------------
 

@@ -8,11 +8,12 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import Frame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
-from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily, DrivesOfModules
+from snakesim_testing.benches.homing_drives import HomingBackend
 from snakesim_testing.contract.bench import Bench
+from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
 IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs the other clauses, too
@@ -75,7 +76,8 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("cia402", "cia402", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_emulated_drive),
+        Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_joint, drives=KitDrives),
+        Bench("homing-driver", HomingBackend, mute=mute_joint, drives=KitDrives),
         Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("threads", IN_REAL_TIME, sets=ALL_FAMILIES, mute=cut_drive_off, drives=DrivesOfAnyFamily),
     ]
@@ -105,11 +107,6 @@ def cut_off(backend: Any, joint: int) -> None:
             process_frame(frame)
 
     backend.modules.reading.process_frame = receive
-
-
-def mute_emulated_drive(backend: Any, joint: int) -> None:
-    """Let an emulated drive send nothing from now on."""
-    assert backend.inject(parse_injection(f"mute:joint_{joint + 1}@0"), begins=True)
 
 
 def cut_drive_off(backend: Any, joint: int) -> None:

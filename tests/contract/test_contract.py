@@ -8,5 +8,6 @@ from snakesim_testing.contract.test_host import *  # noqa: F403
 from snakesim_testing.contract.test_lifecycle import *  # noqa: F403
 from snakesim_testing.contract.test_limits import *  # noqa: F403
 from snakesim_testing.contract.test_modes import *  # noqa: F403
+from snakesim_testing.contract.test_recovery import *  # noqa: F403
 from snakesim_testing.contract.test_samples import *  # noqa: F403
 from snakesim_testing.contract.test_switching import *  # noqa: F403

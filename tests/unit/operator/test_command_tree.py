@@ -26,7 +26,7 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
         "drive emulate cia402",
         "drive emulate dynamixel",
     ),
-    *("drive replay can", "drive dbc"),
+    *("drive replay can", "drive dbc", "drive new"),
     *("recording report", "recording export", "recording video", "recording plot", "recording rosbag"),
     *("study evaluate", "study sweep", "study optimize", "policy train"),
     *("lab example", "lab render", "lab certs"),

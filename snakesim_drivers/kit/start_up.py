@@ -1,0 +1,200 @@
+"""The start-up of drives that takes seconds: steps with a time limit each, between bring-up and arming.
+
+A driver type makes a `StartUp` in its constructor, as `Drives.start_up`, and lists the steps of a drive in order:
+
+    self.start_up = StartUp(labels, readings, clock_ns, steps=[
+        StartUpStep("configuring", limit_s=1.0, begin=self.write_profile, is_done=self.has_acknowledged),
+        StartUpStep("homing", limit_s=10.0, begin=self.begin_homing, is_done=self.is_homed, abort=self.stop_homing,
+                    moves=True),
+    ], may_move=settings.home_at_start)
+
+The kit then calls `update` after every `read`. All drives go through their steps at the same time. Until a drive has
+finished, the robot cannot be armed, and `snakesim status` and the console name the step: "joint_3 (node 4 on can0):
+homing, 2.1 of 10 s". A step that fails or takes too long is aborted, and is tried again after the operator's reset.
+
+Pure: the clock is passed in.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.readings import DriveReadings
+
+
+class StepFailedError(Exception):
+    """Raised by `StartUpStep.is_done` if a drive reports that the step has failed. The text is the reason."""
+
+
+def do_nothing(_i: int) -> None:
+    """Send nothing."""
+
+
+@dataclass(frozen=True)
+class StartUpStep:
+    """One step of a drive's start-up. All functions get the index of the drive, and return at once."""
+
+    name: str  # as an operator reads it, such as "homing"
+    limit_s: float  # time after which the step has failed
+    begin: Callable[[int], None]  # sends what starts the step
+    is_done: Callable[[int], bool]  # whether the drive has acknowledged it; called in every cycle of the bus
+    abort: Callable[[int], None] = do_nothing  # sends what ends the step, after a failure or an emergency stop
+    moves: bool = False  # True: the drive moves its joint by itself, as in homing
+
+
+@dataclass
+class _Progress:
+    """How far one drive is."""
+
+    step: int = 0  # index of the present step; the number of steps: finished
+    begun_ns: int | None = None  # when the present step began; None: it has not begun
+    failure: str = ""  # why the start-up ended early; empty: it did not
+    is_fault: bool = False  # False: the operator ended it, by an emergency stop
+
+
+class StartUp:
+    """The start-up of all drives on one bus, by their indices on it."""
+
+    def __init__(
+        self,
+        labels: Sequence[str],
+        readings: DriveReadings,
+        clock_ns: Callable[[], int],
+        *,
+        steps: Sequence[StartUpStep],
+        may_move: bool = True,
+    ) -> None:
+        """Begin with drives that are not ready.
+
+        Args:
+            labels: Names of the drives for messages, such as "joint_3 (node 4 on can0)".
+            readings: The readings of these drives, which get the reason why a drive is not ready.
+            clock_ns: The driver's time.
+            steps: What each drive goes through, in order.
+            may_move: Whether steps that move a joint may begin. An operator allows it in the scenario.
+        """
+        self._labels = labels
+        self._readings = readings
+        self._clock_ns = clock_ns
+        self._steps = steps
+        self._may_move = may_move
+        self._progress = [_Progress() for _ in labels]
+        self._publish()
+
+    def update(self) -> None:
+        """Begin the steps that are due, and finish those that the drives have acknowledged."""
+        for i, progress in enumerate(self._progress):
+            if not progress.failure:
+                self._update_drive(i, progress)
+        self._publish()
+
+    def is_ready(self, i: int) -> bool:
+        """Return whether a drive has finished its start-up."""
+        progress = self._progress[i]
+        return progress.step == len(self._steps) and not progress.failure
+
+    def can_continue(self) -> bool:
+        """Return whether a drive is still at a step that neither has failed nor waits for the operator."""
+        for progress in self._progress:
+            is_finished = progress.step == len(self._steps)
+            if not is_finished and not progress.failure and not self._is_forbidden(progress):
+                return True
+        return False
+
+    def lose(self, i: int, reason: str) -> None:
+        """Note that a drive has lost what its start-up has established, as by a restart.
+
+        It is a fault. The start-up begins again after the operator's reset.
+
+        Args:
+            i: Index of the drive.
+            reason: Why, such as "position unknown after a restart".
+        """
+        progress = self._progress[i]
+        if not progress.failure:
+            self._fail(i, progress, reason)
+        self._publish()
+
+    def abort(self, reason: str) -> None:
+        """End all steps that are under way, as after an emergency stop; they begin again after a reset.
+
+        Args:
+            reason: Why, for the operator.
+        """
+        for i, progress in enumerate(self._progress):
+            if progress.begun_ns is not None:
+                step_name = self._steps[progress.step].name
+                self._fail(i, progress, f"{step_name} was aborted: {reason}")
+                progress.is_fault = False
+        self._publish()
+
+    def reset(self, drives: frozenset[int]) -> None:
+        """Begin again, after the operator's reset, with those of these drives whose start-up has failed."""
+        for i in drives:
+            if self._progress[i].failure:
+                self._progress[i] = _Progress()
+        self._publish()
+
+    def findings(self) -> list[Finding]:
+        """Return a finding for each drive whose start-up has failed or counts no more."""
+        findings: list[Finding] = []
+        for i, progress in enumerate(self._progress):
+            if progress.is_fault:
+                findings.append(Finding("drive_not_ready", f"{self._labels[i]}: {progress.failure}", i, alone=True))
+        return findings
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _update_drive(self, i: int, progress: _Progress) -> None:
+        """Begin the present step, or go on to the next one if the drive has acknowledged it."""
+        while progress.step < len(self._steps) and not self._is_forbidden(progress):
+            step = self._steps[progress.step]
+            if progress.begun_ns is None:
+                progress.begun_ns = self._clock_ns()
+                step.begin(i)
+                return  # the answer comes in a later cycle
+            try:
+                is_done = step.is_done(i)
+            except StepFailedError as error:
+                self._fail(i, progress, f"{step.name} failed: {error}")
+                return
+            if not is_done:
+                if self._elapsed_s(progress) > step.limit_s:
+                    self._fail(i, progress, f"{step.name} did not end within {step.limit_s:g} s")
+                return
+            progress.step += 1
+            progress.begun_ns = None
+
+    def _fail(self, i: int, progress: _Progress, failure: str) -> None:
+        """End the present step and the start-up."""
+        if progress.begun_ns is not None:
+            self._steps[progress.step].abort(i)
+            progress.begun_ns = None
+        progress.failure = failure
+        progress.is_fault = True
+
+    def _is_forbidden(self, progress: _Progress) -> bool:
+        if progress.step == len(self._steps):
+            return False
+        return self._steps[progress.step].moves and not self._may_move
+
+    def _elapsed_s(self, progress: _Progress) -> float:
+        begun_ns = progress.begun_ns
+        return 0.0 if begun_ns is None else (self._clock_ns() - begun_ns) * 1e-9
+
+    def _publish(self) -> None:
+        """Put into the readings why each drive is not ready."""
+        for i, progress in enumerate(self._progress):
+            reason = self._describe(progress)
+            self._readings.set_not_ready(i, f"{self._labels[i]}: {reason}" if reason else "")
+
+    def _describe(self, progress: _Progress) -> str:
+        """Return the step and the reason why a drive is not ready; empty if it is."""
+        if progress.failure:
+            return f"{progress.failure}; `snakesim robot reset` begins its start-up again"
+        if progress.step == len(self._steps):
+            return ""
+        step = self._steps[progress.step]
+        if self._is_forbidden(progress):
+            return f"{step.name} moves the joint, and the settings of its driver do not allow that at the start"
+        return f"{step.name}, {self._elapsed_s(progress):.1f} of {step.limit_s:g} s"

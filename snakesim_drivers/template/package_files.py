@@ -1,0 +1,108 @@
+"""The files of a package with a new driver type, by their paths in it."""
+
+import re
+from pathlib import Path
+
+DRIVER = Path(__file__).with_name("minimal_driver.py")
+
+PYPROJECT = """\
+[build-system]
+requires = ["setuptools>=77"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "snakesim-{dashed}"
+version = "0.1.0"
+description = "{title} drives for SnakeSIM"
+requires-python = ">=3.11"
+dependencies = ["snakesim"]
+
+[project.entry-points."snakesim.backends"]
+{name} = "{package}.driver:{title}Backend"
+
+[tool.setuptools]
+packages = ["{package}"]
+
+[tool.pytest.ini_options]
+testpaths = ["tests"]
+pythonpath = ["."]
+addopts = ["--import-mode=importlib", "-p", "snakesim_testing"]
+"""
+
+README = """\
+# {title} drives for SnakeSIM
+
+`{package}/driver.py` has the protocol, emulated drives and the driver. Replace the protocol by that of your drives.
+
+```sh
+python -m pytest                                  # the contract suite of SnakeSIM, on the emulated drives
+snakesim run triplet --backend ./{package}/driver.py:{title}Backend --duration 3
+pip install --editable .                          # then `--backend {name}` is enough
+```
+
+Not tested on hardware.
+"""
+
+INIT = '''"""{title} drives for SnakeSIM."""
+'''
+
+CONFTEST = '''"""The bench on which the contract suite of SnakeSIM tests this driver type."""
+
+import pytest
+
+from {package}.driver import {title}Backend
+from snakesim_testing.contract.bench import Bench
+from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_snakesim_benches():
+    """Return the driver type with its emulated drives."""
+    return [Bench("{name}", {title}Backend, mute=mute_joint, drives=KitDrives)]
+'''
+
+TEST = '''"""The contract suite of SnakeSIM; see its page docs/hardware/contract-suite.md."""
+
+{imports}'''
+
+SUBJECTS = (
+    "closing",
+    "description",
+    "drives",
+    "faults",
+    "host",
+    "lifecycle",
+    "limits",
+    "modes",
+    "recovery",
+    "samples",
+    "switching",
+)
+
+
+def make_package_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a package, by its path in the package's folder.
+
+    Args:
+        name: Of the driver type: lower-case words, joined by underscores.
+    """
+    package = f"{name}_driver"
+    title = "".join(word.capitalize() for word in name.split("_"))
+    imports = "".join(f"from snakesim_testing.contract.test_{subject} import *  # noqa: F403\n" for subject in SUBJECTS)
+    values = {"name": name, "dashed": name.replace("_", "-"), "package": package, "title": title, "imports": imports}
+    return {
+        "pyproject.toml": PYPROJECT.format(**values),
+        "README.md": README.format(**values),
+        f"{package}/__init__.py": INIT.format(**values),
+        f"{package}/driver.py": _rename_driver(name, title, package),
+        "tests/conftest.py": CONFTEST.format(**values),
+        "tests/test_contract.py": TEST.format(**values),
+    }
+
+
+def _rename_driver(name: str, title: str, package: str) -> str:
+    """Return the minimal driver with the names of another driver type."""
+    text = DRIVER.read_text(encoding="utf-8")
+    text = text.replace("./examples/minimal_driver.py", f"./{package}/driver.py")
+    text = re.sub(r"\bMinimal(?=[A-Z])", title, text)
+    return text.replace('"minimal', f'"{name}')

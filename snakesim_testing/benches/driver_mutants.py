@@ -1,0 +1,188 @@
+"""Minimal drivers that break the contract, each in one way, and the clauses that have to notice."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.drive_type import DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drives import BusCommand
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_drivers.template.minimal_driver import (
+    NO_SETPOINT,
+    MinimalBackend,
+    MinimalDrives,
+    MinimalEmulator,
+    Report,
+)
+from snakesim_testing.benches.mutant import Mutant, name_clauses
+from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
+
+DRIVER_MUTANTS: list[Mutant] = []
+LATE_CYCLES = 10
+
+IN_TIME = "torque_is_off_in_time_by_the_drives_own_log"
+AFTER_WATCHDOG = "torque_is_off_after_watchdog_by_the_drives_own_log"
+RESTARTED = "a_drive_restarted_in_motion_stays_off_until_reset"
+DUPLICATE = "two_drives_with_one_id_stop_the_robot"
+BUS_LOST = "a_bus_that_is_lost_and_restored_enables_no_drive"
+SUPPLY = "supply_and_temperatures_are_in_volts_and_degrees"
+SAGGING = "a_sagging_supply_is_reported_at_its_joint"
+
+
+def breaks(*clauses: str) -> Callable[[Any], Any]:
+    """Register broken drives, or a broken emulator, with the clauses that must fail on them."""
+
+    def register(broken: Any) -> Any:
+        drives_type = broken if issubclass(broken, MinimalDrives) else MinimalDrives
+        emulator_type = broken if issubclass(broken, MinimalEmulator) else MinimalEmulator
+
+        class Broken(MinimalBackend):
+            name = broken.__name__
+
+            @classmethod
+            def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
+                def open_drives(port: str, joint_indices: Sequence[int], readings: DriveReadings) -> MinimalDrives:
+                    assert context.body is not None
+                    clock_ns = context.clock.now_ns
+                    emulator = emulator_type(context.body, clock_ns, context.settings.watchdog_s)
+                    joints = [context.joints[j] for j in joint_indices]
+                    return drives_type(emulator, joints, readings, clock_ns, context.config.period_ns)
+
+                return group_by_port(context.joints, context.settings, ["memory"], open_drives)
+
+        DRIVER_MUTANTS.append(
+            Mutant(
+                name=broken.__name__, backend=Broken, breaks=name_clauses(clauses), mute=mute_joint, drives=KitDrives
+            )
+        )
+        return broken
+
+    return register
+
+
+@breaks(SUPPLY)
+class VoltsInTensOfMillivolts(MinimalDrives):
+    """The supply has another unit than the driver believes."""
+
+    def _store_report(self, i: int, report: Report) -> None:
+        super()._store_report(i, report._replace(voltage_v=report.voltage_v * 1.5))
+
+
+@breaks(SUPPLY)
+class FahrenheitTemperatures(MinimalDrives):
+    """The temperatures are in another unit."""
+
+    def _store_report(self, i: int, report: Report) -> None:
+        super()._store_report(i, report._replace(motor_c=report.motor_c * 1.8 + 64.0))
+
+
+@breaks(SAGGING)
+class SupplyReadOnce(MinimalDrives):
+    """The supply is read in bring-up alone."""
+
+    first_v: float | None = None
+
+    def _store_report(self, i: int, report: Report) -> None:
+        if self.first_v is None:
+            self.first_v = report.voltage_v
+        super()._store_report(i, report._replace(voltage_v=self.first_v))
+
+
+@breaks(IN_TIME)
+class SwitchesOffLate(MinimalDrives):
+    """Drives are switched off some cycles after the command."""
+
+    late_cycles = 0
+
+    def send_setpoints(self, command: BusCommand) -> None:
+        if command.following:
+            self.late_cycles = 0
+            super().send_setpoints(command)
+            return
+        self.late_cycles += 1
+        still_following = frozenset(i for i in self.all_drives if self.emulator.drives[i].enabled)
+        if self.late_cycles < LATE_CYCLES:
+            command = command._replace(following=still_following)
+        super().send_setpoints(command)
+
+
+@breaks(AFTER_WATCHDOG, BUS_LOST)
+class HasNoWatchdogAtAll(MinimalEmulator):
+    """Drives follow their last setpoint for ever."""
+
+    def on_step(self, now_us: float) -> None:
+        for drive in self.drives:
+            drive.fed_us = now_us
+        super().on_step(now_us)
+
+
+@breaks(AFTER_WATCHDOG)
+class HasASlowWatchdog(MinimalEmulator):
+    """Drives switch off, but later than after their watchdog's time."""
+
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
+        self._watchdog_us *= 5
+
+
+class AnswersForSilentDrives(MinimalDrives):
+    """The last values of a silent drive count as new, so that its silence goes unnoticed."""
+
+    def read(self) -> None:
+        super().read()
+        for i in self.all_drives:
+            self.readings.set_motion(i, float(self.readings.angle_rad[i]), float(self.readings.velocity_rad_s[i]))
+            self.readings.set_torque(i, float(self.readings.torque_nm[i]))
+
+
+@breaks(RESTARTED)
+class EnablesRestartedDrives(AnswersForSilentDrives):
+    """A drive that should follow is enabled in every cycle."""
+
+    def send_setpoints(self, command: BusCommand) -> None:
+        super().send_setpoints(command)
+        for i in command.following:
+            self.emulator.handle_message(i, "enable")
+
+    def findings(self) -> list[Finding]:
+        return [finding for finding in super().findings() if finding.what != "drive_not_armed"]
+
+
+@breaks(DUPLICATE)
+class TakesTheLastAnswer(MinimalDrives):
+    """A second drive with one id goes unnoticed."""
+
+    def findings(self) -> list[Finding]:
+        return [finding for finding in super().findings() if finding.what != "duplicate_node"]
+
+
+@breaks(DUPLICATE)
+class ForgetsTheSecondDrive(MinimalDrives):
+    """A reset ends the fault for good, although the second drive is still there."""
+
+    is_forgotten = False
+
+    def reset_faults(self, joints: frozenset[int]) -> None:
+        super().reset_faults(joints)
+        self.is_forgotten = True
+
+    def findings(self) -> list[Finding]:
+        findings = super().findings()
+        return [finding for finding in findings if not (self.is_forgotten and finding.what == "duplicate_node")]
+
+
+@breaks(BUS_LOST)
+class EnablesWhatTheBusHasLost(MinimalDrives):
+    """After the bus is back, the driver clears errors and goes on, whatever the robot's state."""
+
+    was_cut = False
+
+    def send_setpoints(self, command: BusCommand) -> None:
+        super().send_setpoints(command)
+        if self.was_cut and not self.emulator.is_cut:
+            for i in self.all_drives:
+                self.emulator.handle_message(i, "clear_error")
+                self.emulator.handle_message(i, NO_SETPOINT)
+                self.emulator.handle_message(i, "enable")
+        self.was_cut |= self.emulator.is_cut

@@ -1,0 +1,227 @@
+"""Emulated drives that home, with holding brakes, limit switches and a safe-torque-off input; and their driver.
+
+They extend the minimal driver, and have its protocol with some messages more. A drive does not know its position after
+a restart: it reports 0 until it has moved slowly to its index.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from snakesim_drivers.kit.bus import BusSpec
+from snakesim_drivers.kit.drive_settings import DriveSettings
+from snakesim_drivers.kit.drive_type import DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drives import BusCommand
+from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.holding_brakes import HoldingBrakes
+from snakesim_drivers.kit.limit_switches import LimitSwitches
+from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_drivers.kit.start_up import StartUp, StartUpStep, StepFailedError
+from snakesim_drivers.template.minimal_driver import MinimalBackend, MinimalDrives, MinimalEmulator, Report
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.wire.messages import Mode
+
+HOMING_RAD_S = 0.05
+HOMING_MARGIN_S = 1.6  # until homing has failed
+RELEASE_S = 0.04
+ENGAGE_S = 0.02
+
+
+class HomingSettings(DriveSettings, frozen=True, kw_only=True):
+    """The settings of these drives."""
+
+    home_at_start: bool = True
+    """Whether the drives may move their joints at the start, to find their zeros."""
+
+    homing_s: float = 0.4
+    """Time that the emulated drives need to find their zeros."""
+
+
+class Inputs(NamedTuple):
+    """What a drive reports beside its motion."""
+
+    homed: bool
+    homing_failed: bool
+    safe_torque_off: bool
+    at_lower: bool
+    at_upper: bool
+
+
+@dataclass
+class Extras:
+    """What a drive has beside a minimal one."""
+
+    homed: bool = False
+    homing_until_us: float | None = None  # None: it does not home
+    brake_open: bool = False
+    brake_closed_us: float = -1e9  # when it was told to close
+
+
+class HomingEmulator(MinimalEmulator):
+    """The emulated drives. `dropped` has the drives whose torque went off while their brake did not hold yet."""
+
+    def __init__(self, *parts: Any) -> None:
+        self.extras: list[Extras] = []
+        self.dropped: list[int] = []
+        self.homing_us = 0.0  # set by the driver type
+        # Set by tests.
+        self.without_index: set[int] = set()
+        self.torque_off: set[int] = set()
+        self.at_lower: set[int] = set()
+        self.at_upper: set[int] = set()
+        super().__init__(*parts)
+        self.extras = [Extras() for _ in self.drives]
+
+    def request_inputs(self, i: int) -> Inputs | None:
+        """Return the inputs of a drive; None if it is silent."""
+        if self.is_cut or self.body.is_silent(i):
+            return None
+        failed = i in self.without_index and self.extras[i].homing_until_us is None
+        return Inputs(self.extras[i].homed, failed, i in self.torque_off, i in self.at_lower, i in self.at_upper)
+
+    def request_reports(self, i: int) -> list[Report]:
+        reports = super().request_reports(i)
+        if self.extras[i].homed:
+            return reports
+        return [report._replace(angle_rad=0.0) for report in reports]
+
+    def handle_extra(self, i: int, message: Literal["home", "stop_homing", "open_brake", "close_brake"]) -> None:
+        """Let a drive act on a message that a minimal drive does not have."""
+        if self.is_cut or self.body.is_booting(i):
+            return
+        extras = self.extras[i]
+        match message:
+            case "home":
+                extras.homing_until_us = self.body.now_us + self.homing_us
+                self._drive_motor(i)
+            case "stop_homing":
+                extras.homing_until_us = None
+                self._drive_motor(i)
+            case "open_brake":
+                extras.brake_open = True
+            case "close_brake":
+                if extras.brake_open:
+                    extras.brake_closed_us = self.body.now_us
+                extras.brake_open = False
+
+    def on_step(self, now_us: float) -> None:
+        """End the homing of drives that have reached their index, and keep drives off by their input."""
+        super().on_step(now_us)
+        for i, extras in enumerate(self.extras):
+            if extras.homing_until_us is not None and now_us > extras.homing_until_us:
+                extras.homing_until_us = None
+                extras.homed = i not in self.without_index
+                self._drive_motor(i)
+            if i in self.torque_off and self.drives[i].enabled:
+                self._stop(i, "")
+
+    def restart(self, i: int) -> None:
+        super().restart(i)
+        self.extras[i] = Extras()
+
+    def _drive_motor(self, i: int) -> None:
+        if not self.drives[i].enabled:
+            self._note_drop(i)
+        if self.extras and self.extras[i].homing_until_us is not None:
+            joint = self.body.joints[i]
+            damping = joint.motor.velocity_gain_nm_s_per_rad / joint.drive.gear**2
+            limit_nm = joint.limits.torque_nm / joint.drive.gear
+            self.body.drive_motor(i, Mode.VELOCITY, HOMING_RAD_S, limit_nm, 0.0, damping, HOMING_RAD_S)
+            return
+        super()._drive_motor(i)
+
+    def _note_drop(self, i: int) -> None:
+        if not self.extras:
+            return
+        extras = self.extras[i]
+        is_closing = self.body.now_us - extras.brake_closed_us < ENGAGE_S * 1e6
+        if extras.brake_open or is_closing:
+            self.dropped.append(i)
+
+
+class HomingDrives(MinimalDrives):
+    """The driver of these drives."""
+
+    emulator: HomingEmulator
+
+    def __init__(
+        self,
+        emulator: HomingEmulator,
+        joints: Sequence[Joint],
+        readings: DriveReadings,
+        clock_ns: Callable[[], int],
+        period_ns: int,
+        *,
+        settings: HomingSettings,
+    ) -> None:
+        super().__init__(emulator, joints, readings, clock_ns, period_ns)
+        self.inputs: list[Inputs | None] = [None] * len(joints)
+        self.switches = LimitSwitches(self.labels)
+        self.brakes = HoldingBrakes(len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns)
+        homing = StartUpStep(
+            "homing",
+            limit_s=settings.homing_s + HOMING_MARGIN_S,
+            begin=lambda i: emulator.handle_extra(i, "home"),
+            is_done=self.is_homed,
+            abort=lambda i: emulator.handle_extra(i, "stop_homing"),
+            moves=True,
+        )
+        self.start_up: StartUp = StartUp(
+            self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start
+        )
+
+    def is_homed(self, i: int) -> bool:
+        """Return whether a drive knows its position."""
+        inputs = self.inputs[i]
+        if inputs is None:
+            return False
+        if inputs.homing_failed:
+            raise StepFailedError("no index found")
+        return inputs.homed
+
+    def read(self) -> None:
+        super().read()
+        for i in self.all_drives:
+            inputs = self.emulator.request_inputs(i)
+            self.inputs[i] = inputs
+            if inputs is None:
+                continue
+            self.switches.note(i, lower=inputs.at_lower, upper=inputs.at_upper)
+            self.states.drives[i].safe_torque_off = inputs.safe_torque_off
+            if self.start_up.is_ready(i) and not inputs.homed:
+                self.start_up.lose(i, "position unknown: the drive has restarted")
+
+    def send_setpoints(self, command: BusCommand) -> None:
+        enabled = [i for i in self.all_drives if self.states.drives[i].enabled]
+        restricted = self.switches.restrict(command, self.readings.angle_rad)
+        plan = self.brakes.plan(restricted, enabled, self.readings.angle_rad)
+        for i in self.all_drives:
+            self.emulator.handle_extra(i, "open_brake" if i in plan.released else "close_brake")
+        super().send_setpoints(plan.command)
+
+    def findings(self) -> list[Finding]:
+        return [*super().findings(), *self.switches.findings()]
+
+    def reset_faults(self, joints: frozenset[int]) -> None:
+        super().reset_faults(joints)
+        self.switches.reset(joints)
+
+
+class HomingBackend(MinimalBackend):
+    """The driver type."""
+
+    Settings = HomingSettings
+    name = "homing"
+
+    @classmethod
+    def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
+        def open_drives(port: str, joint_indices: Sequence[int], readings: DriveReadings) -> HomingDrives:
+            assert context.body is not None
+            joints = [context.joints[j] for j in joint_indices]
+            clock_ns = context.clock.now_ns
+            emulator = HomingEmulator(context.body, clock_ns, context.settings.watchdog_s)
+            period_ns = context.config.period_ns
+            emulator.homing_us = context.settings.homing_s * 1e6
+            return HomingDrives(emulator, joints, readings, clock_ns, period_ns, settings=context.settings)
+
+        return group_by_port(context.joints, context.settings, ["memory"], open_drives)

@@ -1,0 +1,17 @@
+"""Injected faults for clauses about what a backend does in them."""
+
+import pytest
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fault_kinds import parse_injection
+from snakesim_testing.contract.rig import Rig
+
+
+def inject_or_skip(rig: Rig, text: str) -> None:
+    """Begin a fault of the emulated drives; skip the clause if the backend cannot."""
+    try:
+        is_possible = rig.backend.inject(parse_injection(text), begins=True)
+    except ConfigError as error:
+        pytest.skip(f"this backend does not have the fault {text.partition(':')[0]}: {error}")
+    if not is_possible:
+        pytest.skip(f"this backend does not have the fault {text.partition(':')[0]}")

@@ -1,0 +1,72 @@
+"""The emulated drives of a backend on the driver kit, as the contract suite looks at them.
+
+Pass `KitDrives` to `--snakesim-drives` or to a `Bench`, and `mute_joint` as `mute`, if the drives of each bus have an
+attribute `emulator`, a `DriveEmulator` that implements `list_enabled`.
+"""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from typing import Any
+
+from snakesim_hal.model.fault_kinds import parse_injection
+from snakesim_testing.contract.bench import TorqueSwitch
+
+
+def mute_joint(backend: Any, joint: int) -> None:
+    """Let the emulated drive of a joint send nothing from now on."""
+    assert backend.inject(parse_injection(f"mute:joint_{joint + 1}@0"), begins=True)
+
+
+class KitDrives:
+    """Emulated drives on one bus or on several: a `snakesim_testing.contract.bench.EmulatedDrives`."""
+
+    def __init__(self, backend: Any) -> None:
+        """Begin to log, at every step of the drives' physics, which drives are enabled."""
+        self._backend = backend
+        self._buses = backend._drives.buses
+        self._log: list[TorqueSwitch] = []
+        for bus in self._buses:
+            emulator = self.find_emulator(bus.drives)
+            is_on = self.list_enabled(emulator)
+            emulator.body.add_step_callback(partial(self._log_switches, emulator, bus.spec.joints, is_on))
+
+    def find_emulator(self, drives: Any) -> Any:
+        """Return the emulated drives of a bus."""
+        return drives.emulator
+
+    def list_enabled(self, emulator: Any) -> list[bool]:
+        """Return for each emulated drive of a bus whether it would follow a setpoint."""
+        return emulator.list_enabled()
+
+    def enabled(self) -> list[bool]:
+        """Return for each joint whether its drive would follow a setpoint now."""
+        enabled: dict[int, bool] = {}
+        for bus in self._buses:
+            enabled |= dict(zip(bus.spec.joints, self.list_enabled(self.find_emulator(bus.drives)), strict=True))
+        return [enabled[joint] for joint in range(len(enabled))]
+
+    def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
+        """Let time pass at the drives while nothing of the driver runs."""
+        with ExitStack() as held:
+            for bus in self._buses:
+                if hasattr(bus, "_condition"):  # a bus in a thread: it can do nothing without this
+                    held.enter_context(bus._condition)
+            self._backend._clock.robot_ns += round(seconds * 1e9)
+            sleep(seconds)
+            for bus in self._buses:
+                self.find_emulator(bus.drives)()
+
+    def now_s(self) -> float:
+        """Return the drives' own time."""
+        return self.find_emulator(self._buses[0].drives).body.now_us * 1e-6
+
+    def torque_log(self) -> list[TorqueSwitch]:
+        """Return when each drive has switched its torque on and off, by the drives' own time."""
+        return list(self._log)
+
+    def _log_switches(self, emulator: Any, joints: tuple[int, ...], is_on: list[bool], now_us: float) -> None:
+        for i, enabled in enumerate(self.list_enabled(emulator)):
+            if enabled != is_on[i]:
+                is_on[i] = enabled
+                self._log.append(TorqueSwitch(now_us * 1e-6, joints[i], on=enabled))

@@ -1,0 +1,139 @@
+"""A driver type with homing, brakes, limit switches and safe torque off, behind the real safety core."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from snakesim_hal.model.fault_kinds import parse_injection
+from snakesim_hal.wire.messages import Mode
+from snakesim_testing.benches.homing_drives import HomingBackend, HomingEmulator
+from snakesim_testing.contract.bench import Bench
+from snakesim_testing.contract.kit_drives import KitDrives
+from snakesim_testing.contract.rig import Rig
+from snakesim_testing.drivers.drive_rig import drives_of
+
+SECOND = 50  # periods
+
+
+def open_bench(*sets: str) -> Bench:
+    return Bench("homing", HomingBackend, sets=sets, drives=KitDrives)
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    bench = open_bench()
+    yield bench.open_rig()
+    bench.close()
+
+
+def emulator_of(rig: Rig) -> HomingEmulator:
+    return drives_of(rig.backend).emulator
+
+
+def unmet(rig: Rig) -> str:
+    return "; ".join(rig.authority.list_unmet_conditions(rig.tick * rig.period_ns))
+
+
+def test_drives_home_at_the_start_and_are_armed_then(rig: Rig) -> None:
+    assert all(extras.homed for extras in emulator_of(rig).extras)
+    assert rig.faults == []
+    rig.cruise()
+
+
+def test_drive_that_may_not_move_at_the_start_blocks_arming() -> None:
+    bench = open_bench("backends.homing.home_at_start=false")
+    rig = bench.open_rig()
+    assert "joint_1 (drive 1): homing moves the joint" in unmet(rig)
+    with pytest.raises(AssertionError, match=r"cannot be armed: .*homing moves the joint"):
+        rig.arm()
+    assert not any(extras.homed for extras in emulator_of(rig).extras)
+    bench.close()
+
+
+def test_restarted_drive_does_not_know_its_position_and_homes_after_reset(rig: Rig) -> None:
+    rig.cruise()
+    rig.backend.inject(parse_injection("reboot:joint_1@0"), begins=True)
+    rig.idle(SECOND)
+    assert rig.authority.state == "fault"
+    assert "position unknown" in unmet(rig)
+    rig.idle(SECOND)
+    assert not emulator_of(rig).extras[0].homed, "it homes without the operator"
+    rig.reset()
+    rig.idle(5)
+    assert "joint_1 (drive 1): homing, 0.1 of 2 s" in unmet(rig)
+    rig.idle(SECOND)
+    assert "joint_1" not in unmet(rig)
+    rig.cruise()
+
+
+def test_homing_that_fails_names_step_and_reason(rig: Rig) -> None:
+    emulator = emulator_of(rig)
+    emulator.without_index.add(1)
+    rig.backend.inject(parse_injection("reboot:joint_2@0"), begins=True)
+    rig.idle(2 * SECOND)
+    rig.reset()
+    rig.idle(3 * SECOND)
+    assert rig.authority.state == "fault"
+    assert "joint_2 (drive 2): homing failed: no index found" in unmet(rig)
+    assert "drive_not_ready" in {fault.what for fault in rig.faults}
+
+
+def test_emergency_stop_ends_homing(rig: Rig) -> None:
+    rig.backend.inject(parse_injection("reboot:joint_1@0"), begins=True)
+    rig.idle(SECOND)
+    rig.reset()
+    rig.idle(5)
+    assert emulator_of(rig).extras[0].homing_until_us is not None
+    rig.estop()
+    rig.idle(3)
+    assert emulator_of(rig).extras[0].homing_until_us is None
+    assert "homing was aborted: emergency stop" in unmet(rig)
+    rig.reset()
+    rig.idle(2 * SECOND)
+    rig.cruise()
+
+
+def test_brakes_close_before_torque_is_off(rig: Rig) -> None:
+    emulator = emulator_of(rig)
+    rig.cruise()
+    assert all(extras.brake_open for extras in emulator.extras)
+    emulator.dropped.clear()
+    rig.disarm()
+    rig.idle(SECOND // 2)
+    assert not any(extras.brake_open for extras in emulator.extras)
+    assert not any(KitDrives(rig.backend).enabled())
+    assert emulator.dropped == []
+
+
+def test_safe_torque_off_needs_its_release_and_a_reset(rig: Rig) -> None:
+    emulator = emulator_of(rig)
+    rig.cruise()
+    emulator.torque_off.add(2)
+    rig.idle(5)
+    assert "safe_torque_off" in {fault.what for fault in rig.faults}
+    assert rig.authority.state == "fault"
+    rig.reset()
+    rig.idle(SECOND // 2)
+    assert rig.authority.state == "fault", "reset while the input is active"
+    emulator.torque_off.clear()
+    rig.idle(SECOND // 2)
+    assert rig.authority.state == "fault", "no reset by the release alone"
+    rig.reset()
+    rig.idle(SECOND // 2)
+    rig.cruise()
+
+
+def test_limit_switch_stops_and_allows_motion_away_alone(rig: Rig) -> None:
+    emulator = emulator_of(rig)
+    rig.cruise()
+    emulator.at_upper.add(0)
+    rig.idle(5)
+    assert [(fault.what, fault.joint) for fault in rig.faults] == [("limit_switch", "joint_1")]
+    rig.idle(SECOND)
+    rig.reset()
+    rig.idle(SECOND // 2)
+    rig.arm()
+    into = rig.drive({0: (Mode.VELOCITY, 0.3)}, SECOND // 2)
+    assert into.angle_rad[-1, 0] - into.angle_rad[0, 0] < 0.02
+    away = rig.drive({0: (Mode.VELOCITY, -0.3)}, SECOND // 2)
+    assert away.angle_rad[-1, 0] - away.angle_rad[0, 0] < -0.05
