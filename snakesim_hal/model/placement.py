@@ -130,7 +130,13 @@ def _placed_step(index: int, step: Step) -> Placed:
     name = step.name or f"step_{index}"
     size_m = (*step.size_m, step.height_m)
     platform = make_block(name, step.position_m, size_m, step.yaw_rad)
-    return Placed(obstacle=platform, friction=step.friction, walkable=True)
+    return Placed(
+        obstacle=platform,
+        friction=step.friction,
+        forward_friction=step.forward_friction,
+        backward_friction=step.backward_friction,
+        walkable=True,
+    )
 
 
 def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:

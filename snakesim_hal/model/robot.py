@@ -15,6 +15,7 @@ from msgspec import Meta
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.friction import Skin, Wheels, check_skin
 from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, make_joints
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.plugins import SENSORS, find_plugin, require_base_class
@@ -95,6 +96,12 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []
     """Every link, tail to head, for a robot whose links differ; empty: the links follow from the modules."""
 
+    skin: Skin | None = None
+    """Scales or a skin that slide more easily in one direction; none: links rub equally in all directions."""
+
+    wheels: Wheels | None = None
+    """Passive wheels under the links; none: the robot has no wheels."""
+
     # All joints.
     limits: Limits
     """Limits of every joint."""
@@ -133,6 +140,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
                 f"[[links]] has {len(self.links)} entries, and {joint_count} joints connect {joint_count + 1} links; "
                 f"list each, tail to head, or none"
             )
+        check_skin(self.skin, self.wheels, [f"link_{i}" for i in range(joint_count + 1)])
         for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.custom):
             self._check_place(sensor)
 

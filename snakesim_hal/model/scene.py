@@ -10,6 +10,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.friction import Surface, Viscous
 from snakesim_hal.model.outlines import Coordinate, Friction, Heading, Point, Size
 from snakesim_hal.model.random_field import RandomField
 from snakesim_hal.model.route import Route, sine_points
@@ -33,11 +34,14 @@ class Heightfield(FileStruct, frozen=True, kw_only=True):
     """Seed of the random hills; the same seed gives the same hills."""
 
 
-class Ground(FileStruct, frozen=True, kw_only=True):
+class Ground(Surface, frozen=True, kw_only=True):
     """The ground, and its friction."""
 
     friction: Friction
     """Coulomb friction between the ground and the snake."""
+
+    viscous: Viscous | None = None
+    """Viscous friction in addition to dry friction, such as in mud; none: there is none."""
 
     heightfield: Heightfield | None = None
     """Random hills; none: the ground is flat."""
@@ -130,7 +134,7 @@ class Wall(Upright, frozen=True, kw_only=True):
     """Name, which no other obstacle has; none: `wall_` with its number in the file."""
 
 
-class Step(FileStruct, frozen=True, kw_only=True):
+class Step(Surface, frozen=True, kw_only=True):
     """A low platform that the snake may lie on or climb."""
 
     position_m: Point

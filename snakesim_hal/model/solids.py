@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.friction import Surface
 from snakesim_hal.model.outlines import Friction, Heading, Point
 from snakesim_hal.wire.messages import Obstacle
 
@@ -14,7 +14,7 @@ BASE_FRICTION = 0.4  # an obstacle on the ground on which it slides
 MAX_LEAN_RAD = 0.6
 
 
-class Solid(FileStruct, frozen=True, kw_only=True):
+class Solid(Surface, frozen=True, kw_only=True):
     """An obstacle that the snake can push against. By default it is rigid, and fixed to the ground."""
 
     friction: Friction = PEG_FRICTION

@@ -18,7 +18,6 @@ typedef struct {
   int other_geom;
   mjtNum sign;     // makes MuJoCo's normal point from the other body into the link
   mjtNum normal_force;
-  mjtNum mu;
 } Pressing;
 
 // What a spring does in one step.
@@ -74,7 +73,9 @@ static mjtNum limit_scale(mjtNum limit, mjtNum size) { return size > limit ? lim
 //   ds = motion of the link's point relative to the other body's point, without its part along the normal n
 //   s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the spring
 //   F  = -(k s + d ds), limited to |F| <= mu N   friction force on the link
-static Rubbing rub(const mjModel* m, const mjData* d, const RoughContact* contact) {
+//
+// On surfaces on which links slide more easily in one direction, directional.c changes F.
+static Rubbing rub(const mjModel* m, const mjData* d, const Chain* chain, const RoughContact* contact) {
   mjtNum step = m->opt.timestep;
   mjtNum k = (PHASE_RAD / step) * (PHASE_RAD / step) * contact->mass;
   mjtNum damping = 2.0 * DAMPING_RATIO * PHASE_RAD / (step * step) * contact->mass;
@@ -106,6 +107,14 @@ static Rubbing rub(const mjModel* m, const mjData* d, const RoughContact* contac
   for (int i = 0; i < 3; i++) {
     rubbing.force[i] = scale * rubbing.force[i];
   }
+  Coefficients coefficients = {contact->max_friction, contact->forward,       contact->backward,
+                               contact->sideways,     contact->viscous_along, contact->viscous_across};
+  if (is_directional(&coefficients)) {
+    int body = (int)contact->link_body;
+    mjtNum axis[3];
+    find_axis(d, body, find_neighbor(m, chain, body, contact->link_point[0]), contact->normal, axis);
+    direct_force(rubbing.force, slip, axis, &coefficients, 1.0 / step);
+  }
   return rubbing;
 }
 
@@ -114,7 +123,7 @@ void rub_links(const mjModel* m, mjData* d, const Chain* chain, const RoughConta
   for (int i = 0; i < count; i++) {
     int link_body = (int)contacts[i].link_body;
     int other_body = (int)contacts[i].other_body;
-    Rubbing rubbing = rub(m, d, contacts + i);
+    Rubbing rubbing = rub(m, d, chain, contacts + i);
     add_force(d, chain, rubbing.force, rubbing.point, wrenches + WRENCH_SIZE * (link_body - chain->first_body));
     if (other_body != WORLD_BODY) {
       mjtNum opposite[3] = {-rubbing.force[0], -rubbing.force[1], -rubbing.force[2]};
@@ -130,6 +139,15 @@ static mjtNum find_mobility(const mjModel* m, int body) {
   return m->body_mass[body] > 0.0 ? END_MOBILITY / m->body_mass[body] : 0.0;
 }
 
+// Return whether a geom has friction of any kind.
+static int has_friction(const mjModel* m, int geom) {
+  int found = m->geom_friction[3 * geom] > 0.0;
+  for (int i = FORWARD; i < USER_NUMBERS && has_directions(m); i++) {
+    found = found || find_directions(m, geom)[i] > 0.0;
+  }
+  return found;
+}
+
 // Return whether one of MuJoCo's contacts presses on a link and has friction, and describe it.
 static int find_pressing(const mjModel* m, const mjData* d, const Chain* chain, int number, mjtNum min_friction,
                          Pressing* pressing) {
@@ -141,10 +159,8 @@ static int find_pressing(const mjModel* m, const mjData* d, const Chain* chain, 
   pressing->sign = first_is_link ? -1.0 : 1.0;  // MuJoCo's normal is from the first geom to the second
   // A contact without a row in the solver has no force.
   pressing->normal_force = contact->efc_address >= 0 ? d->efc_force[contact->efc_address] : 0.0;
-  mjtNum mu = m->geom_friction[3 * pressing->other_geom];
-  pressing->mu = min_friction > mu ? min_friction : mu;
   return pressing->normal_force > 0.0 && is_link(chain, m->geom_bodyid[pressing->link_geom]) &&
-         (mu > 0.0 || min_friction > 0.0);
+         (min_friction > 0.0 || has_friction(m, pressing->other_geom));
 }
 
 // Return the contact with this key in the last step, or NULL.
@@ -157,11 +173,31 @@ static const RoughContact* find_key(const RoughContact* contacts, int count, mjt
   return NULL;
 }
 
+// Return the coefficients of a contact.
+//   along    distance of the contact from the link's rear joint
+//   normal   of the surface, which points into the link
+static Coefficients find_coefficients(const mjModel* m, const mjData* d, const Chain* chain, const Pressing* pressing,
+                                      mjtNum along, const mjtNum normal[3], mjtNum min_friction) {
+  mjtNum mu = m->geom_friction[3 * pressing->other_geom];
+  if (is_link(chain, m->geom_bodyid[pressing->other_geom]) || !has_directions(m)) {
+    return combine_coefficients(mu, mu, mu, 0.0, 0.0, min_friction);
+  }
+  const mjtNum* surface = find_directions(m, pressing->other_geom);
+  const mjtNum* factors = find_directions(m, pressing->link_geom);
+  int body = m->geom_bodyid[pressing->link_geom];
+  if (!faces_underside(d, body, find_neighbor(m, chain, body, along), normal)) {
+    return combine_coefficients(mu, mu, mu, surface[VISCOUS_ACROSS], surface[VISCOUS_ACROSS], min_friction);
+  }
+  return combine_coefficients(surface[FORWARD] * factors[FORWARD], surface[BACKWARD] * factors[BACKWARD],
+                              surface[SIDEWAYS] * factors[SIDEWAYS], surface[VISCOUS_ALONG], surface[VISCOUS_ACROSS],
+                              min_friction);
+}
+
 // Write what is remembered of a contact.
 //   nth      how many contacts of the same two geoms come before it
 //   before   the contacts of the last step, with the stretch and the force that they have now
-static RoughContact describe_contact(const mjModel* m, const mjData* d, const Pressing* pressing, int nth,
-                                     const RoughContact* before, int before_count) {
+static RoughContact describe_contact(const mjModel* m, const mjData* d, const Chain* chain, const Pressing* pressing,
+                                     int nth, const RoughContact* before, int before_count, mjtNum min_friction) {
   const mjContact* contact = d->contact + pressing->number;
   RoughContact result;
   int link_body = m->geom_bodyid[pressing->link_geom];
@@ -172,7 +208,6 @@ static RoughContact describe_contact(const mjModel* m, const mjData* d, const Pr
   result.link_body = link_body;
   result.other_body = other_body;
   result.mass = 0.0;  // is known when all contacts of the link are
-  result.max_friction = pressing->mu * pressing->normal_force;
 
   const RoughContact* same = find_key(before, before_count, result.key);
   result.is_new = same == NULL;
@@ -183,6 +218,15 @@ static RoughContact describe_contact(const mjModel* m, const mjData* d, const Pr
   }
   to_body(d, link_body, contact->pos, result.link_point);
   to_body(d, other_body, contact->pos, result.other_point);
+
+  Coefficients coefficients =
+      find_coefficients(m, d, chain, pressing, result.link_point[0], result.normal, min_friction);
+  result.max_friction = coefficients.largest * pressing->normal_force;
+  result.forward = coefficients.forward;
+  result.backward = coefficients.backward;
+  result.sideways = coefficients.sideways;
+  result.viscous_along = coefficients.viscous_along * pressing->normal_force;
+  result.viscous_across = coefficients.viscous_across * pressing->normal_force;
   return result;
 }
 
@@ -207,7 +251,7 @@ int update_contacts(const mjModel* m, mjData* d, const Chain* chain, RoughContac
   int numbers = sizeof(RoughContact) / sizeof(mjtNum);
   RoughContact* before = (RoughContact*)mj_stackAllocNum(d, (size_t)count * numbers + 1);
   for (int i = 0; i < count; i++) {
-    Rubbing rubbing = rub(m, d, contacts + i);
+    Rubbing rubbing = rub(m, d, chain, contacts + i);
     before[i] = contacts[i];
     mju_copy3(before[i].stretch, rubbing.stretch);
     mju_copy3(before[i].force, rubbing.force);
@@ -223,7 +267,7 @@ int update_contacts(const mjModel* m, mjData* d, const Chain* chain, RoughContac
       for (int i = 0; i < new_count; i++) {
         nth += contacts[i].key >= first_key && contacts[i].key < first_key + CONTACTS_PER_PAIR;
       }
-      contacts[new_count] = describe_contact(m, d, &pressing, nth, before, count);
+      contacts[new_count] = describe_contact(m, d, chain, &pressing, nth, before, count, min_friction);
       new_count++;
     }
   }

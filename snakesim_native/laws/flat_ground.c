@@ -8,6 +8,7 @@ static const mjtNum SINK_M = 2e-4;         // how deep a foot sinks in under its
 static const mjtNum MAX_PHASE_RAD = 0.7;   // the normal spring vibrates by at most this in one step
 static const mjtNum DAMPING_RATIO = 0.5;   // of critical damping
 static const mjtNum MIN_DIVISOR = 1e-12;   // keeps 0 / 0 out of the friction of a foot without load
+static const mjtNum UP[3] = {0.0, 0.0, 1.0};  // normal of the ground
 static const mjtNum FOOT = 1.0;            // first number of a geom's user data, if the geom is a foot
 
 // Parameters of all feet.
@@ -17,6 +18,7 @@ typedef struct {
   mjtNum sink;                // sink
   mjtNum damping_root;        // sqrt(g / sink)
   mjtNum min_friction;
+  const Chain* chain;
 } Ground;
 
 // One foot in one step.
@@ -41,7 +43,7 @@ static mjtNum compute_length(mjtNum x, mjtNum y) {
   return sqrt(fma(ratio, ratio, 1.0)) * longer;
 }
 
-static Ground describe_ground(const mjModel* m, mjtNum min_friction) {
+static Ground describe_ground(const mjModel* m, const Chain* chain, mjtNum min_friction) {
   Ground ground;
   mjtNum gravity = -m->opt.gravity[2];
   mjtNum slow = m->opt.timestep / MAX_PHASE_RAD;
@@ -50,7 +52,33 @@ static Ground describe_ground(const mjModel* m, mjtNum min_friction) {
   ground.sink = SINK_M > gravity * (slow * slow) ? SINK_M : gravity * (slow * slow);
   ground.damping_root = sqrt(gravity / ground.sink);
   ground.min_friction = min_friction;
+  ground.chain = chain;
   return ground;
+}
+
+// Return the other link that a foot belongs to: the one behind its own, if it is at a joint.
+static Neighbor find_foot_neighbor(const mjModel* m, const Chain* chain, int geom) {
+  int body = m->geom_bodyid[geom];
+  int is_at_rear = m->geom_pos[3 * geom] == 0.0;
+  if (is_at_rear && body > chain->first_body) {
+    return (Neighbor){body - 1, 0.5};
+  }
+  return (Neighbor){body, 0.0};
+}
+
+// Return the coefficients of a foot, by how its links lie on the ground now.
+static Coefficients find_foot_coefficients(const mjModel* m, const mjData* d, const Ground* ground, int geom,
+                                           Neighbor neighbor) {
+  mjtNum mu = m->geom_friction[3 * geom];
+  if (!has_directions(m)) {
+    return combine_coefficients(mu, mu, mu, 0.0, 0.0, ground->min_friction);
+  }
+  const mjtNum* numbers = find_directions(m, geom);
+  if (!faces_underside(d, m->geom_bodyid[geom], neighbor, UP)) {
+    return combine_coefficients(mu, mu, mu, numbers[VISCOUS_ACROSS], numbers[VISCOUS_ACROSS], ground->min_friction);
+  }
+  return combine_coefficients(numbers[FORWARD], numbers[BACKWARD], numbers[SIDEWAYS], numbers[VISCOUS_ALONG],
+                              numbers[VISCOUS_ACROSS], ground->min_friction);
 }
 
 // Compute one foot in one step:
@@ -59,6 +87,8 @@ static Ground describe_ground(const mjModel* m, mjtNum min_friction) {
 //   ds = dx + dt r (-w_y, w_x)                   slip of the lowest point since the last step
 //   s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the tangential spring, limited by friction
 //   F  = -(k s + d ds), limited to |F| <= mu N   friction force
+//
+// On ground on which links slide more easily in one direction, directional.c changes F.
 static FootStep compute_foot(const mjModel* m, const mjData* d, const Ground* ground, int geom, mjtNum carried_kg,
                              const Foot* before, int placed) {
   const mjtNum* position = d->geom_xpos + 3 * geom;
@@ -73,8 +103,10 @@ static FootStep compute_foot(const mjModel* m, const mjData* d, const Ground* gr
   mjtNum height = position[2] - r;
   mjtNum normal_force = (position[2] - last[2]) * -damping + -k * height;
   normal_force = maximum(normal_force, 0.0);
-  mjtNum mu = m->geom_friction[3 * geom];
-  mjtNum max_friction = (ground->min_friction > mu ? ground->min_friction : mu) * normal_force;
+  int body = m->geom_bodyid[geom];
+  Neighbor neighbor = find_foot_neighbor(m, ground->chain, geom);
+  Coefficients coefficients = find_foot_coefficients(m, d, ground, geom, neighbor);
+  mjtNum max_friction = coefficients.largest * normal_force;
   mjtNum divisor = maximum(max_friction, MIN_DIVISOR);
 
   // ds, and s + ds
@@ -95,6 +127,13 @@ static FootStep compute_foot(const mjModel* m, const mjData* d, const Ground* gr
   scale = max_friction / maximum(compute_length(pull_x, pull_y), divisor);
   foot.force[0] = pull_x * scale;
   foot.force[1] = pull_y * scale;
+  foot.force[2] = 0.0;
+  if (is_directional(&coefficients)) {
+    mjtNum slip[3] = {slip_x, slip_y, 0.0};
+    mjtNum axis[3];
+    find_axis(d, body, neighbor, UP, axis);
+    direct_force(foot.force, slip, axis, &coefficients, normal_force / ground->step);
+  }
   foot.force[2] = normal_force;
 
   foot.lowest[0] = position[0];
@@ -118,7 +157,7 @@ static int is_foot(const mjModel* m, int geom) {
 
 void push_feet(const mjModel* m, const mjData* d, const Chain* chain, const Foot* feet, int placed,
                mjtNum min_friction, mjtNum* wrenches) {
-  Ground ground = describe_ground(m, min_friction);
+  Ground ground = describe_ground(m, chain, min_friction);
   int count = 0;
   for (int link = 0; link < chain->link_count; link++) {
     int body = chain->first_body + link;
@@ -138,7 +177,7 @@ void push_feet(const mjModel* m, const mjData* d, const Chain* chain, const Foot
 }
 
 void update_feet(const mjModel* m, const mjData* d, const Chain* chain, Foot* feet, int placed, mjtNum min_friction) {
-  Ground ground = describe_ground(m, min_friction);
+  Ground ground = describe_ground(m, chain, min_friction);
   int last_body = chain->first_body + chain->link_count - 1;
   int end = m->body_geomadr[last_body] + m->body_geomnum[last_body];
   int count = 0;

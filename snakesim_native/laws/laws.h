@@ -39,6 +39,56 @@ void add_force(const mjData* d, const Chain* chain, const mjtNum force[3], const
 // Add the generalized forces of the links' wrenches, (link_count x WRENCH_SIZE), to MuJoCo's passive forces.
 void apply_wrenches(const mjModel* m, mjData* d, const Chain* chain, const mjtNum* wrenches);
 
+//---------------------------------- Directions ------------------------------------------------------------------------
+
+// Numbers of a geom in its user data. For a foot and a surface they are coefficients with the underside of a link, for
+// a link they are factors on the coefficients of a surface.
+enum { FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS, USER_NUMBERS };
+
+// Coefficients of one contact or foot.
+typedef struct {
+  mjtNum largest;  // mu
+  mjtNum forward;  // divided by the largest; likewise the next two
+  mjtNum backward;
+  mjtNum sideways;
+  mjtNum viscous_along;   // s/m
+  mjtNum viscous_across;  // s/m
+} Coefficients;
+
+// The link that a point of a link is nearest to besides its own, and the weight of its direction.
+typedef struct {
+  int body;
+  mjtNum weight;  // 0 in the middle of the link, 0.5 at a joint
+} Neighbor;
+
+// Return whether a model has the numbers of directions.
+int has_directions(const mjModel* m);
+
+// Return the user data of a geom.
+const mjtNum* find_directions(const mjModel* m, int geom);
+
+// Return whether the force differs from isotropic dry friction with the largest coefficient.
+int is_directional(const Coefficients* coefficients);
+
+// Return the coefficients of a contact, none of which is lower than `min_friction`.
+Coefficients combine_coefficients(mjtNum forward, mjtNum backward, mjtNum sideways, mjtNum viscous_along,
+                                  mjtNum viscous_across, mjtNum min_friction);
+
+// Return the neighbor at a distance from the link's rear joint.
+Neighbor find_neighbor(const mjModel* m, const Chain* chain, int body, mjtNum along);
+
+// Return whether a surface with this normal, which points into the link, touches the underside.
+int faces_underside(const mjData* d, int body, Neighbor neighbor, const mjtNum normal[3]);
+
+// Write the direction of the underside in the plane of contact: a unit vector, or 0 if there is none.
+void find_axis(const mjData* d, int body, Neighbor neighbor, const mjtNum normal[3], mjtNum axis[3]);
+
+// Make the friction force on a link from isotropic friction with the largest coefficient.
+//   slip                  of the link in the last step
+//   damping_per_viscous   normal force divided by the time step
+void direct_force(mjtNum force[3], const mjtNum slip[3], const mjtNum axis[3], const Coefficients* coefficients,
+                  mjtNum damping_per_viscous);
+
 //---------------------------------- Flat ground -----------------------------------------------------------------------
 
 // What the ground remembers of a foot.
@@ -73,6 +123,11 @@ typedef struct {
   mjtNum force[3];        // friction force on the link in the last step; 0 for a new contact
   mjtNum number;          // in MuJoCo's contacts of the last step
   mjtNum is_new;          // 1: it had no friction force in the last step
+  mjtNum forward;         // coefficient divided by mu; likewise the next two
+  mjtNum backward;
+  mjtNum sideways;
+  mjtNum viscous_along;   // N·s/m
+  mjtNum viscous_across;  // N·s/m
 } RoughContact;
 
 // Add the friction forces to the wrenches of the links, and the opposite forces to the bodies that they touch.

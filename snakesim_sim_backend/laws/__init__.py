@@ -2,6 +2,7 @@
 
 `flat_ground`       the ground's forces on the feet
 `contact_friction`  friction of the contacts that MuJoCo finds
+`directional`       friction of both that depends on the direction of sliding
 `yielding`          obstacles on springs, and obstacles that slide on the ground
 `chain`             adds forces on the links to MuJoCo's generalized forces
 `laws`              what each version of the laws does

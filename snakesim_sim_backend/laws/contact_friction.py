@@ -25,12 +25,24 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.directional import (
+    BACKWARD,
+    FORWARD,
+    SIDEWAYS,
+    VISCOUS_ACROSS,
+    VISCOUS_ALONG,
+    Coefficients,
+    Underside,
+    combine_coefficients,
+    direct_force,
+)
 from snakesim_sim_backend.laws.laws import find_normal_forces_n
 
 # Numbers per contact in `userdata`: its key, the link's body, the other body, the mass that the spring has to follow in
-# kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, and the contact point in the frame of the
-# link (3) and of the other body (3).
-NUMBERS_PER_CONTACT = 17
+# kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, the contact point in the frame of the link
+# (3) and of the other body (3), the coefficients forward, backward and sideways divided by mu, and viscous friction
+# along and across the link in N·s/m.
+NUMBERS_PER_CONTACT = 22
 CONTACTS_PER_LINK = 16  # on average; the contacts beyond that number have no friction
 CONTACTS_PER_PAIR = 64  # of two geoms: more than MuJoCo makes, so that keys are unique
 END_MOBILITY = 4.0  # how many times as easily a rod moves at its end as in its middle
@@ -66,6 +78,8 @@ class ContactFriction:
         s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the spring, tangential to the surface
         F  = -(k s + d ds), limited to |F| <= mu N   friction force on the link
 
+    On surfaces on which links slide more easily in one direction, `directional` changes F.
+
     Attributes:
         min_friction: lowest coefficient that is used; above 0 only while a robot settles.
         geom_pairs: geoms of all contacts of the last step, in MuJoCo's order.
@@ -80,6 +94,7 @@ class ContactFriction:
         chain: Chain,
         link_geoms: Collection[int],
         memory: Floats,
+        underside: Underside,
     ) -> None:
         """Prepare the law for a compiled model.
 
@@ -89,6 +104,7 @@ class ContactFriction:
             chain: collects the forces on the links.
             link_geoms: numbers of the links' geoms.
             memory: (count_numbers(n_links),), a view of `userdata`: the number of contacts, then those.
+            underside: of the links.
         """
         step_s = float(model.opt.timestep)
         self._model = model
@@ -100,11 +116,14 @@ class ContactFriction:
 
         # Properties of geoms and bodies.
         self._friction: list[float] = model.geom_friction[:, 0].tolist()  # Coulomb coefficient with a link
+        self._directions: list[list[float]] = model.geom_user.tolist()
+        self._underside = underside
         self._link_geoms = frozenset(link_geoms)
         self._body_of_geom: list[int] = model.geom_bodyid.tolist()
         self._mobility = [_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]  # 1/kg
         self._stiffness_per_kg = (PHASE_RAD / step_s) * (PHASE_RAD / step_s)  # N/m for each kg
         self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / (step_s * step_s)  # N per m in one step, for each kg
+        self._damping_per_viscous = 1.0 / step_s  # 1/s
 
         # Views of MuJoCo's arrays.
         self._contact = data.contact
@@ -139,7 +158,7 @@ class ContactFriction:
             other_body = int(other_body)
             point_w = self._to_world(link_body, *points[:3])
             x, y, z = point_w
-            ox, oy, oz = self._to_world(other_body, *points[3:])
+            ox, oy, oz = self._to_world(other_body, *points[3:6])
 
             # ds, and s + ds
             dx, dy, dz = _project_to_tangent(x - ox, y - oy, z - oz, nx, ny, nz)
@@ -157,6 +176,11 @@ class ContactFriction:
             fz = k * sz + d * dz
             scale = -_limit_scale(mu_n, math.sqrt(fx * fx + fy * fy + fz * fz))
             force_w = (scale * fx, scale * fy, scale * fz)
+            coefficients = Coefficients(mu_n, *points[6:])
+            if coefficients.is_directional:
+                neighbor, weight = self._underside.find_neighbor(link_body, points[0])
+                axis_w = self._underside.find_axis(link_body, neighbor, weight, (nx, ny, nz))
+                force_w = direct_force(force_w, (dx, dy, dz), axis_w, coefficients, self._damping_per_viscous)
 
             self._stretch_and_force[key] = (sx, sy, sz), force_w
             forces_w.append(force_w)
@@ -199,7 +223,8 @@ class ContactFriction:
             else:
                 link, other, sign = second, first, 1.0
             presses = self.normal_force_n[i] > 0.0 and link in link_geoms
-            if presses and (friction[other] > 0.0 or self.min_friction > 0.0):
+            has_friction = friction[other] > 0.0 or max(self._directions[other][FORWARD:]) > 0.0
+            if presses and (has_friction or self.min_friction > 0.0):
                 rough.append(_RoughContact(i, link, other, sign))
         capacity = (len(self._memory) - 1) // NUMBERS_PER_CONTACT
         del rough[capacity:]
@@ -230,12 +255,48 @@ class ContactFriction:
 
             normal_w = [sign * along for along in frames[i][:3]]  # MuJoCo's is from the first geom to the second
             mass_kg = 1.0 / (link_bodies.count(link_body) * (mobility[link_body] + mobility[other_body]))
-            mu_n = max(self._friction[other_geom], self.min_friction) * self.normal_force_n[i]
+            nx, ny, nz = normal_w
+            link_point = self._to_body(link_body, *points_w[i])
+            coefficients = self._find_coefficients(link_geom, other_geom, link_point[0], (nx, ny, nz))
+            normal_force_n = self.normal_force_n[i]
+            mu_n = coefficients.largest * normal_force_n
             numbers += (key, link_body, other_body, mass_kg, mu_n, *normal_w, *stretch)
-            numbers += self._to_body(link_body, *points_w[i])
+            numbers += link_point
             numbers += self._to_body(other_body, *points_w[i])
+            numbers += (coefficients.forward, coefficients.backward, coefficients.sideways)
+            numbers += (
+                coefficients.viscous_along * normal_force_n,
+                coefficients.viscous_across * normal_force_n,
+            )
         self._memory[1 : 1 + len(numbers)] = numbers
         self._memory[0] = len(rough)
+
+    def _find_coefficients(self, link_geom: int, other_geom: int, along_m: float, normal_w: Vector) -> Coefficients:
+        """Return the coefficients of a contact.
+
+        Args:
+            link_geom: of the link.
+            other_geom: what it touches.
+            along_m: distance of the contact from the link's rear joint.
+            normal_w: normal of the surface, which points into the link.
+        """
+        friction = self._friction[other_geom]
+        forward = backward = sideways = friction
+        viscous_along = viscous_across = 0.0
+        if other_geom not in self._link_geoms:
+            surface = self._directions[other_geom]
+            factors = self._directions[link_geom]
+            viscous_across = surface[VISCOUS_ACROSS]
+            body = self._body_of_geom[link_geom]
+            neighbor, weight = self._underside.find_neighbor(body, along_m)
+            if self._underside.faces(body, neighbor, weight, normal_w):
+                forward = surface[FORWARD] * factors[FORWARD]
+                backward = surface[BACKWARD] * factors[BACKWARD]
+                sideways = surface[SIDEWAYS] * factors[SIDEWAYS]
+                viscous_along = surface[VISCOUS_ALONG]
+            else:
+                viscous_along = viscous_across
+        return combine_coefficients(forward, backward, sideways, viscous_along, viscous_across, self.min_friction)
 
     def _to_world(self, body: int, x: float, y: float, z: float) -> Vector:
         """Return the world coordinates of a point that is given in a body's frame, in m."""

@@ -24,12 +24,24 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.directional import (
+    BACKWARD,
+    FORWARD,
+    SIDEWAYS,
+    VISCOUS_ACROSS,
+    VISCOUS_ALONG,
+    Coefficients,
+    Underside,
+    combine_coefficients,
+    direct_force,
+)
 
 SINK_M = 2e-4  # how deep a foot sinks in under its share of the weight
 MAX_PHASE_RAD = 0.7  # the normal spring vibrates by at most this in one step; long steps get softer ground
 DAMPING_RATIO = 0.5  # of critical damping
 NUMBERS_PER_FOOT = 5  # in `userdata`: two of its slip, three of its position
 FOOT = 1.0  # first number of a geom's user data, if the geom is a foot that flat ground carries
+UP = (0.0, 0.0, 1.0)  # normal of the ground
 MIN_DIVISOR = 1e-12  # keeps 0 / 0 out of the friction of a foot without load
 
 
@@ -41,7 +53,14 @@ class Feet:
     first_body: int  # MuJoCo's number of the tail link's body
     carried_kg: Floats  # (n_feet,), mass that each foot carries when the robot lies straight
     radius_m: float
-    friction: float  # Coulomb coefficient
+    friction: float  # Coulomb coefficient, of sides and backs of links
+    directions: list[list[float]]  # user data of each foot's geom, see `directional`
+
+    @property
+    def are_directional(self) -> bool:
+        """Return whether the ground has viscous friction, or rubs otherwise than equally in all directions."""
+        same = [self.friction] * 3 + [0.0] * 2
+        return any(numbers[FORWARD:] != same for numbers in self.directions)
 
 
 def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float) -> Feet:
@@ -50,7 +69,7 @@ def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: floa
     geoms = np.array([model.geom(f"foot_{i}").id for i in range(links + 1)])
     carried_kg = 0.5 * (np.append(masses_kg, 0.0) + np.append(0.0, masses_kg))
     friction = float(model.geom_friction[geoms[0], 0])
-    return Feet(geoms, first_body, carried_kg, radius_m, friction)
+    return Feet(geoms, first_body, carried_kg, radius_m, friction, model.geom_user[geoms].tolist())
 
 
 class FlatGround:
@@ -67,6 +86,8 @@ class FlatGround:
         s  = (s + ds) min(1, mu N / (k |s + ds|))    stretch of the tangential spring, limited by friction
         F  = -(k s + d ds), limited to |F| <= mu N   friction force
 
+    On ground on which links slide more easily in one direction, `directional` changes F.
+
     A call of NumPy costs more than what it computes for so few feet, and a physics step runs each millisecond or two.
     So `apply` makes few calls, on arrays and views that were allocated before. An array `..._xy` holds x and y of the
     first foot, then of the next: viewed as complex numbers, each foot has one number, whose absolute value is a length.
@@ -76,7 +97,10 @@ class FlatGround:
         normal_force_n: (n_feet,), normal force on each foot in the last step.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, feet: Feet) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, feet: Feet, underside: Underside
+    ) -> None:
+        """Prepare the law for a compiled model, its feet and the undersides of its links."""
         count = len(feet.geoms)
         gravity = -float(model.opt.gravity[2])
         step_s = float(model.opt.timestep)
@@ -90,6 +114,10 @@ class FlatGround:
 
         # Parameters of the law.
         self._friction = feet.friction
+        self._is_directional = feet.are_directional
+        self._directions = feet.directions
+        self._underside = underside
+        self._step_s = step_s
         self._stiffness = stiffness
         self._minus_stiffness = -stiffness
         self._minus_damping = -damping
@@ -109,6 +137,9 @@ class FlatGround:
         count = len(feet.geoms)
         both = 2 * count
         bodies = np.minimum(np.arange(count) + first, first + count - 2)  # the head's link has two feet
+        self._bodies: list[int] = bodies.tolist()
+        # A foot at a joint has as much of the link behind as of its own.
+        self._neighbors = [(first, 0.0), *((body - 1, 0.5) for body in self._bodies[1:-1]), (self._bodies[-1], 0.0)]
         xy = np.add.outer(3 * feet.geoms, [0, 1]).ravel()
         z = 3 * feet.geoms + 2
         self._positions = data.geom_xpos.reshape(-1)
@@ -167,7 +198,14 @@ class FlatGround:
         normal_force_n *= self._minus_damping
         normal_force_n += self._minus_stiffness * height
         self.normal_force_n = np.maximum(normal_force_n, self._zeros)
-        max_friction_n = max(self._friction, self.min_friction) * self.normal_force_n
+        coefficients: list[Coefficients] = []
+        slips: list[list[float]] = []
+        if self._is_directional:
+            coefficients = [self._find_coefficients(foot) for foot in range(len(self._bodies))]
+            slips = slip_xy.reshape(-1, 2).tolist()
+            max_friction_n = np.array([each.largest for each in coefficients]) * self.normal_force_n
+        else:
+            max_friction_n = max(self._friction, self.min_friction) * self.normal_force_n
         divisor = np.maximum(max_friction_n, self._min_divisor)
 
         # s = (s + ds) min(1, mu N / (k |s + ds|))
@@ -180,9 +218,42 @@ class FlatGround:
         self._pull_xy += slip_xy
         forces = self._forces
         np.multiply(self._pull_by_axis, max_friction_n / np.maximum(np.abs(self._pull), divisor), forces[:2])
+        if self._is_directional:
+            self._direct_forces(coefficients, slips)
         forces[2] = self.normal_force_n
         forces[3:] = forces[:2]
         self._push_links()
+
+    def _find_coefficients(self, foot: int) -> Coefficients:
+        """Return the coefficients of a foot, by how its links lie on the ground now."""
+        numbers = self._directions[foot]
+        viscous_across = numbers[VISCOUS_ACROSS]
+        neighbor, weight = self._neighbors[foot]
+        if not self._underside.faces(self._bodies[foot], neighbor, weight, UP):
+            side = self._friction
+            return combine_coefficients(side, side, side, viscous_across, viscous_across, self.min_friction)
+        return combine_coefficients(
+            numbers[FORWARD],
+            numbers[BACKWARD],
+            numbers[SIDEWAYS],
+            numbers[VISCOUS_ALONG],
+            viscous_across,
+            self.min_friction,
+        )
+
+    def _direct_forces(self, coefficients: list[Coefficients], slips: list[list[float]]) -> None:
+        """Change the friction forces of the feet by the direction in which they slide."""
+        for foot, of_foot in enumerate(coefficients):
+            if of_foot.is_directional:
+                neighbor, weight = self._neighbors[foot]
+                axis_w = self._underside.find_axis(self._bodies[foot], neighbor, weight, UP)
+                force_x, force_y = self._forces[:2, foot].tolist()
+                slip_x, slip_y = slips[foot]
+                damping_per_viscous = float(self.normal_force_n[foot]) / self._step_s
+                force_x, force_y, _ = direct_force(
+                    (force_x, force_y, 0.0), (slip_x, slip_y, 0.0), axis_w, of_foot, damping_per_viscous
+                )
+                self._forces[:2, foot] = force_x, force_y
 
     def _push_links(self) -> None:
         """Add the forces, and their moments about MuJoCo's reference point, to the links of the chain."""

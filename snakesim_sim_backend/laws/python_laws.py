@@ -7,6 +7,7 @@ import mujoco
 from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.laws.chain import Chain
 from snakesim_sim_backend.laws.contact_friction import ContactFriction, count_numbers
+from snakesim_sim_backend.laws.directional import Underside
 from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT, FlatGround
 from snakesim_sim_backend.laws.laws import Laws
 from snakesim_sim_backend.laws.yielding import Yielding
@@ -25,16 +26,18 @@ class PythonLaws(Laws):
         self._model = model
         self._data = data
         chain = Chain(data, sim.first_link_body, links)
+        half_lengths_m = model.geom_size[sim.link_geoms, 1]
+        underside = Underside(data, sim.first_link_body, (2.0 * half_lengths_m).tolist())
 
         start = NUMBERS_PER_FOOT * (links + 1)
         memory = data.userdata[start : start + count_numbers(links)]
-        self._friction = ContactFriction(model, data, chain, sim.link_geoms, memory)
+        self._friction = ContactFriction(model, data, chain, sim.link_geoms, memory, underside)
         self.contacts = self._friction
         self._force_laws: list[Callable[[], None]] = [self._friction.apply]
 
         self._ground: FlatGround | None = None
         if sim.feet is not None:
-            self._ground = FlatGround(model, data, chain, sim.feet)
+            self._ground = FlatGround(model, data, chain, sim.feet, underside)
             self._force_laws.append(self._ground.apply)
         if sim.yielding:
             self._force_laws.append(Yielding(model, data, len(sim.yielding)).apply)

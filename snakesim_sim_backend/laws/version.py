@@ -12,6 +12,7 @@ import mujoco
 from snakesim_native.libraries import LAWS
 from snakesim_native.load import load
 from snakesim_sim_backend.laws.contact_friction import count_numbers
+from snakesim_sim_backend.laws.directional import USER_NUMBERS_OF_GEOM
 from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT
 from snakesim_sim_backend.laws.yielding import DOFS, SPRING_NUMBERS
 
@@ -23,7 +24,6 @@ TOUCHES_PLUGIN = "snakesim.touches"
 FRICTION_INSTANCE = "dry_friction"  # names in MuJoCo's model
 YIELDING_INSTANCE = "yielding"
 TOUCHES_INSTANCE = "touches"
-USER_NUMBERS_OF_GEOM = 1
 
 
 def choose_laws() -> LawsVersion:

@@ -26,6 +26,7 @@ from snakesim_sim_backend.laws.chain import FREE_DOFS
 from snakesim_sim_backend.laws.flat_ground import FOOT, Feet, find_feet
 from snakesim_sim_backend.laws.version import LawsVersion, add_laws, choose_laws
 from snakesim_sim_backend.laws.yielding import check_yielding
+from snakesim_sim_backend.model.friction import set_friction
 from snakesim_sim_backend.model.ground import add_ground
 from snakesim_sim_backend.model.imu import add_imus
 from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, geom_name
@@ -145,12 +146,7 @@ def make_blueprint(
 
     # Friction and the other laws.
     links = config.robot.chain.modules + 1
-    foot_names = [f"foot_{i}" for i in range(links + 1)]
-    friction_of = dict.fromkeys([*rough_ground_geoms, *foot_names], config.scene.ground.friction)
-    friction_of |= {geom_name(item): item.friction for item in placed}
-    friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
-    for geom in spec.geoms:
-        geom.friction[0] = friction_of.get(geom.name, 0.0)
+    set_friction(spec, config, placed, rough_ground_geoms, settings.self_friction)
     add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
     return Blueprint(spec, steps_per_tick, yielding, laws)
 
@@ -312,7 +308,7 @@ def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, 
         contype=0,
         conaffinity=0,
         group=FOOT_GROUP,
-        userdata=[FOOT if stands else 0.0],
+        userdata=[FOOT if stands else 0.0],  # `set_friction` adds to it
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.friction import surface_friction
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, Advance, energy_j, energy_j_per_m
@@ -45,12 +46,14 @@ class Effort:
         cost_of_transport = None
         if has_power:
             cost_of_transport = _cost_of_transport(record, advance)
-        # Dragging the robot over flat ground costs its weight times the friction: compare with that.
+        # Dragging the robot forward over flat ground costs its weight times the friction: compare with that.
         propulsive_efficiency = None
         ground = record.config.scene.ground
+        robot = record.config.robot
         is_flat = ground.heightfield is None
         if cost_of_transport is not None and cost_of_transport > 0 and is_flat:
-            propulsive_efficiency = ground.friction / cost_of_transport
+            friction = surface_friction(ground.friction, ground, robot.skin, robot.wheels)
+            propulsive_efficiency = friction.forward / cost_of_transport
         return Effort(
             body_lengths_s=advance.reached_m / advance.until_s / _body_length_m(record),
             cost_of_transport=cost_of_transport,

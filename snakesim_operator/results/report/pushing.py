@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.friction import surface_friction
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score
@@ -116,7 +117,9 @@ def _force_chart(record: RunRecord) -> Figure:
         Line("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
     ]
     weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)
-    drag_n = record.config.scene.ground.friction * weight_n
+    ground = record.config.scene.ground
+    robot = record.config.robot
+    drag_n = surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * weight_n
     label = "Contact forces along the body over time"
     return lines(label, "force, N", drawn, end_s(record), levels=[(drag_n, "friction of the ground")])
 

@@ -1,0 +1,170 @@
+"""Friction that depends on the direction in which a link slides, for flat ground and for all other contacts.
+
+Both laws of dry friction compute a force u with |u| <= mu N, from the stretch of a spring. Here mu is the largest of
+the coefficients forward, backward and sideways, and u is reduced along and across the link:
+
+    F = -N_c ds - D u        on a link, with u pointing along the slip
+
+    D   diagonal in the link's frame: coefficient / mu, along the link that of its direction of sliding
+    N_c diagonal in the link's frame: viscous damping, N per m of slip ds in one step
+
+- **Sticking.** The forces that hold a link are all within two half ellipses, whose half axes are forward, backward and
+  sideways coefficient, times N.
+- **Sliding.** u is parallel to the velocity v, so F = -N (mu_along v_along, mu_across v_across) / |v|. That is the law
+  of Hu et al. It dissipates in every direction, because every coefficient is positive. It is not the law of maximum
+  dissipation, whose force would be normal to the ellipse: F = -N (mu_along^2 v_along, mu_across^2 v_across) /
+  |(mu_along v_along, mu_across v_across)|. The two agree along the axes of the link, and if all coefficients are equal.
+
+The underside of a robot is taken as a smooth curve: halfway between its joints it has the direction of the link, and at
+a joint the mean direction of both links. A straight piece of each link would rub sideways next to every bent joint.
+
+Sides and back of a link have no scales or wheels. They rub with one coefficient in all directions.
+
+Source: D. L. Hu, J. Nirody, T. Scott and M. J. Shelley, "The mechanics of slithering locomotion", PNAS 106, 2009.
+"""
+
+import math
+from typing import NamedTuple
+
+import mujoco
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.wire.quantities import Vector
+
+# Numbers of a geom in its user data, after the mark of a foot. For a foot and a surface they are coefficients with the
+# underside of a link, and viscous ones in s/m; for a link they are factors on the coefficients of a surface.
+FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS = range(6)
+USER_NUMBERS_OF_GEOM = 6
+
+UNDERSIDE_COSINE = 0.7  # of the angle between a surface's normal and a link's z axis: within 45 degrees
+MIN_AXIS = 0.1  # length of the mean of two directions; below it the body is folded, and has none
+NO_AXIS = (0.0, 0.0, 0.0)
+
+
+class Coefficients(NamedTuple):
+    """Coefficients of one contact or foot."""
+
+    largest: float  # mu
+    forward: float  # divided by the largest; likewise the next two
+    backward: float
+    sideways: float
+    viscous_along: float  # s/m
+    viscous_across: float  # s/m
+
+    @property
+    def is_directional(self) -> bool:
+        """Return whether the force differs from isotropic dry friction with the largest coefficient."""
+        return (
+            self.forward != 1.0
+            or self.backward != 1.0
+            or self.sideways != 1.0
+            or self.viscous_along > 0.0
+            or self.viscous_across > 0.0
+        )
+
+
+def combine_coefficients(
+    forward: float, backward: float, sideways: float, viscous_along: float, viscous_across: float, min_friction: float
+) -> Coefficients:
+    """Return the coefficients of a contact, none of which is lower than `min_friction`."""
+    forward = max(forward, min_friction)
+    backward = max(backward, min_friction)
+    sideways = max(sideways, min_friction)
+    largest = max(forward, backward, sideways)
+    if largest == 0.0:
+        return Coefficients(0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across)
+    return Coefficients(
+        largest, forward / largest, backward / largest, sideways / largest, viscous_along, viscous_across
+    )
+
+
+class Underside:
+    """The undersides of the links of one simulation."""
+
+    def __init__(self, data: mujoco.MjData, first_body: int, lengths_m: list[float]) -> None:
+        """Prepare views. lengths_m: of the links, tail to head."""
+        self._rotations = data.xmat  # world_from_body, row by row
+        self._first_body = first_body
+        self._last_body = first_body + len(lengths_m) - 1
+        self._lengths_m = lengths_m
+
+    def find_neighbor(self, body: int, along_m: float) -> tuple[int, float]:
+        """Return the link that a point of a link is nearest to besides its own, and the weight of its direction.
+
+        Args:
+            body: MuJoCo's number of the link's body.
+            along_m: distance of the point from the link's rear joint.
+
+        Returns:
+            MuJoCo's number of the neighbor's body, and its weight: 0 in the middle of the link, 0.5 at a joint.
+        """
+        length_m = self._lengths_m[body - self._first_body]
+        from_middle = along_m / length_m - 0.5
+        neighbor = body + 1 if from_middle > 0.0 else body - 1
+        if neighbor < self._first_body or neighbor > self._last_body:
+            return body, 0.0
+        return neighbor, min(abs(from_middle), 0.5)
+
+    def faces(self, body: int, neighbor: int, weight: float, normal_w: Vector) -> bool:
+        """Return whether a surface with this normal, which points into the link, touches the underside."""
+        nx, ny, nz = normal_w
+        ux, uy, uz = self._mix(body, neighbor, weight, 2)
+        return ux * nx + uy * ny + uz * nz > UNDERSIDE_COSINE
+
+    def find_axis(self, body: int, neighbor: int, weight: float, normal_w: Vector) -> Vector:
+        """Return the direction of the underside in the plane of contact, a unit vector, or `NO_AXIS`."""
+        nx, ny, nz = normal_w
+        x, y, z = self._mix(body, neighbor, weight, 0)
+        along = x * nx + y * ny + z * nz
+        x, y, z = x - along * nx, y - along * ny, z - along * nz
+        length = math.sqrt(x * x + y * y + z * z)
+        if length < MIN_AXIS:
+            return NO_AXIS
+        return x / length, y / length, z / length
+
+    def _mix(self, body: int, neighbor: int, weight: float, column: int) -> Vector:
+        """Return the weighted mean of one axis of two links."""
+        x, y, z = _read_axis(self._rotations, body, column)
+        ox, oy, oz = _read_axis(self._rotations, neighbor, column)
+        own = 1.0 - weight
+        return own * x + weight * ox, own * y + weight * oy, own * z + weight * oz
+
+
+def direct_force(
+    force_w: Vector,
+    slip_w: Vector,
+    axis_w: Vector,
+    coefficients: Coefficients,
+    damping_per_viscous: float,
+) -> Vector:
+    """Return the friction force on a link, made from isotropic friction with the largest coefficient.
+
+    Args:
+        force_w: isotropic friction force on the link, -u, in N.
+        slip_w: slip of the link in the last step, ds, in m.
+        axis_w: direction of the link in the plane of contact; `NO_AXIS`: sideways in all directions.
+        coefficients: of this contact.
+        damping_per_viscous: normal force divided by the time step, in N/s.
+    """
+    ax, ay, az = axis_w
+    fx, fy, fz = force_w
+    sx, sy, sz = slip_w
+    along = fx * ax + fy * ay + fz * az
+    slip_along = sx * ax + sy * ay + sz * az
+    # A force that points backward brakes a link that slides forward.
+    ratio = coefficients.forward if along < 0.0 else coefficients.backward
+    sideways = coefficients.sideways
+    damping_along = damping_per_viscous * coefficients.viscous_along
+    damping_across = damping_per_viscous * coefficients.viscous_across
+    result_along = ratio * along - damping_along * slip_along
+    return (
+        result_along * ax + sideways * (fx - along * ax) - damping_across * (sx - slip_along * ax),
+        result_along * ay + sideways * (fy - along * ay) - damping_across * (sy - slip_along * ay),
+        result_along * az + sideways * (fz - along * az) - damping_across * (sz - slip_along * az),
+    )
+
+
+def _read_axis(rotations: Floats, body: int, column: int) -> Vector:
+    """Return one axis of a body's frame in the world frame."""
+    rotation = rotations[body].tolist()
+    return rotation[column], rotation[column + 3], rotation[column + 6]

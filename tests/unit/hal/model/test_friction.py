@@ -1,0 +1,61 @@
+"""Coefficients of friction by direction: what skins, wheels and surfaces make of them, and which files are refused."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.model.friction import Skin, Surface, Wheels, link_factors, surface_friction
+from snakesim_testing.sim.simulator_rig import make_config
+
+SCALES = {"forward": 0.11, "backward": 0.14, "sideways": 0.19}
+WHEELS = {"radius_m": 0.03, "bearing_radius_m": 0.004, "bearing_friction": 0.03}
+
+
+def test_robot_without_skin_rubs_equally_in_all_directions() -> None:
+    assert surface_friction(0.3, Surface(), None, None) == (0.3, 0.3, 0.3)
+
+
+@pytest.mark.parametrize("friction", [0.19, 0.38])
+def test_only_ratios_of_a_skin_matter(friction: float) -> None:
+    scale = friction / 0.19
+    expected = pytest.approx((0.11 * scale, 0.14 * scale, 0.19 * scale))
+    assert surface_friction(friction, Surface(), Skin(**SCALES), None) == expected
+
+
+def test_coefficients_of_a_surface_replace_those_of_the_skin() -> None:
+    surface = Surface(forward_friction=0.05)
+    assert surface_friction(0.19, surface, Skin(**SCALES), None) == pytest.approx((0.05, 0.14, 0.19))
+    assert surface_friction(0.3, surface, None, None) == (0.05, 0.3, 0.3)
+
+
+def test_wheels_roll_along_and_slide_sideways() -> None:
+    wheels = Wheels(**WHEELS, rolling_resistance=0.01, tire_friction=0.6)
+    assert surface_friction(0.2, Surface(forward_friction=0.1), None, wheels) == pytest.approx((0.014, 0.014, 0.6))
+    assert surface_friction(0.2, None, None, Wheels(**WHEELS)) == pytest.approx((0.004, 0.004, 0.2))
+
+
+def test_wheels_on_ice_slide_instead_of_rolling() -> None:
+    assert surface_friction(0.001, None, None, Wheels(**WHEELS)) == (0.001, 0.001, 0.001)
+
+
+def test_factors_of_a_link_are_its_coefficients_over_those_of_the_skin() -> None:
+    skin = msgspec.convert({**SCALES, "links": {"link_2": {"forward": 0.22, "sideways": 0.095}}}, Skin)
+    assert link_factors(skin, 4) == [(1, 1, 1), (1, 1, 1), pytest.approx((2.0, 1.0, 0.5)), (1, 1, 1)]
+    assert link_factors(None, 2) == [(1, 1, 1), (1, 1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("robot", "words"),
+    [
+        ({"skin": {**SCALES, "links": {"link_14": {}}}}, ["skin.links.link_14", "link_0", "link_13"]),
+        ({"skin": SCALES, "wheels": WHEELS}, ["[skin]", "[wheels]", "leave one out"]),
+        ({"wheels": {**WHEELS, "bearing_radius_m": 0.03}}, ["bearing_radius_m", "0.03 m", "below"]),
+        ({"skin": {**SCALES, "sideways": 0.0}}, ["> 0"]),
+    ],
+)
+def test_impossible_skins_and_wheels_are_refused(robot: dict[str, Any], words: list[str]) -> None:
+    with pytest.raises(msgspec.ValidationError) as refused:
+        make_config(robot)
+    for word in words:
+        assert word in str(refused.value)
