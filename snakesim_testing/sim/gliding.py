@@ -1,0 +1,120 @@
+"""A straight, stiff snake that glides over level ground of every kind, and an integrator of the same without MuJoCo."""
+
+from typing import Any
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
+
+FRICTION = 0.19
+HEIGHT_M = 0.1  # of a step, and of an obstacle with a flat top
+FAR_M = 10.0  # from where the snake is built: no scene may have an obstacle under it
+STIFF_NM_PER_RAD = 200.0
+ROLL_AND_YAW_DOFS = [3, 5]
+LOCKED_KG_M2 = 1e4  # inertia about these axes, so that the round body does not roll or turn
+TOLERANCE_M_S = 1e-9
+
+LEVEL_HILLS = {"height_m": 1e-5, "wavelength_m": 0.8, "area_m": 40.0}
+SURFACES: dict[str, dict[str, Any]] = {
+    "flat ground": {"ground": {"friction": FRICTION}},
+    "level hills": {"ground": {"friction": FRICTION, "heightfield": LEVEL_HILLS}},
+    "step": {
+        "ground": {"friction": 0.9},
+        "step": [{"position_m": [FAR_M, 0.0], "size_m": [16.0, 16.0], "height_m": HEIGHT_M, "friction": FRICTION}],
+    },
+    "top of an obstacle": {
+        "ground": {"friction": 0.9},
+        "box": [{"position_m": [FAR_M, 0.0], "size_m": [16.0, 16.0, HEIGHT_M], "friction": FRICTION}],
+    },
+}
+
+
+class Glider:
+    """A straight snake of 8 modules at rest on one of `SURFACES`, which does not bend, roll or turn."""
+
+    def __init__(self, surface: str, robot: dict[str, Any], step_s: float = 0.002) -> None:
+        config = make_config({"chain": {"modules": 8}} | robot, SURFACES[surface])
+        self.sim, self.data, self.physics = lie_down(config, SimSettings(timestep_s=step_s))
+        self.model = self.sim.model
+        first = self.sim.first_link_body
+        links = len(self.sim.link_geoms)
+        self._masses_kg = self.model.body_mass[first : first + links]
+        self._forces_w = self.data.xfrc_applied[first : first + links]
+        self.mass_kg = float(self._masses_kg.sum())
+        self.model.jnt_stiffness[1:] = STIFF_NM_PER_RAD
+        self.model.dof_damping[6:] = 1.0
+        self.model.dof_armature[ROLL_AND_YAW_DOFS] = LOCKED_KG_M2
+        if surface in ("step", "top of an obstacle"):
+            self.data.qpos[0] = FAR_M
+            self.data.qpos[2] += HEIGHT_M
+        self.physics.begin()
+        self.go(0.6)
+
+    @property
+    def position_w(self) -> Floats:
+        """Return the position of the center of mass, (2,) in m."""
+        return self.data.subtree_com[self.sim.first_link_body, :2].copy()
+
+    def go(self, time_s: float) -> None:
+        """Simulate for a time."""
+        self.physics.step(round(time_s / self.model.opt.timestep))
+
+    def throw(self, velocity_w: Floats) -> None:
+        """Give the body a velocity, in m/s."""
+        self.data.qvel[:2] = velocity_w
+
+    def push(self, force_per_weight: Floats) -> None:
+        """Push every link by a force in proportion to its weight."""
+        self._forces_w[:, :2] = G * self._masses_kg[:, None] * force_per_weight
+
+    def drag(self, velocity_w: Floats, time_s: float) -> Floats:
+        """Drag the body at a constant velocity, and return the mean force on it in the second half, (2,) in N."""
+        step_s = self.model.opt.timestep
+        forces_n: list[Floats] = []
+        change = np.zeros(2)  # of the velocity in one step; the body moves with the velocity after it
+        for _ in range(round(time_s / step_s)):
+            before = velocity_w - change
+            self.throw(before)
+            self.physics.step(1)
+            change = self.data.qvel[:2] - before
+            forces_n.append(-self.mass_kg * change / step_s)
+        return np.mean(forces_n[len(forces_n) // 2 :], axis=0)
+
+
+def glide_without_mujoco(
+    velocity: Floats, coefficients: DirectionalFriction, time_s: float, step_s: float = 1e-4
+) -> Floats:
+    """Return the displacement of a body that glides along x and y without turning, (2,) in m.
+
+    It is integrated by the classical Runge-Kutta method, until the body stops.
+
+    Args:
+        velocity: at the start, along the body and across it, in m/s.
+        coefficients: of its friction.
+        time_s: time to integrate.
+        step_s: of the integrator.
+    """
+    moved = np.zeros(2)
+    velocity = np.array(velocity, dtype=np.float64)
+    for _ in range(round(time_s / step_s)):
+        if np.linalg.norm(velocity) < 2.0 * G * max(coefficients) * step_s:
+            break
+        first = _decelerate(velocity, coefficients)
+        second = _decelerate(velocity + 0.5 * step_s * first, coefficients)
+        third = _decelerate(velocity + 0.5 * step_s * second, coefficients)
+        fourth = _decelerate(velocity + step_s * third, coefficients)
+        change = step_s / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        moved += step_s * (velocity + 0.5 * change)
+        velocity += change
+    return moved
+
+
+def _decelerate(velocity: Floats, coefficients: DirectionalFriction) -> Floats:
+    """Return the acceleration by friction, (2,) in m/s²."""
+    along = coefficients.forward if velocity[0] > 0 else coefficients.backward
+    return (
+        -G * np.array([along, coefficients.sideways]) * velocity / max(float(np.linalg.norm(velocity)), TOLERANCE_M_S)
+    )
