@@ -1,4 +1,4 @@
-"""`python -m verification.gaits [NAME ...] [--seeds 5] [--write]`: how far each gait moves its robot, and its energy.
+"""`python -m verification.gaits [NAME ...] [--seeds 5] [--workers 2] [--write]`: how far each gait moves its robot, and its energy.
 
 Each row is a shipped scenario with one gait and some seeds of the sensors' noise. The distance is that of the center of
 mass from its first to its last place, in whichever direction it moved. `--write` puts the table into the page.
@@ -7,6 +7,7 @@ mass from its first to its last place, in whichever direction it moved. `--write
 import argparse
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,6 +77,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m verification.gaits", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="gaits to run (all)")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds, from 1 (5)")
+    parser.add_argument("--workers", type=int, default=2, help="runs side by side (2)")
     parser.add_argument("--write", action="store_true", help=f"write the table into {PAGE.name}; only with all gaits")
     asked = parser.parse_args()
     if unknown := set(asked.names) - {row.gait for row in ROWS}:
@@ -84,12 +86,14 @@ def main() -> int:
         parser.error("--write needs all gaits: leave the names out")
     table = HEADER
     print(HEADER, end="", flush=True)
-    for row in ROWS:
-        if asked.names and row.gait not in asked.names:
-            continue
-        line = format_row(row, [run_row(row, seed) for seed in range(1, asked.seeds + 1)])
-        print(line, end="", flush=True)
-        table += line
+    rows = [row for row in ROWS if not asked.names or row.gait in asked.names]
+    seeds = range(1, asked.seeds + 1)
+    with ProcessPoolExecutor(asked.workers) as pool:
+        trials = {row: [pool.submit(run_row, row, seed) for seed in seeds] for row in rows}
+        for row in rows:
+            line = format_row(row, [trial.result() for trial in trials[row]])
+            print(line, end="", flush=True)
+            table += line
     if asked.write:
         PAGE.write_text(put_table(PAGE.read_text(encoding="utf-8"), table), encoding="utf-8")
     return 0

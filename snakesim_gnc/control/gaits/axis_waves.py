@@ -23,7 +23,7 @@ Lag = Annotated[float, bounded(-3.2, 3.2, "rad")]
 class _WaveGait(Gait[GaitParametersT]):
     """A gait whose waves have a lag from joint to joint."""
 
-    blends_after_hold = False  # the digests of recorded runs depend on it
+    _blends_after_hold = False  # the digests of recorded runs depend on it
 
     def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
@@ -135,7 +135,7 @@ class RaisedHead(_WaveGait[RaisedHeadParameters]):
     The body behind lies in a wave of its yaw joints, because a straight round body would roll over.
     """
 
-    reason_to_stay = "it lifts its head, looks around, and travels nowhere"
+    _reason_to_stay = "it lifts its head, looks around, and travels nowhere"
 
     Parameters = RaisedHeadParameters
 

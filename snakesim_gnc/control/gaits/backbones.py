@@ -41,7 +41,7 @@ MIN_ARC_RAD = 1e-3  # the bend of a straight body, as an arc
 class BackboneSidewindingParameters(GaitParameters, frozen=True, kw_only=True):
     """Parameters of the helix, which transfer between robots."""
 
-    half_width: Annotated[float, from_zero(0.3, "body lengths")] = 0.07
+    half_width: Annotated[float, from_zero(0.3, "body lengths")] = 0.09
     """Half of the width of the helix, in the ground plane (A)."""
 
     half_height: Annotated[float, bounded(-0.1, 0.1, "body lengths")] = 0.015
@@ -123,7 +123,7 @@ class BackboneSidewinding(_BackboneGait[BackboneSidewindingParameters]):
     @classmethod
     def check(cls, robot: Description, parameters: BackboneSidewindingParameters) -> None:
         """Check that the joints can form the helix. Raises ConfigError."""
-        for axis in cls.required_axes:
+        for axis in cls._required_axes:
             curve = BodyCurve(robot, axis)
             curve.check_wavelength(
                 parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it"

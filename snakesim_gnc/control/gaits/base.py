@@ -34,13 +34,13 @@ class Gait(Controller[GaitParametersT]):
     computes the reference from the phase.
     """
 
-    required_axes: ClassVar[tuple[Axis, ...]] = ("pitch", "yaw")
+    _required_axes: ClassVar[tuple[Axis, ...]] = ("pitch", "yaw")
     """Axes of which the robot needs a joint. A robot without one holds its pose and reports the reason."""
 
-    reason_to_stay: ClassVar[str] = ""
+    _reason_to_stay: ClassVar[str] = ""
     """Why the gait does not travel; empty for a gait that travels."""
 
-    blends_after_hold: ClassVar[bool] = True
+    _blends_after_hold: ClassVar[bool] = True
     """Whether the command changes smoothly to the reference after the robot has held its pose.
 
     False: at once, so that only the command limiter smooths it.
@@ -51,7 +51,7 @@ class Gait(Controller[GaitParametersT]):
         self._bumpless = BumplessReference(robot, parameters.blend_s)
         self._phase_rad = 0.0
         self._holding = False  # in the tick before
-        self._reason_to_hold = explain_missing_joints(robot, self.required_axes)
+        self._reason_to_hold = explain_missing_joints(robot, self._required_axes)
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Advance the gait while motion is requested; a robot without the necessary joints holds its pose."""
@@ -60,11 +60,11 @@ class Gait(Controller[GaitParametersT]):
         passed_rad = math.tau * observation.period_s / self.parameters.period_s
         self._phase_rad += find_travel_sign(observation) * passed_rad
         reference_rad = self.find_reference_rad(observation, self._phase_rad)
-        restarted = self._holding and self.blends_after_hold
+        restarted = self._holding and self._blends_after_hold
         self._holding = False
         setpoints = self._bumpless.follow(observation, reference_rad, restarted=restarted)
         telemetry = Telemetry(
-            reason=self.reason_to_stay, reference_rad=reference_rad.tolist(), custom=self.list_custom_numbers()
+            reason=self._reason_to_stay, reference_rad=reference_rad.tolist(), custom=self.list_custom_numbers()
         )
         return ControllerCommand(setpoints, telemetry)
 

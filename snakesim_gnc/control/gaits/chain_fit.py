@@ -218,7 +218,7 @@ def _find_first_rotation(backbone: Backbone) -> Floats:
     x /= np.linalg.norm(x)
     y = np.cross(backbone.roll_normal, x)
     y /= np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+    return np.stack([x, y, np.cross(x, y)], axis=1).astype(np.float64)
 
 
 def _rotate(vector: Floats) -> Floats:

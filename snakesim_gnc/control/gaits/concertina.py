@@ -38,7 +38,7 @@ class ConcertinaParameters(GaitParameters, frozen=True, kw_only=True):
     folds: Annotated[int, Meta(ge=1, le=10)] = 1
     """Number of waves in each half of the body (m)."""
 
-    period_s: Seconds = 4.0
+    period_s: Seconds = 3.0
     """Time of a cycle: transfer, draw, extend."""
 
     blend_s: Seconds = 1.0
@@ -60,7 +60,7 @@ class Concertina(Gait[ConcertinaParameters]):
     """Moves forward in a channel whose walls the folds touch. It is slow, and holds at any time."""
 
     Parameters = ConcertinaParameters
-    required_axes = ("yaw",)
+    _required_axes = ("yaw",)
 
     @classmethod
     def check(cls, robot: Description, parameters: ConcertinaParameters) -> None:

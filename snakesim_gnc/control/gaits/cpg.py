@@ -48,10 +48,10 @@ MAX_STEP_S = 0.005  # of the integration
 class CpgParameters(GaitParameters, frozen=True, kw_only=True):
     """Parameters of the curve on the limit cycle, of the oscillators, of the feedback and of the steering."""
 
-    winding_angle_rad: WindingAngle = 0.7
+    winding_angle_rad: WindingAngle = 0.9
     """Angle between the curve's axis and its steepest tangent on the limit cycle (alpha)."""
 
-    wavelength: Wavelength = 0.67
+    wavelength: Wavelength = 0.8
     """Length of a wave along the body (lambda)."""
 
     period_s: Seconds = 1.6
@@ -138,7 +138,7 @@ class Cpg(Gait[CpgParameters]):
     """Moves as `serpenoid` does. Contacts shift the phases of the joints beside them."""
 
     Parameters = CpgParameters
-    required_axes = ("yaw",)
+    _required_axes = ("yaw",)
 
     @classmethod
     def check(cls, robot: Description, parameters: CpgParameters) -> None:

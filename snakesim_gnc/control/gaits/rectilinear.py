@@ -31,16 +31,16 @@ from snakesim_hal.wire.quantities import from_zero
 class RectilinearParameters(GaitParameters, frozen=True, kw_only=True):
     """Parameters of the wave, which transfer between robots."""
 
-    slope_rad: Annotated[float, from_zero(1.2, "rad")] = 0.4
+    slope_rad: Annotated[float, from_zero(1.2, "rad")] = 0.3
     """Steepest slope of the body (beta)."""
 
-    wavelength: Wavelength = 0.35
+    wavelength: Wavelength = 0.45
     """Length of a wave along the body (lambda)."""
 
-    stance_rad: Annotated[float, from_zero(1.5, "rad")] = 0.4
+    stance_rad: Annotated[float, from_zero(1.5, "rad")] = 0.9
     """Largest angle between the body and its axis in the ground plane; 0: straight, and likely to roll over."""
 
-    period_s: Seconds = 1.5
+    period_s: Seconds = 0.8
     """Period of the wave."""
 
     blend_s: Seconds = 1.0
@@ -51,7 +51,7 @@ class Rectilinear(Gait[RectilinearParameters]):
     """Moves forward without a sideways motion of the body. It needs pitch joints, and ground that holds the troughs."""
 
     Parameters = RectilinearParameters
-    required_axes = ("pitch", "yaw")
+    _required_axes = ("pitch", "yaw")
 
     @classmethod
     def check(cls, robot: Description, parameters: RectilinearParameters) -> None:

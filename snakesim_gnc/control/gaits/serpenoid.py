@@ -31,10 +31,10 @@ Wavelength = Annotated[float, bounded(0.1, 10, "body lengths")]
 class SerpenoidParameters(GaitParameters, frozen=True, kw_only=True):
     """Parameters of the curve, which transfer between robots, and of the directional control."""
 
-    winding_angle_rad: WindingAngle = 0.7
+    winding_angle_rad: WindingAngle = 0.9
     """Angle between the curve's axis and its steepest tangent (alpha)."""
 
-    wavelength: Wavelength = 0.67
+    wavelength: Wavelength = 0.8
     """Length of a wave along the body (lambda)."""
 
     period_s: Seconds = 1.6
@@ -72,7 +72,7 @@ class Serpenoid(Gait[SerpenoidParameters]):
     """Moves forward on ground on which links slide more easily along the body than sideways, and among push-points."""
 
     Parameters = SerpenoidParameters
-    required_axes = ("yaw",)
+    _required_axes = ("yaw",)
 
     @classmethod
     def check(cls, robot: Description, parameters: SerpenoidParameters) -> None:

@@ -32,16 +32,16 @@ from snakesim_hal.wire.quantities import bounded
 class SinusLiftingParameters(GaitParameters, frozen=True, kw_only=True):
     """Parameters of the curve, which transfer between robots, and of the directional control."""
 
-    winding_angle_rad: WindingAngle = 0.8
+    winding_angle_rad: WindingAngle = 1.0
     """Angle between the curve's axis and its steepest tangent, in the ground plane (alpha)."""
 
     wavelength: Wavelength = 0.7
     """Length of a wave along the body (lambda). The wave of the height is half as long."""
 
-    lift_slope_rad: Annotated[float, bounded(-1, 1, "rad")] = 0.25
+    lift_slope_rad: Annotated[float, bounded(-1, 1, "rad")] = 0.05
     """Steepest slope of the lifted parts (beta); negative: the straight parts are lifted instead."""
 
-    period_s: Seconds = 1.6
+    period_s: Seconds = 1.5
     """Period of the wave."""
 
     k_theta: SteeringGain = 0.0
@@ -61,7 +61,7 @@ class SinusLifting(Gait[SinusLiftingParameters]):
     """Moves forward on level ground, also if its friction is isotropic. It needs yaw and pitch joints."""
 
     Parameters = SinusLiftingParameters
-    required_axes = ("pitch", "yaw")
+    _required_axes = ("pitch", "yaw")
 
     @classmethod
     def check(cls, robot: Description, parameters: SinusLiftingParameters) -> None:
