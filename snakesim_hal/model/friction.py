@@ -174,7 +174,7 @@ def check_skin(skin: Skin | None, wheels: Wheels | None, link_names: Sequence[st
     if skin is None:
         return
     if wheels is not None:
-        raise ValueError("it has [skin] and [wheels], and each of them says how links slide; leave one out")
+        raise ValueError("it has [skin] and [wheels], and both describe how links slide; leave one out")
     for name in skin.links:
         if name not in link_names:
             raise ValueError(f"[skin.links.{name}]: this robot has {link_names[0]} (tail) to {link_names[-1]} (head)")

@@ -119,6 +119,8 @@ def momentum_balance(
     coefficients: DirectionalFriction,
     viscous_s_per_m: complex = 0.0,
     step_s: float = BALANCE_STEP_S,
+    *,
+    in_the_middle: bool = False,
 ) -> Track:
     """Compute the same without MuJoCo: links of prescribed angles in the plane, friction at the feet, momentum.
 
@@ -130,6 +132,7 @@ def momentum_balance(
         coefficients: of dry friction, by the direction of sliding.
         viscous_s_per_m: along the link, and as imaginary part across it.
         step_s: of the integrator.
+        in_the_middle: each link rubs in its middle, as with wheels there, and not at its ends.
     """
     robot = make_config().robot
     lengths, masses = np.array(robot.link_lengths_m), np.array(robot.link_masses_kg)
@@ -160,8 +163,14 @@ def momentum_balance(
         velocities = speed + 1j * spin * (feet - base) + feet_rates
         tangents = np.append(directions, 0.0) + np.append(0.0, directions)
         tangents /= np.abs(tangents)
-        rub = loads_n * tangents * brake(velocities * np.conj(tangents), coefficients, viscous_s_per_m)
-        momentum += step_s * np.array([rub.sum().real, rub.sum().imag, np.sum((np.conj(feet - place) * rub).imag)])
+        points = feet
+        if in_the_middle:
+            velocities = speed + 1j * spin * (middles - base) + middle_rates
+            tangents = directions
+            points = middles
+        weights_n = G * masses if in_the_middle else loads_n
+        rub = weights_n * tangents * brake(velocities * np.conj(tangents), coefficients, viscous_s_per_m)
+        momentum += step_s * np.array([rub.sum().real, rub.sum().imag, np.sum((np.conj(points - place) * rub).imag)])
         pose += step_s * np.array([speed.real, speed.imag, spin])
         center[k] = place.real, place.imag
         axis[k] = (feet[-1] - feet[0]).real, (feet[-1] - feet[0]).imag
