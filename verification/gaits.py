@@ -1,4 +1,4 @@
-"""`python -m verification.gaits [NAME ...] [--seeds 5] [--workers 2] [--write]`: distance, speed and energy of each gait.
+"""`python -m verification.gaits [NAME ...] [--seeds N] [--workers N] [--write]`: measures what each gait achieves.
 
 Each row is a shipped scenario with one gait and some seeds of the sensors' noise. The distance is that of the center of
 mass from its first to its last place, in whichever direction it moved. `--write` puts the table into the page.
