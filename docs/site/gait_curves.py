@@ -13,6 +13,7 @@ from snakesim_gnc.control.gaits.sinus_lifting import SinusLiftingParameters
 
 LENGTH_PX = 250.0  # of a body that is straight
 POINTS = 120
+ENLARGED = 5.0  # heights of sinus-lifting
 PLACES = np.linspace(0.0, 1.0, POINTS)  # from the tail
 MIDDLES_FROM_HEAD = 1.0 - 0.5 * (PLACES[1:] + PLACES[:-1])
 
@@ -24,7 +25,7 @@ def draw_gait_curves() -> Drawing:
         ("serpenoid, cpg", "from above", _list_serpenoid()),
         ("concertina", "from above: transfer, draw, extend", _list_concertina()),
         ("rectilinear", "from the side", _list_rectilinear()),
-        ("sinus_lifting", "height, from the side", _list_lifts()),
+        ("sinus_lifting", "from the side, heights enlarged 5 times", _list_lifts()),
         ("backbone_sidewinding", "from above, and the height", _list_helix()),
         ("backbone_rolling", "from above: the arc stays, the body turns", _list_arc()),
     )
@@ -34,7 +35,7 @@ def draw_gait_curves() -> Drawing:
         drawing.text(left, top, name, "t b")
         drawing.text(left, top + 18.0, view)
         for row, curve in enumerate(curves):
-            middle = top + 62.0 + 62.0 * row
+            middle = top + 62.0 + 62.0 * row if len(curves) > 1 else top + 100.0
             x, y = curve
             y = y - 0.5 * (y.max() + y.min())
             points = [
@@ -85,7 +86,8 @@ def _list_lifts():
     curves = []
     for phase in (0.0, math.tau / 6, math.tau / 3):
         u = phase - math.tau * MIDDLES_FROM_HEAD / p.wavelength
-        curves.append(_integrate(p.lift_slope_rad * np.sin(2.0 * u)))
+        x, z = _integrate(p.lift_slope_rad * np.sin(2.0 * u))
+        curves.append((x, ENLARGED * z))
     return curves
 
 

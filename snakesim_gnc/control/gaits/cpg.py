@@ -160,6 +160,7 @@ class Cpg(Gait[CpgParameters]):
             k_theta=parameters.k_theta,
             look_ahead=parameters.look_ahead,
             max_bend_rad=parameters.max_bend_rad,
+            filter_s=parameters.period_s,
         )
         from_head = self._curve.from_head
         piece_distance = from_head[:-1] - from_head[1:]  # (n_yaw,) l of every joint

@@ -13,7 +13,9 @@ look-ahead distance Delta,
 Every joint gets an offset in proportion to the error. Here the offset is a bend of the whole body, so that it does not
 depend on the number of joints:
 
-    bend = k_theta (theta_ref - theta_bar).
+    bend = k_theta (theta_ref - theta_bar),
+
+low-pass filtered over a period of the gait, because the mean heading swings with the wave.
 """
 
 import math
@@ -35,28 +37,41 @@ MaxBend = Annotated[float, from_zero(6, "rad")]
 
 
 class HeadingControl:
-    """Computes the bend of one robot. It has no state besides the path."""
+    """Computes the bend of one robot."""
 
-    def __init__(self, robot: Description, *, k_theta: float, look_ahead: float, max_bend_rad: float) -> None:
-        """Start without a path.
+    def __init__(
+        self, robot: Description, *, k_theta: float, look_ahead: float, max_bend_rad: float, filter_s: float
+    ) -> None:
+        """Start without a path and without a bend.
 
         Args:
             robot: description of the robot.
             k_theta: bend of the whole body for each radian of heading error; 0 switches the control off.
             look_ahead: look-ahead distance Delta in body lengths.
             max_bend_rad: bound of the bend.
+            filter_s: time constant of the low-pass filter.
         """
         self._body = PlanarBody(robot)
         self._k_theta = k_theta
         self._look_ahead_m = look_ahead * self._body.length_m
         self._max_bend_rad = max_bend_rad
+        self._filter_s = filter_s
+        self._bend_rad = 0.0
         self._route: Route | None = None
         self._path_id: int | None = None
         self.error_rad = 0.0  # theta_ref - theta_bar of the last tick; 0.0: unknown
 
     def find_bend_rad(self, observation: Observation) -> float:
-        """Return the bend of the whole body, to the left positive; 0.0 without a world model or a path."""
-        self.error_rad = 0.0
+        """Return the bend of the whole body, to the left positive. Call it in every tick."""
+        self.error_rad = self._find_error_rad(observation)
+        desired_rad = self._k_theta * self.error_rad
+        desired_rad = min(max(desired_rad, -self._max_bend_rad), self._max_bend_rad)
+        gain = 1.0 - math.exp(-observation.period_s / self._filter_s)
+        self._bend_rad += gain * (desired_rad - self._bend_rad)
+        return self._bend_rad
+
+    def _find_error_rad(self, observation: Observation) -> float:
+        """Return theta_ref - theta_bar; 0.0 without a world model or a path."""
         world = observation.world
         trajectory = observation.trajectory
         if self._k_theta == 0.0 or world is None or trajectory is None:
@@ -79,6 +94,4 @@ class HeadingControl:
         path_heading_rad = self._route.heading_rad(s_m)
         p_y = math.cos(path_heading_rad) * (center_w[1] - foot_y) - math.sin(path_heading_rad) * (center_w[0] - foot_x)
         theta_ref = path_heading_rad - math.atan(p_y / self._look_ahead_m)
-        self.error_rad = math.remainder(theta_ref - theta_bar, math.tau)
-        bend_rad = self._k_theta * self.error_rad
-        return min(max(bend_rad, -self._max_bend_rad), self._max_bend_rad)
+        return math.remainder(theta_ref - theta_bar, math.tau)

@@ -83,6 +83,7 @@ class SinusLifting(Gait[SinusLiftingParameters]):
             k_theta=parameters.k_theta,
             look_ahead=parameters.look_ahead,
             max_bend_rad=parameters.max_bend_rad,
+            filter_s=parameters.period_s,
         )
 
     def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:

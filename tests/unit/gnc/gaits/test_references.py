@@ -147,6 +147,22 @@ def test_directional_control_bends_towards_the_path(gait: type[Controller[Any]])
     assert to_the_left > 0.02
 
 
+@pytest.mark.parametrize("gait", [Serpenoid, Cpg])
+def test_another_path_does_not_jerk_the_joints(gait: type[Controller[Any]]) -> None:
+    """Its direction differs by two radians, and the joints move no faster than in the wave itself."""
+    stage = make_stage(13)
+    controller = gait(stage.robot, gait.Parameters())
+    observation = stage.observe(0, 2.0)
+    assert observation.trajectory is not None
+    aside = msgspec.structs.replace(observation.trajectory, path_id=1, path_w=[(2.0, 0.0), (1.0, 4.0)])
+    replanned = dataclasses.replace(observation, trajectory=aside)
+    references = list_references([controller.update(observation) for _ in range(480)])
+    wave_step = np.abs(np.diff(references[160:], axis=0)).max()
+    after = list_references([controller.update(replanned) for _ in range(160)])
+    steps = np.abs(np.diff(np.vstack([references[-1:], after]), axis=0))
+    assert steps.max() < 1.1 * wave_step
+
+
 def test_serpenoid_wave_travels_from_head_to_tail() -> None:
     stage = make_stage(13)
     controller = Serpenoid(stage.robot, SerpenoidParameters(k_theta=0.0))
