@@ -69,13 +69,13 @@ class CpgParameters(GaitParameters, frozen=True, kw_only=True):
     force_phase_rad: Annotated[float, bounded(-3.2, 3.2, "rad")] = 0.0
     """Phase of an oscillator at which a force to its side changes it most (psi)."""
 
-    k_theta: SteeringGain = 1.0
+    k_theta: SteeringGain = 2.0
     """Bend of the whole body for each radian of heading error; 0: no directional control."""
 
     look_ahead: LookAhead = 1.0
     """Look-ahead distance of the line-of-sight guidance (Delta)."""
 
-    max_bend_rad: MaxBend = 1.0
+    max_bend_rad: MaxBend = 1.5
     """Maximum bend of the whole body by the directional control."""
 
     blend_s: Seconds = 1.0

@@ -10,6 +10,9 @@ look-ahead distance Delta,
 
     theta_ref = heading of the path - arctan(p_y / Delta).
 
+On a straight path that is the direction to the point at the distance Delta ahead on the path. This point is used on
+curved paths as well, because a planned path begins with the shape of the body.
+
 Every joint gets an offset in proportion to the error. Here the offset is a bend of the whole body, so that it does not
 depend on the number of joints:
 
@@ -90,8 +93,6 @@ class HeadingControl:
 
         center_w = nodes_w.mean(axis=1)
         s_m = self._route.project(center_w)
-        foot_x, foot_y = self._route.point_at(s_m)
-        path_heading_rad = self._route.heading_rad(s_m)
-        p_y = math.cos(path_heading_rad) * (center_w[1] - foot_y) - math.sin(path_heading_rad) * (center_w[0] - foot_x)
-        theta_ref = path_heading_rad - math.atan(p_y / self._look_ahead_m)
+        aim_x, aim_y = self._route.point_at(s_m + self._look_ahead_m)
+        theta_ref = math.atan2(aim_y - center_w[1], aim_x - center_w[0])
         return math.remainder(theta_ref - theta_bar, math.tau)

@@ -40,13 +40,13 @@ class SerpenoidParameters(GaitParameters, frozen=True, kw_only=True):
     period_s: Seconds = 1.6
     """Period of the wave."""
 
-    k_theta: SteeringGain = 1.0
+    k_theta: SteeringGain = 2.0
     """Bend of the whole body for each radian of heading error; 0: no directional control."""
 
     look_ahead: LookAhead = 1.0
     """Look-ahead distance of the line-of-sight guidance (Delta)."""
 
-    max_bend_rad: MaxBend = 1.0
+    max_bend_rad: MaxBend = 1.5
     """Maximum bend of the whole body by the directional control."""
 
     blend_s: Seconds = 1.0
