@@ -63,7 +63,7 @@ class CpgParameters(GaitParameters, frozen=True, kw_only=True):
     amplitude_rate: Annotated[float, above(100, "1/s")] = 10.0
     """Rate at which amplitudes approach their limit (a)."""
 
-    force_gain: Annotated[float, bounded(-10, 10, "rad/(N*s)")] = 0.1
+    force_gain: Annotated[float, bounded(-10, 10, "rad/(N*s)")] = -0.3
     """Change of a phase for the contact force at its joint (sigma); 0: no feedback."""
 
     force_phase_rad: Annotated[float, bounded(-3.2, 3.2, "rad")] = 0.0
