@@ -121,6 +121,7 @@ def momentum_balance(
     step_s: float = BALANCE_STEP_S,
     *,
     in_the_middle: bool = False,
+    separate_limits: bool = False,
 ) -> Track:
     """Compute the same without MuJoCo: links of prescribed angles in the plane, friction at the feet, momentum.
 
@@ -133,6 +134,7 @@ def momentum_balance(
         viscous_s_per_m: along the link, and as imaginary part across it.
         step_s: of the integrator.
         in_the_middle: each link rubs in its middle, as with wheels there, and not at its ends.
+        separate_limits: friction along the link and across it do not limit each other, as with wheels that roll.
     """
     robot = make_config().robot
     lengths, masses = np.array(robot.link_lengths_m), np.array(robot.link_masses_kg)
@@ -169,7 +171,11 @@ def momentum_balance(
             tangents = directions
             points = middles
         weights_n = G * masses if in_the_middle else loads_n
-        rub = weights_n * tangents * brake(velocities * np.conj(tangents), coefficients, viscous_s_per_m)
+        rub = (
+            weights_n
+            * tangents
+            * brake(velocities * np.conj(tangents), coefficients, viscous_s_per_m, separate_limits=separate_limits)
+        )
         momentum += step_s * np.array([rub.sum().real, rub.sum().imag, np.sum((np.conj(points - place) * rub).imag)])
         pose += step_s * np.array([speed.real, speed.imag, spin])
         center[k] = place.real, place.imag
@@ -177,15 +183,21 @@ def momentum_balance(
     return Track(center, axis, step_s, wave.period_s)
 
 
-def brake(velocities: Any, coefficients: DirectionalFriction, viscous_s_per_m: complex) -> Any:
+def brake(
+    velocities: Any, coefficients: DirectionalFriction, viscous_s_per_m: complex, *, separate_limits: bool = False
+) -> Any:
     """Return the force of friction on what slides, divided by its normal force; all complex, along the link and across.
 
     Args:
         velocities: of what slides, in m/s.
         coefficients: of dry friction.
         viscous_s_per_m: along the link, and as imaginary part across it.
+        separate_limits: friction along the link and across it do not limit each other.
     """
     along, across = velocities.real, velocities.imag
     of_along = np.where(along > 0, coefficients.forward, coefficients.backward)
     dry = (of_along * along + 1j * coefficients.sideways * across) / np.sqrt(np.abs(velocities) ** 2 + SMOOTH_M_S**2)
+    if separate_limits:
+        dry_along = of_along * along / np.sqrt(along**2 + SMOOTH_M_S**2)
+        dry = dry_along + 1j * coefficients.sideways * across / np.sqrt(across**2 + SMOOTH_M_S**2)
     return -dry - viscous_s_per_m.real * along - 1j * viscous_s_per_m.imag * across

@@ -59,7 +59,7 @@ def measure_medians_us(
 ) -> dict[str, dict[LawsVersion, float]]:
     """Return the median CPU time of a step of each case, by version of the laws; all take turns in every round."""
     versions: tuple[LawsVersion, ...] = ("c", "python")
-    snakes = {
+    snakes: dict[tuple[str, LawsVersion], TimedSnake] = {
         (name, version): TimedSnake(robot, scene, version)
         for name, (robot, scene) in cases.items()
         for version in versions

@@ -30,7 +30,10 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
     "its flag": (["drive", "load", "can", "peg_row", "--jo"], {"--joints"}),
     "key": (["topic", "echo", "sensor/j"], {"sensor/joints"}),
     "kind of a fault": (["fault", "inject", "overh"], {"overheat"}),
-    "robot": (["robot", "arm", "pl"], {"planar13", "planar13_camera", "planar13_mixed"}),
+    "robot": (
+        ["robot", "arm", "pl"],
+        {"planar13", "planar13_camera", "planar13_mixed", "planar13_scales", "planar13_wheels"},
+    ),
     "shell": (["completion", "z"], {"zsh"}),
     "file": (["start", "router", "./"], set()),  # nothing of ours: the shell completes file names
 }

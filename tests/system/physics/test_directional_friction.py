@@ -125,7 +125,7 @@ def test_ground_takes_all_the_energy_that_a_writhing_snake_loses(robot: dict[str
     feet = [model.geom(f"foot_{i}").id for i in range(15)]
     physics.step(1)
     start_j = kinetic_energy_j(model, data)
-    lost_j, lowest_j = 0.0, start_j
+    lost_j, lowest_j, energy_j = 0.0, start_j, start_j
     before = data.geom_xpos[feet, :2].copy()
     for _ in range(400):
         physics.step(1)

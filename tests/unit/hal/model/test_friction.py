@@ -10,6 +10,8 @@ from snakesim_testing.sim.simulator_rig import make_config
 
 SCALES = {"forward": 0.11, "backward": 0.14, "sideways": 0.19}
 WHEELS = {"radius_m": 0.03, "bearing_radius_m": 0.004, "bearing_friction": 0.03}
+MILK_SNAKE = msgspec.convert(SCALES, Skin)
+BALL_BEARINGS = msgspec.convert(WHEELS, Wheels)
 
 
 def test_robot_without_skin_rubs_equally_in_all_directions() -> None:
@@ -20,23 +22,23 @@ def test_robot_without_skin_rubs_equally_in_all_directions() -> None:
 def test_only_ratios_of_a_skin_matter(friction: float) -> None:
     scale = friction / 0.19
     expected = pytest.approx((0.11 * scale, 0.14 * scale, 0.19 * scale))
-    assert surface_friction(friction, Surface(), Skin(**SCALES), None) == expected
+    assert surface_friction(friction, Surface(), MILK_SNAKE, None) == expected
 
 
 def test_coefficients_of_a_surface_replace_those_of_the_skin() -> None:
     surface = Surface(forward_friction=0.05)
-    assert surface_friction(0.19, surface, Skin(**SCALES), None) == pytest.approx((0.05, 0.14, 0.19))
+    assert surface_friction(0.19, surface, MILK_SNAKE, None) == pytest.approx((0.05, 0.14, 0.19))
     assert surface_friction(0.3, surface, None, None) == (0.05, 0.3, 0.3)
 
 
 def test_wheels_roll_along_and_slide_sideways() -> None:
-    wheels = Wheels(**WHEELS, rolling_resistance=0.01, tire_friction=0.6)
+    wheels = msgspec.convert({**WHEELS, "rolling_resistance": 0.01, "tire_friction": 0.6}, Wheels)
     assert surface_friction(0.2, Surface(forward_friction=0.1), None, wheels) == pytest.approx((0.014, 0.014, 0.6))
-    assert surface_friction(0.2, None, None, Wheels(**WHEELS)) == pytest.approx((0.004, 0.004, 0.2))
+    assert surface_friction(0.2, None, None, BALL_BEARINGS) == pytest.approx((0.004, 0.004, 0.2))
 
 
 def test_wheels_on_ice_slide_instead_of_rolling() -> None:
-    assert surface_friction(0.001, None, None, Wheels(**WHEELS)) == (0.001, 0.001, 0.001)
+    assert surface_friction(0.001, None, None, BALL_BEARINGS) == (0.001, 0.001, 0.001)
 
 
 def test_factors_of_a_link_are_its_coefficients_over_those_of_the_skin() -> None:
