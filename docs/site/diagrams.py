@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from docs.site.drawing import Drawing, spread
+from docs.site.gait_curves import draw_gait_curves
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 
@@ -303,6 +304,7 @@ DIAGRAMS: dict[str, Callable[[], Drawing]] = {
     "contract-suite.svg": draw_contract,
     "lab-roles.svg": draw_lab,
     "tour.svg": draw_tour,
+    "gait-curves.svg": draw_gait_curves,
 }
 
 

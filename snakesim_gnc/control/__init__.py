@@ -4,7 +4,8 @@ Their base class, their observations and commands are in `snakesim_hal.controlle
 
 Controllers, one per module:
 
-`hold`, `path_following`, `obstacle_triplet`, `obstacle_aided`, `undulation`, `force_feedback_wave`, `gaits`, `policy`
+`hold`, `path_following`, `obstacle_triplet`, `obstacle_aided`, `undulation`, `force_feedback_wave`, `policy`
+`gaits`   a folder: the gaits of the literature
 `joint_check`, `identify`   motions whose recordings are evaluated afterwards
 
 Parts that controllers share:

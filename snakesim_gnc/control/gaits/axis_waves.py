@@ -1,4 +1,4 @@
-"""Gaits in three dimensions, for robots whose joints are yaw and pitch joints in alternation. They use no map.
+"""Gaits as waves of the joints, for robots whose joints are yaw and pitch joints in alternation. They use no map.
 
 All are sums of two waves, one of the yaw joints and one of the pitch joints (Tesch et al. 2009). Sidewinding lifts
 parts of the body over while others rest on the ground. Rolling turns a bent body about its own axis. A raised head
@@ -6,68 +6,30 @@ bends its last pitch joints up, and looks around.
 """
 
 import math
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 
-from snakesim_gnc.control.bumpless import BumplessReference
+from snakesim_gnc.control.gaits.base import Gait, GaitParameters, GaitParametersT, Seconds
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
-from snakesim_hal.model.files import FileStruct
+from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description
-from snakesim_hal.wire.quantities import above, bounded, from_zero
+from snakesim_hal.wire.quantities import bounded, from_zero
 
 Swing = Annotated[float, bounded(-2, 2, "rad")]
 Lag = Annotated[float, bounded(-3.2, 3.2, "rad")]
-Seconds = Annotated[float, above(100, "s")]
 
 
-class GaitParameters(FileStruct, frozen=True, kw_only=True):
-    """Parameters that all gaits have; each declares them again, with its own default."""
+class _WaveGait(Gait[GaitParametersT]):
+    """A gait whose waves have a lag from joint to joint."""
 
-    period_s: Seconds
-    blend_s: Seconds
-
-
-GaitParametersT = TypeVar("GaitParametersT", bound=GaitParameters)
-
-
-class _Gait(Controller[GaitParametersT]):
-    """A reference over time for yaw and pitch joints, which the joints follow without a jump.
-
-    A subclass computes the reference from the phase of the gait.
-    """
-
-    _reason_to_stay = ""  # why the gait does not travel; empty for a gait that travels
+    _blends_after_hold = False  # the digests of recorded runs depend on it
 
     def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
-        self._bumpless = BumplessReference(robot, parameters.blend_s)
-        self._phase_rad = 0.0
-
-        # Indices of the joints.
-        axes = [joint.axis for joint in robot.joints]
-        self._yaw = [i for i, axis in enumerate(axes) if axis == "yaw"]
-        self._pitch = [i for i, axis in enumerate(axes) if axis == "pitch"]
-        self._from_head = np.arange(len(axes))[::-1]  # (n_joints,), 0 at the head
-
-        self._missing = _explain_missing_joints(self._yaw, self._pitch)
-
-    def update(self, observation: Observation) -> ControllerCommand:
-        """Advance the gait while motion is requested; a robot without the necessary joints holds its pose."""
-        if self._missing or not is_motion_requested(observation):
-            return self._bumpless.hold_pose(observation, self._missing)
-        self._phase_rad += math.tau * observation.period_s / self.parameters.period_s
-        reference_rad = np.zeros(len(self._from_head))
-        self._shape(reference_rad, self._phase_rad)
-        setpoints = self._bumpless.follow(observation, reference_rad)
-        return ControllerCommand(
-            setpoints, Telemetry(reason=self._reason_to_stay, reference_rad=reference_rad.tolist())
-        )
-
-    def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
-        """Write the angles of all joints, (n_joints,), into an array of zeros."""
-        raise NotImplementedError
+        self._yaw = self.find_joints("yaw")
+        self._pitch = self.find_joints("pitch")
+        self._from_head = np.arange(len(robot.joints))[::-1]  # (n_joints,), 0 at the head
 
     def _wave(self, joints: list[int], phase_rad: float, lag_rad: float) -> Floats:
         """Return sin(phase - lag n) for joints that are n joints behind the head, (len(joints),).
@@ -75,18 +37,6 @@ class _Gait(Controller[GaitParametersT]):
         The wave travels from the head to the tail.
         """
         return np.sin(phase_rad - lag_rad * self._from_head[joints])
-
-
-def _explain_missing_joints(yaw: list[int], pitch: list[int]) -> str:
-    """Return why a robot cannot move in three dimensions; empty if it can."""
-    directions: list[str] = []
-    if not pitch:
-        directions.append("up and down")
-    if not yaw:
-        directions.append("left and right")
-    if not directions:
-        return ""
-    return f"this robot has no joints that turn {' and '.join(directions)}"
 
 
 class SidewindingParameters(GaitParameters, frozen=True, kw_only=True):
@@ -108,7 +58,7 @@ class SidewindingParameters(GaitParameters, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
 
-class Sidewinding(_Gait[SidewindingParameters]):
+class Sidewinding(_WaveGait[SidewindingParameters]):
     """Travels sideways, by a yaw wave and a pitch wave that leads by a quarter of a period.
 
     A joint n joints behind the head has, at phase phi and with the lag beta, the angle
@@ -119,12 +69,14 @@ class Sidewinding(_Gait[SidewindingParameters]):
 
     Parameters = SidewindingParameters
 
-    def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
+    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        reference_rad = self.make_straight()
         lag_rad = self.parameters.lag_rad
         reference_rad[self._yaw] = self.parameters.yaw_rad * self._wave(self._yaw, phase_rad, lag_rad)
         reference_rad[self._pitch] = self.parameters.pitch_rad * self._wave(
             self._pitch, phase_rad + 0.5 * math.pi, lag_rad
         )
+        return reference_rad
 
 
 class RollingParameters(GaitParameters, frozen=True, kw_only=True):
@@ -140,7 +92,7 @@ class RollingParameters(GaitParameters, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
 
-class Rolling(_Gait[RollingParameters]):
+class Rolling(_WaveGait[RollingParameters]):
     """Rolls sideways: the body lies in an arc that turns about its own axis.
 
     All yaw joints have the angle |bend_rad| sin(phi), and all pitch joints bend_rad cos(phi), at phase phi.
@@ -148,9 +100,11 @@ class Rolling(_Gait[RollingParameters]):
 
     Parameters = RollingParameters
 
-    def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
+    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        reference_rad = self.make_straight()
         reference_rad[self._yaw] = abs(self.parameters.bend_rad) * math.sin(phase_rad)
         reference_rad[self._pitch] = self.parameters.bend_rad * math.cos(phase_rad)
+        return reference_rad
 
 
 class RaisedHeadParameters(GaitParameters, frozen=True, kw_only=True):
@@ -175,7 +129,7 @@ class RaisedHeadParameters(GaitParameters, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
 
-class RaisedHead(_Gait[RaisedHeadParameters]):
+class RaisedHead(_WaveGait[RaisedHeadParameters]):
     """Lifts its head by one pitch joint, keeps it level by the next, and looks left and right.
 
     The body behind lies in a wave of its yaw joints, because a straight round body would roll over.
@@ -185,7 +139,8 @@ class RaisedHead(_Gait[RaisedHeadParameters]):
 
     Parameters = RaisedHeadParameters
 
-    def _shape(self, reference_rad: Floats, phase_rad: float) -> None:
+    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        reference_rad = self.make_straight()
         # Positive pitch bends the head down. With one pitch joint only, nothing keeps the head level.
         lift_joint = self._pitch[0] if len(self._pitch) == 1 else self._pitch[-2]
         if len(self._pitch) > 1:
@@ -194,3 +149,4 @@ class RaisedHead(_Gait[RaisedHeadParameters]):
         reference_rad[self._yaw] = self.parameters.stance_rad * self._wave(self._yaw, 0.0, self.parameters.lag_rad)
         foremost_yaw_joint = self._yaw[-1]
         reference_rad[foremost_yaw_joint] = self.parameters.look_rad * math.sin(phase_rad)
+        return reference_rad

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.gaits import RaisedHead, Rolling, Sidewinding
+from snakesim_gnc.control.gaits.axis_waves import RaisedHead, Rolling, Sidewinding
 from snakesim_hal.controller import Controller
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.run_log import RunRecord

@@ -1,0 +1,98 @@
+"""Directional control of planar gaits: how much the whole body bends so that it converges to the path.
+
+Source: P. Liljebäck, K. Y. Pettersen, Ø. Stavdahl, J. T. Gravdahl, "Snake Robots: Modelling, Mechatronics, and
+Control", Springer 2013. The heading of the robot is the mean of the headings of its links,
+
+    theta_bar = (1 / N) sum_i theta_i.
+
+Line-of-sight guidance gives the desired heading from the distance p_y of the robot from the path, to the left, and a
+look-ahead distance Delta,
+
+    theta_ref = heading of the path - arctan(p_y / Delta).
+
+On a straight path that is the direction to the point at the distance Delta ahead on the path. This point is used on
+curved paths as well, because a planned path begins with the shape of the body.
+
+Every joint gets an offset in proportion to the error. Here the offset is a bend of the whole body, so that it does not
+depend on the number of joints:
+
+    bend = k_theta (theta_ref - theta_bar),
+
+low-pass filtered over a period of the gait, because the mean heading swings with the wave.
+"""
+
+import math
+from typing import Annotated
+
+import numpy as np
+
+from snakesim_gnc.geometry.planar_body import PlanarBody
+from snakesim_hal.controller import Observation
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.quantities import above, from_zero
+
+MIN_SPREAD = 0.2  # resultant of the headings below which they have no mean direction
+
+SteeringGain = Annotated[float, from_zero(5, "1")]
+LookAhead = Annotated[float, above(10, "body lengths")]
+MaxBend = Annotated[float, from_zero(6, "rad")]
+
+
+class HeadingControl:
+    """Computes the bend of one robot."""
+
+    def __init__(
+        self, robot: Description, *, k_theta: float, look_ahead: float, max_bend_rad: float, filter_s: float
+    ) -> None:
+        """Start without a path and without a bend.
+
+        Args:
+            robot: description of the robot.
+            k_theta: bend of the whole body for each radian of heading error; 0 switches the control off.
+            look_ahead: look-ahead distance Delta in body lengths.
+            max_bend_rad: bound of the bend.
+            filter_s: time constant of the low-pass filter.
+        """
+        self._body = PlanarBody(robot)
+        self._k_theta = k_theta
+        self._look_ahead_m = look_ahead * self._body.length_m
+        self._max_bend_rad = max_bend_rad
+        self._filter_s = filter_s
+        self._bend_rad = 0.0
+        self._route: Route | None = None
+        self._path_id: int | None = None
+        self.error_rad = 0.0  # theta_ref - theta_bar of the last tick; 0.0: unknown
+
+    def find_bend_rad(self, observation: Observation) -> float:
+        """Return the bend of the whole body, to the left positive. Call it in every tick."""
+        self.error_rad = self._find_error_rad(observation)
+        desired_rad = self._k_theta * self.error_rad
+        desired_rad = min(max(desired_rad, -self._max_bend_rad), self._max_bend_rad)
+        gain = 1.0 - math.exp(-observation.period_s / self._filter_s)
+        self._bend_rad += gain * (desired_rad - self._bend_rad)
+        return self._bend_rad
+
+    def _find_error_rad(self, observation: Observation) -> float:
+        """Return theta_ref - theta_bar; 0.0 without a world model or a path."""
+        world = observation.world
+        trajectory = observation.trajectory
+        if self._k_theta == 0.0 or world is None or trajectory is None:
+            return 0.0
+        if self._route is None or trajectory.path_id != self._path_id:
+            self._route = Route(trajectory.path_w)
+            self._path_id = trajectory.path_id
+
+        nodes_w = self._body.nodes_w(world, observation.joints.angle_rad)  # (2, n_nodes)
+        pieces_w = np.diff(nodes_w, axis=1)
+        headings_rad = np.arctan2(pieces_w[1], pieces_w[0])
+        resultant = np.exp(1j * headings_rad).mean()
+        if abs(resultant) < MIN_SPREAD:
+            return 0.0
+        theta_bar = float(np.angle(resultant))
+
+        center_w = nodes_w.mean(axis=1)
+        s_m = self._route.project(center_w)
+        aim_x, aim_y = self._route.point_at(s_m + self._look_ahead_m)
+        theta_ref = math.atan2(aim_y - center_w[1], aim_x - center_w[0])
+        return math.remainder(theta_ref - theta_bar, math.tau)

@@ -1,0 +1,121 @@
+"""The same parameters of a curve on robots with other numbers of joints, and robots that cannot form a curve."""
+
+import math
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.gaits.body_curve import BodyCurve
+from snakesim_gnc.control.gaits.concertina import Concertina, ConcertinaParameters
+from snakesim_gnc.control.gaits.cpg import Cpg, CpgParameters
+from snakesim_gnc.control.gaits.rectilinear import Rectilinear, RectilinearParameters
+from snakesim_gnc.control.gaits.serpenoid import Serpenoid, SerpenoidParameters, find_serpenoid_headings
+from snakesim_gnc.control.gaits.sinus_lifting import SinusLifting, SinusLiftingParameters
+from snakesim_gnc.geometry.body_on_path import chain_nodes
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.errors import ConfigError
+from snakesim_testing.gnc.stage import make_robot
+from snakesim_testing.messages import raises_error
+
+# Of a node from the continuous curve, in body lengths: 8 joints are coarser than 20.
+MAX_DISTANCES = {8: 0.02, 13: 0.008, 20: 0.004}
+PHASES = (0.0, 1.0, 2.5, 4.0)
+
+
+def find_continuous_nodes(phase_rad: float, parameters: SerpenoidParameters, places: Floats) -> Floats:
+    """Return points (2, n) of the serpenoid curve at fractions of the body from the tail, by numerical integration."""
+    s = np.linspace(0.0, 1.0, 4001)
+    middles = 0.5 * (s[1:] + s[:-1])
+    headings = find_serpenoid_headings(1.0 - middles, phase_rad, parameters.winding_angle_rad, parameters.wavelength)
+    steps = np.diff(s) * np.array([np.cos(headings), np.sin(headings)])
+    curve = np.concatenate([np.zeros((2, 1)), steps.cumsum(axis=1)], axis=1)
+    return np.array([np.interp(places, s, row) for row in curve])
+
+
+def find_robot_nodes(modules: int, angles_rad: Floats) -> tuple[Floats, Floats]:
+    """Return the nodes of a planar robot (2, n) in body lengths, and their fractions of the body from the tail."""
+    lengths = [link.length_m for link in make_robot(modules).links]
+    total_m = sum(lengths)
+    nodes = chain_nodes((0.0, 0.0), 0.0, angles_rad.tolist(), [length / total_m for length in lengths])
+    return nodes, np.concatenate(([0.0], np.cumsum(lengths) / total_m))
+
+
+def measure_distance(nodes: Floats, curve: Floats) -> float:
+    """Return the largest distance of corresponding points after the best motion of one set in the plane."""
+    a = np.array([1, 1j]) @ nodes
+    b = np.array([1, 1j]) @ curve
+    a = a - a.mean()
+    b = b - b.mean()
+    turned = a * np.exp(1j * np.angle(np.vdot(a, b)))
+    return float(np.abs(turned - b).max())
+
+
+@pytest.mark.parametrize("modules", [8, 13, 20])
+@pytest.mark.parametrize("phase_rad", PHASES)
+def test_the_same_parameters_give_the_same_curve_on_any_planar_robot(modules: int, phase_rad: float) -> None:
+    parameters = SerpenoidParameters()
+    robot = make_robot(modules)
+    curve = BodyCurve(robot, "yaw")
+    headings = find_serpenoid_headings(curve.from_head, phase_rad, parameters.winding_angle_rad, parameters.wavelength)
+    nodes, places = find_robot_nodes(modules, curve.find_angles_rad(headings))
+    distance = measure_distance(nodes, find_continuous_nodes(phase_rad, parameters, places))
+    assert distance < MAX_DISTANCES[modules]
+
+
+def test_joint_angles_depend_on_the_spacing_and_the_curve_does_not() -> None:
+    """A controller that copied joint angles would fail: 8 joints bend more than twice as far as 20."""
+    peaks: dict[int, float] = {}
+    for modules in (8, 20):
+        curve = BodyCurve(make_robot(modules), "yaw")
+        angles = [curve.find_angles_rad(find_serpenoid_headings(curve.from_head, u, 0.7, 0.67)) for u in PHASES]
+        peaks[modules] = float(np.abs(angles).max())
+    assert peaks[8] > 2.0 * peaks[20]
+
+
+def test_equal_links_have_the_discrete_form_of_the_serpenoid_curve() -> None:
+    """phi_i = A sin(...) with A = 2 alpha sin(delta / 2) and a lag of delta = 2 pi l / lambda from joint to joint."""
+    alpha, wavelength = 0.6, 0.5
+    curve = BodyCurve(make_robot(20), "yaw")
+    delta = math.tau * (curve.from_head[3] - curve.from_head[4]) / wavelength
+    shapes = np.array(
+        [
+            curve.find_angles_rad(find_serpenoid_headings(curve.from_head, u, alpha, wavelength))
+            for u in np.linspace(0.0, math.tau, 64, endpoint=False)
+        ]
+    )
+    series = np.fft.rfft(shapes, axis=0)[1] / 32
+    inner = series[2:-2]  # the pieces at both ends have other lengths
+    assert np.abs(inner) == pytest.approx(2.0 * alpha * math.sin(0.5 * delta))
+    assert np.angle(inner[1:] / inner[:-1]) == pytest.approx(delta)
+
+
+def test_a_bend_is_shared_by_the_joints_whatever_their_number() -> None:
+    for modules in (8, 20):
+        curve = BodyCurve(make_robot(modules), "yaw")
+        turned = curve.find_angles_rad(curve.spread_bend(1.0)).sum()
+        assert turned == pytest.approx(1.0, abs=1.2 / modules)  # the middles of both end pieces are not at the ends
+
+
+@pytest.mark.parametrize(
+    ("gait", "parameters"),
+    [
+        (Serpenoid, SerpenoidParameters(wavelength=0.2)),
+        (Serpenoid, SerpenoidParameters(winding_angle_rad=2.2, wavelength=0.4)),
+        (Cpg, CpgParameters(winding_angle_rad=2.2, wavelength=0.4)),
+        (Concertina, ConcertinaParameters(folds=2)),
+    ],
+    ids=["short wave", "winding", "winding of oscillators", "folds"],
+)
+def test_a_curve_that_the_joints_cannot_form_is_refused(gait, parameters) -> None:
+    with raises_error(ConfigError):
+        gait.check(make_robot(8), parameters)
+
+
+@pytest.mark.parametrize(
+    ("gait", "parameters"),
+    [(Rectilinear, RectilinearParameters()), (SinusLifting, SinusLiftingParameters())],
+    ids=["rectilinear", "sinus_lifting"],
+)
+def test_a_robot_without_pitch_joints_is_not_refused(gait, parameters) -> None:
+    """It holds its pose and reports the reason, as the other gaits do."""
+    gait.check(make_robot(13), parameters)

@@ -1,0 +1,103 @@
+"""`python -m verification.gaits [NAME ...] [--seeds N] [--workers N] [--write]`: measures what each gait achieves.
+
+Each row is a shipped scenario with one gait and some seeds of the sensors' noise. The distance is that of the center of
+mass from its first to its last place, in whichever direction it moved. `--write` puts the table into the page.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.in_process import simulate
+
+PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "gaits.md"
+BEGIN, END = "<!-- from here: made by `python -m verification.gaits --write` -->\n", "<!-- to here -->\n"
+DURATION_S = 10
+HEADER = "| gait | scenario | distance in 10 s, m | speed, body lengths/s | energy, J/m |\n|---|---|---|---|---|\n"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A gait on a scene where it works."""
+
+    gait: str
+    scenario: str
+    sets: tuple[str, ...] = ()  # further `--set` arguments
+
+
+ROWS = (
+    Row("serpenoid", "scales"),
+    Row("serpenoid", "peg_row", ("control.wavelength=0.31", "control.winding_angle_rad=0.45")),
+    Row("cpg", "scales"),
+    Row("cpg", "peg_row", ("control.wavelength=0.31", "control.winding_angle_rad=0.45")),
+    Row("backbone_sidewinding", "mamba_flat"),
+    Row("backbone_rolling", "mamba_flat"),
+    Row("sinus_lifting", "mamba_flat"),
+    Row("rectilinear", "mamba_flat"),
+    Row("concertina", "corridor"),
+)
+
+
+def run_row(row: Row, seed: int) -> RunSummary:
+    """Run one trial, and return its summary."""
+    sets = (f"controller={row.gait}", f"duration_s={DURATION_S}", f"seed={seed}", *row.sets)
+    return simulate(load(row.scenario, [parse_set(text) for text in sets]).config).summary
+
+
+def format_row(row: Row, summaries: Sequence[RunSummary]) -> str:
+    """Return a line of the table: means over the trials, and the lowest and highest value in brackets."""
+    settings = "".join(f", `{text}`" for text in row.sets)
+    distances_m = [summary.net_displacement_m or 0.0 for summary in summaries]
+    speeds = [summary.displacement_body_lengths_s or 0.0 for summary in summaries]
+    energies = [summary.displacement_energy_j_per_m or float("nan") for summary in summaries]
+    return (
+        f"| `{row.gait}` | `{row.scenario}`{settings} | {_format_range(distances_m, 2)} | {_format_range(speeds, 3)} | "
+        f"{_format_range(energies, 0)} |\n"
+    )
+
+
+def put_table(page: str, table: str) -> str:
+    """Return a page with another table between the marks."""
+    head, _, rest = page.partition(BEGIN)
+    return head + BEGIN + table + END + rest.partition(END)[2]
+
+
+def _format_range(values: Sequence[float], digits: int) -> str:
+    mean = sum(values) / len(values)
+    return f"{mean:.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+def main() -> int:
+    """Run the rows that are asked for, print each, and write the table if all were run."""
+    parser = argparse.ArgumentParser(prog="python -m verification.gaits", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="gaits to run (all)")
+    parser.add_argument("--seeds", type=int, default=5, help="number of seeds, from 1 (5)")
+    parser.add_argument("--workers", type=int, default=2, help="runs side by side (2)")
+    parser.add_argument("--write", action="store_true", help=f"write the table into {PAGE.name}; only with all gaits")
+    asked = parser.parse_args()
+    if unknown := set(asked.names) - {row.gait for row in ROWS}:
+        parser.error(f"no gait called {', '.join(sorted(unknown))}; there are {', '.join(row.gait for row in ROWS)}")
+    if asked.write and asked.names:
+        parser.error("--write needs all gaits: leave the names out")
+    table = HEADER
+    print(HEADER, end="", flush=True)
+    rows = [row for row in ROWS if not asked.names or row.gait in asked.names]
+    seeds = range(1, asked.seeds + 1)
+    with ProcessPoolExecutor(asked.workers) as pool:
+        trials = {row: [pool.submit(run_row, row, seed) for seed in seeds] for row in rows}
+        for row in rows:
+            line = format_row(row, [trial.result() for trial in trials[row]])
+            print(line, end="", flush=True)
+            table += line
+    if asked.write:
+        PAGE.write_text(put_table(PAGE.read_text(encoding="utf-8"), table), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
