@@ -35,7 +35,7 @@ class ConcertinaParameters(GaitParameters, frozen=True, kw_only=True):
     winding_angle_rad: Annotated[float, from_zero(1.5, "rad")] = 1.0
     """Angle between the curve's axis and its steepest tangent, where the body is folded (alpha)."""
 
-    folds: Annotated[int, Meta(ge=1, le=10)] = 1
+    folds: Annotated[int, Meta(ge=1, le=10, extra_json_schema={"unit": "1"})] = 1
     """Number of waves in each half of the body (m)."""
 
     period_s: Seconds = 3.0
