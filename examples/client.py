@@ -12,12 +12,13 @@ JOINT, TURN_RAD = "joint_3", 0.1
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
 LINK = {"mode": "client", "connect": {"endpoints": [ENDPOINT]}, "namespace": ROBOT, "scouting": QUIET}
 FORM = "application/msgpack;snakesim.{}/1"
+SILENCE_S = 15  # longer than the 10 s for which lockstep waits for another service
 BLOCK = zenoh.CongestionControl.BLOCK  # lose no command, so that lockstep goes on
 
 
 def newest(arrivals, meanwhile=lambda: time.sleep(0.0005), known=None):
-    """The newest arrival; if there is none, `known`, or what arrives within a second."""
-    give_up = time.monotonic() + 1.0
+    """The newest arrival; if there is none, `known`, or what arrives within SILENCE_S."""
+    give_up = time.monotonic() + SILENCE_S
     while (arrival := arrivals.try_recv()) is None:
         if known is not None:
             return known
@@ -43,9 +44,9 @@ def command(turn_rad=0.0):
 with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
     robot = newest(session.get("hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY))
     number = [joint["name"] for joint in robot["joints"]].index(JOINT)
-    present = session.liveliness().declare_token("alive/control")  # a run waits for it
     joints = session.declare_subscriber("sensor/joints", zenoh.handlers.RingChannel(1))
     clocks = session.declare_subscriber("hal/clock", zenoh.handlers.RingChannel(1))
+    present = session.liveliness().declare_token("alive/control")  # last: from the next tick on, a run waits for it
     start = (state := newest(joints))["angle_rad"]
     lease = ask("hal/lease", "LeaseRequest", action="acquire", holder="control")
     rights = {"lease_epoch": lease["epoch"], "layout": robot["layout"], "valid_for_ns": robot["lease_ns"]}

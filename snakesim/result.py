@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from snakesim.chart import Chart, framed
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.playback.export import arrays, name_parts, table, unit_of
 from snakesim_operator.results.page.charts import Line, lines
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.signals import arrays, select_columns, table, unit_of
 from snakesim_operator.results.summary import RunSummary, distance_m
 
 PLAYBACK_PX = 580
@@ -32,7 +32,8 @@ class Result:
     """The signals and the summary of a run that is over.
 
     Every signal has a row for each tick since the first arming; NaN is unknown. `result["angle_rad"]` is
-    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,); `signal_names` lists all signals.
+    (ticks, joints), `result["angle_rad.joint_3"]` is (ticks,), `result["link_force_l_n"]` is (ticks, links, 3).
+    `signal_names` lists all signals.
     """
 
     record: RunRecord  # every tick, and the telemetry of control and guidance
@@ -40,7 +41,7 @@ class Result:
 
     @cached_property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All signals by name, each (ticks,) or (ticks, width)."""
+        """All signals by name, each (ticks,), (ticks, width), or (ticks, links or obstacles, 3)."""
         return arrays(self.record)
 
     @cached_property
@@ -96,18 +97,24 @@ class Result:
         """Return a signal.
 
         Args:
-            name: A name in `signal_names`, such as "angle_rad" or "angle_rad.joint_3".
+            name: A name in `signal_names`, such as "angle_rad" or "angle_rad.joint_3", or a part of a signal, such as
+                "link_force_l_n.head", which is (ticks, 3).
 
         Raises:
             ConfigError: There is no such signal.
         """
-        if name not in self.signal_names:
+        if name in self.arrays:
+            return self.arrays[name]
+        found = select_columns(name, self.columns)
+        if not found:
             raise ConfigError(
                 f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
                 f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `signal_names`",
                 code="recording/unknown-signal",
             )
-        return self.arrays[name] if name in self.arrays else self.columns[name]
+        if name in found:
+            return found[name]
+        return np.stack(list(found.values()), axis=1)
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame of all columns, with the time in s as its index.
@@ -227,15 +234,21 @@ class Result:
 
     def _figure(self, name: str) -> dict[str, Any]:
         """Return the figure of a signal over time."""
-        values = self[name].astype(float)
-        unit = self.units[name]
+        if name not in self.signal_names:
+            self[name]  # raises ConfigError, unless it is a part of a signal
+        unit = unit_of(name, self.record)
         title = name if unit == "1" else f"{name}, {unit}"
         end_s = float(self.time_s[-1]) if len(self.time_s) else 0.0
-        return lines(f"{name} over time", title, self._lines(name, values), end_s)
+        return lines(f"{name} over time", title, self._lines(name), end_s)
 
-    def _lines(self, name: str, values: NDArray[np.float64]) -> Sequence[Line]:
+    def _lines(self, name: str) -> Sequence[Line]:
         """Return a line for each column of a signal."""
-        if values.ndim == 1:
-            return [Line(name, self.time_s, values, "--measured")]
-        labels = name_parts(name, self.joints)
-        return [Line(label, self.time_s, values[:, i], f"--joint-{i}") for i, label in enumerate(labels)]
+        columns = select_columns(name, self.columns)
+        if list(columns) == [name]:
+            return [Line(name, self.time_s, columns[name].astype(float), "--measured")]
+        color_count = len(self.joints)
+        drawn: list[Line] = []
+        for i, (column, values) in enumerate(columns.items()):
+            label = column.removeprefix(f"{name}.")
+            drawn.append(Line(label, self.time_s, values.astype(float), f"--joint-{i % color_count}"))
+        return drawn

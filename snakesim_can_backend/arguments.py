@@ -39,7 +39,7 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
 
 
 def add_module_load(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the bus load of joint modules."""
+    """Add the arguments of `snakesim drive load can`, which computes the bus load of joint modules."""
     add_scenario_name(parser)
     add_set(parser)
     parser.add_argument(
@@ -84,7 +84,7 @@ def add_dbc(parser: argparse.ArgumentParser) -> None:
 
 
 def add_module_emulation(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of emulated joint modules."""
+    """Add the arguments of `snakesim drive emulate can`, which emulates joint modules on a bus."""
     add_scenario_name(parser)
     add_channel(parser, f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})")
     parser.add_argument(

@@ -148,9 +148,15 @@ def _cell(joints: int, reports: ReportSchedule) -> str:
 
 
 def scan_channels(arguments: argparse.Namespace) -> int:
-    """List the joint modules that answer on some buses. Returns 1 if none answers.
+    """Run `snakesim drive scan can`: list the joint modules that answer on some buses.
 
     Nothing is sent on a bus that unknown nodes use, unless `--anyway` is given.
+
+    Args:
+        arguments: the parsed command line.
+
+    Returns:
+        The exit code: 0; 1 if no module answers.
     """
     all_rows: list[dict[str, str]] = []  # of all buses, by column
     channels_in_use: list[str] = []
@@ -245,7 +251,17 @@ def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
 
 
 def replay_log(arguments: argparse.Namespace) -> int:
-    """Compare the log of a bus with the run log of the same run. Returns 1 if they differ."""
+    """Run `snakesim drive replay can`: compare the log of a bus with the run log of the same run.
+
+    Args:
+        arguments: the parsed command line, with the log and the folder of the run.
+
+    Returns:
+        The exit code: 0; 1 if the joint states differ or the log has no Sync.
+
+    Raises:
+        ConfigError: the run has another backend, or a file cannot be read.
+    """
     loaded = load_scenario(str(arguments.run / "config.json"), [])
     config = loaded.config
     if config.backend != MODULES:

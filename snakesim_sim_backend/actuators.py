@@ -88,12 +88,14 @@ class Motors:
     def __init__(
         self, model: mujoco.MjModel, data: MotorData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
     ) -> None:
-        """Take over the motors of a model, and switch them off.
+        """Take over the motors of a compiled model, and switch them off.
+
+        The inputs, limits and gains are views of MuJoCo's arrays, so that a tick copies nothing.
 
         Args:
             model: the compiled model.
             data: its state.
-            robot: the robot file.
+            robot: the robot file, with the limits, gains and response times of all joints.
             period_s: control period.
             gain_scale: factor on the gains of the robot file.
         """

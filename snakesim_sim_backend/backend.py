@@ -41,7 +41,14 @@ class SimBackend(Backend):
 
     @classmethod
     def check(cls, config: RunConfig, settings: SimSettings) -> tuple[ClockMode, ...]:
-        """Check that this backend can run a scenario, and return the clock modes that it supports: all of them.
+        """Check that this backend can run a scenario, before anything is started.
+
+        Args:
+            config: configuration of the run.
+            settings: settings of this backend, which are not needed here.
+
+        Returns:
+            The clock modes that the simulator supports, which are all of them.
 
         Raises:
             ConfigError: a gain, a sensor or an injected fault of the run is not possible here.
@@ -84,7 +91,8 @@ class SimBackend(Backend):
         self._period_s = config.period_ns * 1e-9
 
         # Physics and motors, with the snake at rest.
-        self._sim = build(config, settings, laws=laws)
+        has_contact_sensor = config.robot.sensors.contacts is not None
+        self._sim = build(config, settings, laws=laws, measures_force=has_contact_sensor)
         self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)
@@ -230,5 +238,5 @@ class SimBackend(Backend):
             angles_rad=angles_rad.copy(),
             velocities_rad_s=velocities_rad_s.copy(),
             torques_nm=self._motors.applied_nm().copy(),
-            contacts=list(TouchReader(self._sim, data, self._physics).read()),
+            contacts=list(TouchReader(self._sim, data, self._physics.contacts).read()),
         )

@@ -57,7 +57,12 @@ class Film:
     Settings = SimSettings  # of the backend, which the scene is built with
 
     def __init__(self, config: RunConfig, width: int, height: int) -> None:
-        """Prepare to render the scene of a run in pictures of this size, in pixels.
+        """Prepare to render the scene of a run, with a camera that follows the snake.
+
+        Args:
+            config: configuration of the run, with robot and scene.
+            width: width of the pictures in pixels.
+            height: height of the pictures in pixels.
 
         Raises:
             ConfigError: the scene cannot be built, or there is no OpenGL.
@@ -99,17 +104,17 @@ class Film:
     def picture(
         self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: Sequence[Floats] = ()
     ) -> Picture:
-        """Render the snake, seen from above and behind.
+        """Render the snake at a pose, seen from above and behind.
 
         Args:
-            position_w: (3,), position of the tail end, m.
-            wxyz: (4,), orientation of the tail link.
-            angles_rad: (n_joints,), tail to head.
-            look_at_w: (3,), middle of the picture, m.
+            position_w: (3,) position of the tail end, m.
+            wxyz: (4,) orientation of the tail link.
+            angles_rad: (n_joints,) joint angles, tail to head.
+            look_at_w: (3,) middle of the picture, m.
             arrows_w: arrows to draw, (2, 3) each: start and end, m.
 
         Returns:
-            (height, width, 3), rows from the top.
+            (height, width, 3) colors, rows from the top.
         """
         self._data.qpos[:3] = position_w
         self._data.qpos[3:7] = wxyz

@@ -1,10 +1,8 @@
 """Steps of one simulation: MuJoCo's own, with the forces that this package computes itself."""
 
-from collections.abc import Callable
-
 import mujoco
 
-from snakesim_sim_backend.laws.laws import Laws
+from snakesim_sim_backend.laws.laws import Laws, MeasuredContactForce
 from snakesim_sim_backend.laws.native_laws import NativeLaws
 from snakesim_sim_backend.laws.python_laws import PythonLaws
 from snakesim_sim_backend.model.build import SimModel
@@ -25,13 +23,11 @@ class Physics:
     Attributes:
         laws: the forces that MuJoCo does not compute.
         contacts: forces of the contacts that MuJoCo finds.
-        after_step: called after every physics step, for a sensor that must not miss one.
     """
 
     def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
         self.laws = open_laws(sim, data)
         self.contacts = self.laws.contacts
-        self.after_step: Callable[[], None] | None = None
 
     def set_min_friction(self, min_friction: float) -> None:
         """Use at least this friction coefficient in every contact, until it is set back to 0."""
@@ -46,6 +42,10 @@ class Physics:
         """Compute all quantities of the present state."""
         self.laws.forward()
 
+    def measure_force(self) -> MeasuredContactForce:
+        """Begin to measure the force between links and obstacles, in a model that was built with `measures_force`."""
+        return self.laws.measure_force()
+
     def step(self, count: int) -> None:
         """Advance by this number of physics steps under the present inputs."""
-        self.laws.step(count, self.after_step)
+        self.laws.step(count)

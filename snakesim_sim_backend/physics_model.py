@@ -40,7 +40,13 @@ class MujocoPhysicsModel(PhysicsModel):
     Settings = PhysicsModelSettings
 
     def __init__(self, config: RunConfig, settings: PhysicsModelSettings) -> None:
-        """Place the snake as `SimBackend` does, at rest.
+        """Build the scene of a run without motors, and place the snake in it at rest, as `SimBackend` does.
+
+        Emulated drives then move it by the torques that they compute.
+
+        Args:
+            config: the run, with its robot and its scene.
+            settings: parameters of the physics.
 
         Raises:
             ConfigError: the settings do not match the robot or the scene.
@@ -95,10 +101,13 @@ class MujocoPhysicsModel(PhysicsModel):
         self._model.opt.disableflags = self._flags_without_sensors
 
     def advance(self, torque_nm: Floats) -> None:
-        """Make one physics step under these motor torques, (n_joints,).
+        """Make one physics step under the torques of the motors.
+
+        Args:
+            torque_nm: (n_joints,) torques during the step, tail to head.
 
         Raises:
-            BackendError: the simulation has diverged, in this step or before. The last good state stays.
+            BackendError: the simulation has diverged, in this step or before. Its state is the last good one.
         """
         if self._diverged:
             self._watch.check(self._step_count)  # raises again

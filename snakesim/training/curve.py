@@ -48,6 +48,6 @@ def _draw_curve(file: Path, generations: Sequence[Generation]) -> None:
     axes.plot(checked_episodes, check_rewards, "o-", color="tab:blue", label="mean policy, on other fields")
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=8)
     with exported(file) as partial:
         figure.savefig(partial, dpi=120)

@@ -64,7 +64,7 @@ POLL_S = 0.0005  # pause between two looks at an adapter that has no file descri
 def open_wire(
     channel: str, only: Iterable[Opcode] | None = None, bit_rate: int = BIT_RATE, data_bit_rate: int | None = None
 ) -> Wire:
-    """Open one end of a bus.
+    """Open one end of a bus: a SocketCAN interface of the kernel, or an adapter of python-can.
 
     Args:
         channel: a SocketCAN interface, or INTERFACE:CHANNEL of python-can.
@@ -123,7 +123,15 @@ def check_channel(channel: str, *, fd: bool = False) -> None:
 
 
 def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
-    """Check every channel of a robot, and that each is another bus. Raises ConfigError."""
+    """Check every channel of a robot, and that no two of them are the same bus.
+
+    Args:
+        channels: SocketCAN interfaces, or INTERFACE:CHANNEL of python-can.
+        fd: whether they must support CAN FD.
+
+    Raises:
+        ConfigError: a channel does not exist, is down, or is named twice.
+    """
     channel_of_bus: dict[tuple[str, str], str] = {}
     for channel in channels:
         check_channel(channel, fd=fd)

@@ -96,7 +96,7 @@ class SocketCanWire:
     """One end of a bus, as an interface of the kernel."""
 
     def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
-        """Open an interface.
+        """Open a SocketCAN interface of the kernel for sending and receiving without blocking.
 
         Args:
             channel: name of the interface.
@@ -368,11 +368,11 @@ def drain_socket(
 
 
 def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
-    """Wait until a frame may have arrived on any bus, or the timeout. Other ends in this process run meanwhile.
+    """Wait until a frame may have arrived on any bus, or the timeout. Emulators in this process run meanwhile.
 
     Args:
         wires: ends of the buses.
-        timeout_s: how long to wait at most.
+        timeout_s: maximum time to wait.
 
     Returns:
         False if nothing can arrive before this end sends something.

@@ -39,7 +39,7 @@ def worst_frame_bits(length: int) -> int:
 
 
 def worst_frame_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
-    """Return the time that a frame takes at worst-case stuffing.
+    """Return the time that a frame occupies the bus with the maximum number of stuff bits.
 
     On CAN FD, identifier and end are sent at the first bit rate; length, data and CRC at the second. The CRC has 17
     bits, or 21 above 16 bytes of data. Before it comes the count of stuff bits, and it has a fixed stuff bit for every
@@ -84,7 +84,12 @@ class Stream:
 
 
 def list_streams(joints: int, reports: ReportSchedule) -> list[Stream]:
-    """Return all kinds of frames on a bus with this many joints while the robot runs."""
+    """Return all kinds of frames on one bus while the robot runs, each with its mean rate.
+
+    Args:
+        joints: number of joints on the bus.
+        reports: which reports the modules send, and how often.
+    """
     rate_hz = reports.rate_hz
     contact_hz = rate_hz / reports.contact_every if reports.contact_every else 0.0
     imu_hz = rate_hz / reports.imu_every if reports.imu_every else 0.0
@@ -157,7 +162,18 @@ def plan_reports_at(rate_hz: float, config: RunConfig, settings: CanSettings) ->
 
 
 def joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
-    """Return the number of joints on each bus, tail to head. Raises ConfigError for impossible settings."""
+    """Distribute the joints of a robot over its buses, as the settings say, or as evenly as possible.
+
+    Args:
+        config: configuration of the run, with the robot.
+        settings: settings of the backend, with its channels.
+
+    Returns:
+        The number of joints on each bus, tail to head.
+
+    Raises:
+        ConfigError: a channel is named twice, or the numbers do not fit the robot.
+    """
     joints = config.robot.chain.modules
     buses = max(len(settings.channels), 1)
     if len(set(settings.channels)) < len(settings.channels):
@@ -200,14 +216,18 @@ def plan_buses(config: RunConfig, settings: CanSettings) -> list[tuple[int, Repo
 
 
 def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
-    """Check that every bus can carry its joints.
+    """Check that every bus can carry the frames of its joints.
+
+    Args:
+        config: configuration of the run, with the control rate.
+        settings: settings of the backend, with its channels.
 
     Returns:
         The load of every bus, as a fraction of its time.
 
     Raises:
-        ConfigError: a load is above `MAX_LOAD`, or a single period is too long. The error has the sum, and
-            alternatives that fit.
+        ConfigError: a load is above `MAX_LOAD`, or a single period is too long. The error has the sum, and alternatives
+            that fit.
     """
     buses = plan_buses(config, settings)
     joints = [count for count, _ in buses]

@@ -183,7 +183,11 @@ def parse_line(line: str) -> can.Message | None:
 
 
 def _parse_compact(match: re.Match[str]) -> can.Message:
-    """Return the frame of a line of `candump -L`."""
+    """Return the CAN frame of a line in the compact format of `candump -L`.
+
+    Args:
+        match: the parts of the line; flags are such as "#1" for CAN FD, and remote is such as "R8".
+    """
     data = bytes.fromhex(match["data"] or "")
     flags = match["flags"]  # such as "#1"; None: classic CAN
     has_fast_data = flags is not None and bool(int(flags[1:], 16) & FAST_DATA)
@@ -241,7 +245,17 @@ def _make_message(
     length: int,
     has_fast_data: bool = False,
 ) -> can.Message:
-    """Return the frame with the id, channel and direction of a line."""
+    """Return the CAN frame of a line of a log, with the id, channel and direction of that line.
+
+    Args:
+        match: the parts of the line.
+        time_s: timestamp of the line.
+        data: bytes of data.
+        is_fd: whether it is a frame of CAN FD.
+        is_remote: whether it is a remote frame, which has a length but no data.
+        length: number of bytes.
+        has_fast_data: whether the data were sent at the second bit rate.
+    """
     identifier = int(match["id"], 16)
     is_extended = len(match["id"]) == EXTENDED_ID_DIGITS
     if is_extended and identifier & ERROR_FLAG:

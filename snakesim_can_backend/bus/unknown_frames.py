@@ -53,7 +53,18 @@ class UnknownFrames:
 
 
 def listen_for_unknown_frames(bus: can.BusABC, seconds: float) -> list[UnknownFrames]:
-    """Return the unknown frames that arrive on a bus within a time, sorted by id. Raises BackendError."""
+    """Collect the frames on a bus that do not belong to the protocol of joint modules, without sending anything.
+
+    Args:
+        bus: an open bus of python-can.
+        seconds: how long to listen; it ends earlier after MAX_FRAMES frames.
+
+    Returns:
+        The unknown frames by id, with their number and a guess at their origin.
+
+    Raises:
+        BackendError: the bus cannot be read.
+    """
     counts: Counter[tuple[int, bool]] = Counter()  # by id, and whether it is extended
     newest: dict[tuple[int, bool], can.Message] = {}
     end_s = time.monotonic() + seconds

@@ -83,7 +83,12 @@ class CanDriveBackend(DriverTypeBackend):
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
-        """Check channels, ids, joints and bus load.
+        """Check channels, ids, joints and bus load of the joints that have drives of this type.
+
+        Args:
+            config: configuration of the run.
+            settings: settings of the driver type.
+            joints: the joints with drives of this type.
 
         Raises:
             ConfigError: one of them does not suit this driver type.
@@ -143,7 +148,12 @@ class CanDriveBackend(DriverTypeBackend):
 
     @classmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-        """Return one bus for each channel, or a virtual one with emulated drives."""
+        """Return one bus for each channel, or a virtual one with emulated drives.
+
+        Args:
+            context: configuration, settings, joints, clock, and the body that emulated drives move; without a body the
+                drives are real.
+        """
         config = context.config
         settings = context.settings
         joints = context.joints
@@ -157,6 +167,13 @@ class CanDriveBackend(DriverTypeBackend):
         log = open_log(Path(settings.log), cls.name) if settings.log else None
 
         def open_drives(channel: str, indices: Sequence[int], readings: DriveReadings) -> CanDrives:
+            """Open the bus of a channel, virtual if the drives are emulated, and return its drives; nothing is sent.
+
+            Args:
+                channel: name of the channel.
+                indices: joints with drives on this bus, by their indices in the robot.
+                readings: gets the values that the drives report.
+            """
             emulator = None
             if body is not None:
                 other_end = VirtualWire(channel, fd=uses_fd)

@@ -22,7 +22,18 @@ from snakesim_hal.programs.preflight import backend_settings
 
 
 def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
-    """Emulate the drives of a driver type until a stop signal arrives. Returns 0; raises SnakesimError."""
+    """Emulate the drives of a driver type on some channels until a stop signal arrives.
+
+    Args:
+        backend: the driver type.
+        arguments: the parsed command line.
+
+    Returns:
+        The exit code, 0.
+
+    Raises:
+        SnakesimError: the configuration is invalid, or a channel is not virtual or cannot be opened.
+    """
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
     config, settings = _load_settings(backend, "drive emulate", arguments)
@@ -43,7 +54,18 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
 
 
 def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
-    """Print the bus load of the drives of a driver type. Returns 0; raises SnakesimError."""
+    """Print the bus load of the drives of a driver type, and the highest control rate that fits.
+
+    Args:
+        backend: the driver type.
+        arguments: the parsed command line.
+
+    Returns:
+        The exit code, 0.
+
+    Raises:
+        SnakesimError: the configuration is invalid.
+    """
     config, settings = _load_settings(backend, "drive load", arguments)
     bus_load = backend.compute_load(config.rate_hz, settings, config.robot.joint_table)
     if arguments.json:
@@ -51,7 +73,7 @@ def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) ->
             {
                 "rate_hz": config.rate_hz,
                 "drives": bus_load.drives,
-                "load": bus_load.share,
+                "load": bus_load.fraction,
                 "max_load": MAX_LOAD,
                 "max_rate_hz": bus_load.fits_hz,
             }
@@ -60,7 +82,7 @@ def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) ->
     rates = backend.describe_rates(settings)
     print_line(
         f"{bus_load.drives} {backend.plural_noun} at {config.rate_hz:g} Hz on {rates}: "
-        f"{bus_load.share:.0%} at worst-case stuffing; {MAX_LOAD:.0%} are allowed, so up to {bus_load.fits_hz} Hz"
+        f"{bus_load.fraction:.0%} at worst-case stuffing; {MAX_LOAD:.0%} are allowed, so up to {bus_load.fits_hz} Hz"
     )
     return 0
 

@@ -67,7 +67,11 @@ class CanDrives(Drives):
     missing_identity_reason: str  # why a drive may not send its firmware version, for a message
 
     def __init__(self, context: CanDrivesContext) -> None:
-        """Use an open bus; nothing is sent."""
+        """Prepare to drive the joints on an open bus; nothing is sent before `bring_up`.
+
+        Args:
+            context: the bus, its joints, the object that stores their readings, and the times of the driver.
+        """
         self._context = context
         self.emulated = context.emulated
         self._emulator = context.emulator

@@ -22,7 +22,7 @@ class CycleTraffic:
 class BusLoad:
     """The load of the fullest bus."""
 
-    share: float  # of its time, 0 to 1
+    fraction: float  # of its time, 0 to 1
     fits_hz: int  # the highest rate that is allowed
     drives: int
 
@@ -37,9 +37,9 @@ class BusLoad:
         Raises:
             ConfigError: the load is higher than `MAX_LOAD`.
         """
-        if self.share > MAX_LOAD:
+        if self.fraction > MAX_LOAD:
             raise ConfigError(
-                f"{self.drives} drives at {rate_hz:g} Hz need {self.share:.0%} of a bus of {bus}, at worst-case "
+                f"{self.drives} drives at {rate_hz:g} Hz need {self.fraction:.0%} of a bus of {bus}, at worst-case "
                 f"stuffing; at most {MAX_LOAD:.0%}: use rate_hz = {self.fits_hz}, or more `backends.{name}.channels`",
                 code="bus/overloaded",
             )
@@ -48,20 +48,20 @@ class BusLoad:
 def compute_load(
     traffic: CycleTraffic, bus_indices: Sequence[int], rate_hz: float, frame_s: Callable[[int], float]
 ) -> BusLoad:
-    """Return the load of the fullest bus.
+    """Return the load of the bus with the most drives, and the highest control rate that it allows.
 
     Args:
-        traffic: The frames of the driver type.
-        bus_indices: The bus of every joint.
+        traffic: The frames that a driver type sends and receives in each cycle.
+        bus_indices: Index of the bus of every joint.
         rate_hz: Rate of the control cycle on the bus.
-        frame_s: Returns the time that a frame of so many bytes takes at most.
+        frame_s: Returns the maximum time that a frame occupies the bus, from its number of data bytes.
     """
     drives = max(bus_indices.count(bus) for bus in set(bus_indices))
     each_drive_s = sum(map(frame_s, traffic.each_drive))
     one_drive_s = sum(map(frame_s, traffic.one_drive))
     cycle_s = drives * each_drive_s + one_drive_s
-    heartbeat_share = 0.0
+    heartbeat_fraction = 0.0
     if traffic.heartbeats_hz:
-        heartbeat_share = drives * traffic.heartbeats_hz * frame_s(HEARTBEAT_BYTES)
-    max_rate_hz = int((MAX_LOAD - heartbeat_share) / cycle_s)
-    return BusLoad(cycle_s * rate_hz + heartbeat_share, max_rate_hz, drives)
+        heartbeat_fraction = drives * traffic.heartbeats_hz * frame_s(HEARTBEAT_BYTES)
+    max_rate_hz = int((MAX_LOAD - heartbeat_fraction) / cycle_s)
+    return BusLoad(cycle_s * rate_hz + heartbeat_fraction, max_rate_hz, drives)

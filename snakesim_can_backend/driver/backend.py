@@ -30,7 +30,11 @@ class CanBackend(DriveBackend):
 
     @classmethod
     def check(cls, config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:
-        """Check that a run is possible with these settings.
+        """Check that a run is possible with these settings, before a bus is opened.
+
+        Args:
+            config: configuration of the run.
+            settings: settings of this backend.
 
         Returns:
             The supported clock modes: real time only on real modules, and lockstep too on emulators of this driver.
@@ -54,7 +58,16 @@ class CanBackend(DriveBackend):
         return ("realtime",)
 
     def __init__(self, config: RunConfig, settings: CanSettings) -> None:
-        """Open the buses and find every module; nothing is enabled. Raises ConfigError and BackendError."""
+        """Open the buses and find every joint module; no module is enabled.
+
+        Args:
+            config: configuration of the run.
+            settings: settings of this backend, with its channels.
+
+        Raises:
+            ConfigError: the run is not possible with these settings.
+            BackendError: a bus cannot be opened, or a module is missing.
+        """
         self.check(config, settings)
         clock = DriverClock(config)
         has_emulators = settings.emulators_run != "none"

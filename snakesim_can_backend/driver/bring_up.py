@@ -113,20 +113,23 @@ def _make_identity(channel: str, node: int, values: Mapping[str, float]) -> Modu
 
 
 def discovery_errors(
-    buses: Sequence[ModuleBus], found: Sequence[ModuleIdentity], joints: Sequence[str], *, lockstep: bool
+    buses: Sequence[ModuleBus], identities: Sequence[ModuleIdentity], joints: Sequence[str], *, lockstep: bool
 ) -> list[str]:
-    """Return what is wrong with the modules that answered; nothing if the robot is complete.
+    """Compare the modules that answered with the joints of the robot.
 
     Args:
         buses: the buses, with the nodes that are expected there.
-        found: the modules that answered.
+        identities: the modules that answered.
         joints: names of the joints, tail to head.
         lockstep: whether the run is in lockstep, which only stepped emulators support.
+
+    Returns:
+        The errors as text; none if the robot is complete.
     """
     errors: list[str] = []
     channel_of_node = {node: bus.wire.channel for bus in buses for node in bus.nodes}
     identities_of_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
-    for identity in found:
+    for identity in identities:
         identities_of_node[identity.node].append(identity)
     for node, channel in channel_of_node.items():
         subject = f"{joints[node - 1]} (node {node} on {channel})"
@@ -140,7 +143,7 @@ def discovery_errors(
         errors += _node_errors(subject, on_its_channel, on_other_channels)
         for identity in on_its_channel:
             errors += _identity_errors(subject, identity, lockstep=lockstep)
-    for identity in found:
+    for identity in identities:
         if identity.node not in channel_of_node:
             errors.append(
                 f"node {identity.node} with serial {identity.serial:08X} on {identity.channel} is not a joint of this "

@@ -31,7 +31,7 @@ class ModuleMonitor:
     """Finds what is wrong with modules and buses, and remembers which findings it has reported."""
 
     def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float) -> None:
-        """Create the monitor of a robot.
+        """Create the monitor of a robot's modules, which remembers what it has seen from Sync to Sync.
 
         Args:
             joints: name of every joint, tail to head.
@@ -242,7 +242,12 @@ class ModuleMonitor:
     # --- the buses --------------------------------------------------------------------------------------------
 
     def _check_buses(self, errors: Iterable[BusError], unsent: set[str]) -> list[Finding]:
-        """Return findings about bus errors, and about buses that send nothing."""
+        """Return findings about bus errors, and about buses that have rejected frames for several cycles.
+
+        Args:
+            errors: bus errors since the last call; those that are not faults are only counted.
+            unsent: channels of the buses that rejected a frame in this cycle.
+        """
         findings: list[Finding] = []
         for error in errors:
             if error.kind == "interface_down":
@@ -269,7 +274,11 @@ class ModuleMonitor:
         return Finding("bus_stuck", cause)
 
     def _check_unknown_senders(self, reading: ModuleReports) -> list[Finding]:
-        """Return findings about nodes that are no joints, and about other programs that command the modules."""
+        """Return findings about nodes that are no joints, and about other programs that command the modules.
+
+        Args:
+            reading: counts of frames from other senders, which are reset.
+        """
         findings: list[Finding] = []
         self._unknown_nodes = {
             node: self._unknown_nodes.get(node, 0) + frames for node, frames in reading.unknown_nodes.items()

@@ -144,7 +144,10 @@ class JointModules(Drives):
         self._answer_limit_s = answer_limit_s(self._config, self._settings)
 
     def read(self) -> None:
-        """Send a Sync, and collect the modules' samples. Waits for late ones only for a limited time."""
+        """Send a Sync, at which all modules sample their sensors, and collect their answers for a limited time.
+
+        A module that does not answer in time keeps its last values.
+        """
         reading = self.reading
         queries = self._lockstep_queries()
         time_us = self._clock.now_ns() // 1000
@@ -158,9 +161,9 @@ class JointModules(Drives):
             wire.send(query)
         if reading.complete:  # no answer is expected; but emulators in this process run only while this one waits
             wait(self.wires, 0.0)
-        end_s = time.monotonic() + self._answer_limit_s
+        deadline_s = time.monotonic() + self._answer_limit_s
         while not reading.complete:
-            left_s = end_s - time.monotonic()
+            left_s = deadline_s - time.monotonic()
             if left_s <= 0 or not wait(self.wires, left_s):
                 break
             self._receive()
@@ -213,7 +216,9 @@ class JointModules(Drives):
     def send_setpoints(self, command: BusCommand) -> None:
         """Send the setpoints while the robot is armed. Otherwise send none, and the modules come to rest by themselves.
 
-        `may_enable` and `emergency` are not used, because `announce` arms, disarms and stops modules.
+        Args:
+            command: setpoints of all joints, and which of them follow. `may_enable` and `emergency` are not used,
+                because `announce` arms, disarms and stops modules.
         """
         must_not_arm = self._unconfigured - self._isolated
         if self._arm_is_due and not must_not_arm:
@@ -278,7 +283,15 @@ class JointModules(Drives):
     # --- opening and closing ----------------------------------------------------------------------------------
 
     def _open_buses(self, joints_of_buses: list[int], pose: str | None) -> list[ModuleBus]:
-        """Open every bus, and return it with the nodes that belong on it."""
+        """Open every bus, and start the emulators if the settings ask for them.
+
+        Args:
+            joints_of_buses: number of joints on each bus, tail to head.
+            pose: address, HOST:PORT, to which emulators send motion capture; None: nowhere.
+
+        Returns:
+            The buses, with the nodes that are expected on each of them.
+        """
         settings = self._settings
         if settings.emulators_run == "process":
             self._emulators = EmulatorProcess(self._config, settings, pose, stepped=self._lockstep)

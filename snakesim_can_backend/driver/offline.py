@@ -32,7 +32,7 @@ class LogReplay:
     """Reads a log frame by frame as the driver reads a bus, and collects the joint states of every Sync."""
 
     def __init__(self, mounting: Mounting, reports: ReportSchedule, answer_limit_s: float) -> None:
-        """Start a replay.
+        """Prepare to read the log of a bus as the driver would have read the bus.
 
         Args:
             mounting: how the modules' shafts move the joints.
@@ -106,12 +106,15 @@ class ReplayComparison:
 
 
 def compare_with_run_log(replay: LogReplay, layout: Layout, rows: dict[str, Floats]) -> ReplayComparison:
-    """Compare the joint states of every tick with the run log.
+    """Compare the joint states that were replayed from a bus log with those of every tick in the run log.
 
     Args:
         replay: the replay of the bus log.
         layout: layout of the run log, with the names of the joints.
         rows: columns of the run log: "tick", and VALUES with shape (n_ticks, n_joints).
+
+    Returns:
+        The number of compared ticks, and the first difference as text; empty if there is none.
     """
     recorded = np.stack([rows[name] for name in VALUES], axis=1)  # (n_ticks, 3, n_joints)
     ticks = rows["tick"].astype(int)

@@ -26,7 +26,16 @@ POLL_S = 0.02
 
 
 def check_emulators(config: RunConfig, settings: CanSettings) -> None:
-    """Raise ConfigError for impossible settings of the emulators."""
+    """Check that the settings of emulators fit the channels and the faults of a run.
+
+    Args:
+        config: the run, with the robot.
+        settings: settings of the backend.
+
+    Raises:
+        ConfigError: emulators in the driver have real channels, emulators in a process have none, or a fault is
+            invalid.
+    """
     from snakesim_can_backend.emulator.faults import parse_fault
 
     if settings.emulators_run == "here" and settings.channels:
@@ -82,7 +91,7 @@ def supports_fault(injection: Injection, joints: int) -> bool:
 def start_local_emulators(
     config: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
 ) -> VirtualPeer:
-    """Start emulators at the other end of a virtual bus, in this process.
+    """Start emulators of all joint modules at the other end of a virtual bus, in this process.
 
     Args:
         config: the run, with the robot.
@@ -103,7 +112,7 @@ class EmulatorProcess:
     """`snakesim drive emulate can` as a child that dies with this process."""
 
     def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
-        """Start the child, and wait until its modules are on the bus.
+        """Start `snakesim drive emulate can` as a child process, and wait until its modules are on the bus.
 
         Args:
             config: the run, with the robot.

@@ -19,7 +19,16 @@ RATING_TOLERANCE = 0.999  # a rating has single precision on the bus
 def plan_parameters(
     robot: RobotFile, settings: CanSettings, reports: ReportSchedule
 ) -> dict[int, dict[ModuleParameter, float]]:
-    """Return the parameters to write to each node, converted from the joints to the modules' shafts."""
+    """Compute the parameters that each module gets in bring-up, converted from the joint to the module's shaft.
+
+    Args:
+        robot: the robot file, with gains, limits and gears of the joints.
+        settings: settings of the backend.
+        reports: which reports the modules send, and how often.
+
+    Returns:
+        The value of each parameter, by node.
+    """
     stop_mode = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
     planned: dict[int, dict[ModuleParameter, float]] = {}
     for node, joint in enumerate(robot.joint_table, start=1):
@@ -50,7 +59,15 @@ def _max_shaft_angle_rad(joint: Joint) -> float:
 
 
 def check_drives(robot: RobotFile, settings: CanSettings) -> None:
-    """Raise ConfigError for joints whose `[drive]` is not how this backend finds modules."""
+    """Check that node ids, ports and turns in the robot file are those that joint modules support.
+
+    Args:
+        robot: the robot file.
+        settings: settings of the backend, with its channels.
+
+    Raises:
+        ConfigError: a joint has another id than its number, counts turns, or names a port that is no channel.
+    """
     for number, joint in enumerate(robot.joint_table, start=1):
         if joint.id != number:
             raise ConfigError(

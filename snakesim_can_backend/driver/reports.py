@@ -165,7 +165,7 @@ class ModuleReports:
         Args:
             sync: number of this Sync.
             contacts: whether the modules report contact forces at this Sync.
-            tail: whether the tail link sends a contact report of its own.
+            tail: whether the tail link sends its own contact report, too.
             questions: number of parameter requests that are sent with this Sync.
         """
         self.sync = sync
@@ -257,6 +257,15 @@ class ModuleReports:
     # --- one kind of frame each -------------------------------------------------------------------------------
 
     def _on_joint_state(self, module: ModuleStatus, frame: Frame) -> None:
+        """Store the joint state that a module has sent, if its checksum and its count are valid.
+
+        The count is the number of the Sync that it answers, modulo COUNTER_MODULUS. An answer to an older Sync counts
+        if it is at most MAX_LATE_SYNCS late.
+
+        Args:
+            module: status of the module that sent the frame, which is updated.
+            frame: the frame.
+        """
         identifier, data = frame
         if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `has_valid_checksum`, without the cost of a call
             module.corrupt += 1

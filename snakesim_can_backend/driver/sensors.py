@@ -35,7 +35,7 @@ class SampleBuilder:
     def __init__(
         self, config: RunConfig, reports: ReportSchedule, reading: ModuleReports, mocap: MocapReceiver | None
     ) -> None:
-        """Create the builder of a run.
+        """Prepare to convert the raw reports of all modules into messages, with the units and scales of the protocol.
 
         Args:
             config: the run, with the robot.
@@ -93,6 +93,12 @@ class SampleBuilder:
         return Samples(self._make_joint_state(tick, timestamp_ns), others)
 
     def _make_joint_state(self, tick: int, timestamp_ns: int) -> JointState:
+        """Return angles, velocities and torques of all joints as a message; values older than the lease are invalid.
+
+        Args:
+            tick: number of the control cycle.
+            timestamp_ns: robot time of the cycle.
+        """
         reading = self._reading
         angle_rad, velocity_rad_s, torque_nm = joint_values(reading, self._mounting).tolist()
         ages_ns: list[int] = []
@@ -156,7 +162,12 @@ class SampleBuilder:
         )
 
     def _make_power(self, tick: int, timestamp_ns: int) -> Power:
-        """Return voltage, current and temperatures of every module; 0.0 and invalid where no report has arrived."""
+        """Return voltage, current and temperatures of every module; 0.0 and invalid where no report has arrived.
+
+        Args:
+            tick: number of the control cycle.
+            timestamp_ns: robot time of the cycle.
+        """
         rows = self._reading.health()
         columns: list[list[float]] = []
         for i, signal in enumerate(self._health_signals):
@@ -221,9 +232,9 @@ def describe_sensors(
 
 
 def locate_on_capsule(along_m: float, bearing_rad: float, length_m: float, radius_m: float) -> tuple[Vector, Vector]:
-    """Return the outward normal and the point on the surface of a link's capsule.
+    """Convert the place of a contact on a link, as its sensor measures it, to a point on the link's surface.
 
-    Beyond its ends a capsule is a sphere, and its normal tilts forward or back.
+    A link is a capsule. Beyond its ends it is a sphere, and its normal tilts forward or back.
 
     Args:
         along_m: place along the link, from its joint.
@@ -232,7 +243,7 @@ def locate_on_capsule(along_m: float, bearing_rad: float, length_m: float, radiu
         radius_m: radius of the capsule.
 
     Returns:
-        Normal and point in the link's frame.
+        The outward normal, a unit vector, and the point in m, both in the link's frame.
     """
     axis_m = min(max(along_m, 0.0), length_m)  # the nearest place on the capsule's axis
     lean = min(max((along_m - axis_m) / radius_m, -1.0), 1.0)

@@ -43,6 +43,11 @@ class BusTime:
     """The timing of one bus. Times are microseconds, and must not go backward."""
 
     def __init__(self, bit_rate: int = BIT_RATE) -> None:
+        """Start with an idle bus, on which frames wait for arbitration and occupy the bus for their worst-case time.
+
+        Args:
+            bit_rate: bit rate of the bus in bit/s.
+        """
         self.frame_us = [worst_frame_bits(length) * 1e6 / bit_rate for length in range(MAX_DATA_BYTES + 1)]
 
         # Frames that wait: sender -> mailbox -> frame, and since when it waits.

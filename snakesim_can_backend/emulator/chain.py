@@ -200,7 +200,11 @@ class ModuleChain:
             self.motors.derate(remaining_fraction)
 
     def _poll(self, now_us: float) -> None:
-        """Run everything that depends on time, except physics: planned faults, modules, babblers."""
+        """Run everything that depends on time, except physics: planned faults, firmware and babbling modules.
+
+        Args:
+            now_us: present time.
+        """
         for change in self._plan.until(now_us / 1e6):
             self._apply_fault(change, now_us)
         speeds_rad_s = self.physics_model.velocity_rad_s.tolist()
@@ -229,7 +233,12 @@ class ModuleChain:
     # --- frames from the bus -------------------------------------------------------------------------------
 
     def receive(self, channel: int, frame: Frame) -> None:
-        """Process a frame of the host that has arrived on a bus."""
+        """Process a frame of the host that has arrived on a bus: pass it to the modules that it addresses.
+
+        Args:
+            channel: index of the bus.
+            frame: the frame; one that no host sends, or of a wrong length, is only counted.
+        """
         opcode = parse_opcode(frame.id)
         node = parse_node(frame.id)
         # An Emergency is valid at any length.
@@ -292,6 +301,8 @@ class ModuleChain:
     def _receive_sync(self, channel: int, frame: Frame) -> None:
         """Advance to a Sync, send the pose, and let every module of its bus answer and follow its setpoint.
 
+        Answers are sent in the order of arbitration.
+
         Args:
             channel: index of the bus on which the Sync arrived.
             frame: the Sync.
@@ -350,7 +361,11 @@ class ModuleChain:
             self._drive_motor(slot)
 
     def _drive_motor(self, slot: ModuleSlot) -> None:
-        """Apply a module's demand and gains to its motor, converted from the module's shaft to the joint."""
+        """Apply a module's demand and gains to its motor, converted from the module's shaft to the joint.
+
+        Args:
+            slot: the module, and the joint that it moves.
+        """
         demand = slot.module.demand
         slot.driven = demand
         values = slot.module.parameters.values

@@ -47,7 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def emulate(arguments: argparse.Namespace) -> int:
-    """Check everything, open the buses, and serve the emulators until the command is stopped. Returns 0."""
+    """Run `snakesim drive emulate can`: check everything, open the buses, and serve the emulators until a stop signal.
+
+    Args:
+        arguments: the parsed command line.
+
+    Returns:
+        The exit code, 0.
+    """
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
     loaded = _load_configuration(arguments)

@@ -91,7 +91,7 @@ class ModuleFirmware:
         stepped: bool = False,
         now_us: float = 0.0,
     ) -> None:
-        """Start to boot.
+        """Start to boot the firmware of one emulated module.
 
         Args:
             node: id of the module on its bus.
@@ -123,7 +123,14 @@ class ModuleFirmware:
     # --- frames from the bus -------------------------------------------------------------------------------
 
     def receive(self, frame: Frame, now_us: float) -> None:
-        """Process an Emergency, Command or ParameterRequest. The first two may be broadcasts."""
+        """Process an Emergency, Command or ParameterRequest. The first two may be broadcasts.
+
+        A module that boots obeys only an Emergency; one that hangs obeys nothing.
+
+        Args:
+            frame: the frame.
+            now_us: present time.
+        """
         opcode = parse_opcode(frame.id)
         if self.hangs:
             return
@@ -163,10 +170,14 @@ class ModuleFirmware:
                 pass
 
     def receive_setpoint(self, frame: Frame, now_us: float) -> None:
-        """Check a setpoint for this node, and keep it until the next Sync.
+        """Check a setpoint for this node, and store it until the next Sync.
 
         A setpoint with a wrong length, checksum, counter or mode is refused. MAX_WRONG_COUNTS wrong counters in a row
-        are a fault.
+        are a fault. The first valid setpoint after a Sync feeds the watchdog.
+
+        Args:
+            frame: the setpoint.
+            now_us: present time.
         """
         if self.state != ModuleState.ARMED or self.hangs:
             return
@@ -238,8 +249,11 @@ class ModuleFirmware:
     def poll(self, now_us: float) -> float:
         """Do everything that is due now: watchdog, fault detection, heartbeat and Health.
 
+        Args:
+            now_us: present time.
+
         Returns:
-            The time at which the next call is due.
+            The time at which the next call is due, in microseconds.
         """
         if self.hangs:
             return self._poll_hanging(now_us)
@@ -309,7 +323,11 @@ class ModuleFirmware:
     # --- states --------------------------------------------------------------------------------------------
 
     def _reset_state(self, now_us: float) -> None:
-        """Set everything as it is at the start of a boot."""
+        """Set state, setpoints and times to what they are when a module begins to boot.
+
+        Args:
+            now_us: present time.
+        """
         self.state = ModuleState.BOOT
         self._after_boot = ModuleState.DISARMED
         self.faults = 0  # bits of ModuleFault
@@ -332,7 +350,7 @@ class ModuleFirmware:
     def _enter(
         self, state: ModuleState, now_us: float, reason: LastStop | None = None, demand: Demand = PASSIVE
     ) -> None:
-        """Change state, forget all setpoints, and send a heartbeat.
+        """Change the state of the module, drop all setpoints, and send a heartbeat.
 
         Args:
             state: the new state.

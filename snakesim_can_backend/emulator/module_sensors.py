@@ -33,11 +33,11 @@ class ModuleSensors:
     def __init__(
         self, robot: RobotFile, physics_model: PhysicsModel, mounting: Mounting, first: int, seed: Sequence[int]
     ) -> None:
-        """Create the sensors of one bus.
+        """Create the emulated sensors of the modules on one bus, with a noise generator of their own.
 
         Args:
             robot: the robot file, with noise and thresholds.
-            physics_model: what the sensors measure.
+            physics_model: the body whose motion and contacts they measure.
             mounting: how the shafts of these modules move their joints.
             first: index of the first joint on this bus, 0 at the tail.
             seed: seed of the noise.

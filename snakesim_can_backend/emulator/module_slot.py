@@ -41,7 +41,13 @@ class ModuleSlot:
         self.module.health.voltage_v = self.joint_model.supply.voltage_v
 
     def set_fault(self, kind: str, active: bool, now_us: float) -> None:
-        """Begin or end a fault of this module; a kind that is no fault of a single module has no effect."""
+        """Begin or end a fault of this module; a kind that is no fault of a single module has no effect.
+
+        Args:
+            kind: kind of the fault, such as "mute" or "leak".
+            active: True to begin it, False to end it.
+            now_us: present time.
+        """
         health = self.module.health
         match kind:
             case "mute":
@@ -102,6 +108,10 @@ def assign_node_ids(robot: RobotFile, settings: CanSettings) -> list[int]:
     """Return the node id of every emulated module, tail to head.
 
     A module has the number of its joint, unless the settings give it another id.
+
+    Args:
+        robot: the robot file.
+        settings: settings of the backend, which may mount modules otherwise.
 
     Raises:
         ConfigError: an id occurs more than once, or not at all.

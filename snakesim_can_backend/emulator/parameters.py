@@ -54,7 +54,7 @@ class ParameterStore:
         self.values = dict(self._flash)
 
     def answer_request(self, node: int, data: bytes, armed: bool) -> Frame:
-        """Execute a ParameterRequest.
+        """Read, write or save a parameter as a ParameterRequest demands, and return the answer.
 
         Args:
             node: id of the module.

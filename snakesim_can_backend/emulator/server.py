@@ -38,7 +38,7 @@ class EmulatorServer:
         self._start_ns: int | None = None
 
     def run_due(self, now_ns: int) -> float | None:
-        """Process received frames, and send the frames that are due.
+        """Process received frames, advance the modules to the present time, and send the frames that are due.
 
         Args:
             now_ns: present time, on a steady clock. Not used by a stepped chain.
@@ -63,7 +63,7 @@ class EmulatorServer:
         return max(pause_us, MIN_PAUSE_US) * 1e-6
 
     def _receive_in_time(self, received: Sequence[Sequence[Frame]], clock_us: float) -> None:
-        """Process frames at their estimated times of arrival.
+        """Process received frames at their estimated times of arrival.
 
         After a delay of this process several periods are in the queue. They are spread over the time since the last
         run, so that a delay here does not look like a delay of the host.

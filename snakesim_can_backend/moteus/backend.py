@@ -34,7 +34,12 @@ class MoteusBackend(CanDriveBackend):
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:
-        """Check also the gains that all controllers have alike.
+        """Check channels, ids and bus load, and the gains, which must be equal on all controllers.
+
+        Args:
+            config: configuration of the run.
+            settings: settings of the driver type, which state the configured gains.
+            joints: the joints with moteus controllers.
 
         Raises:
             ConfigError: the joints need higher gains, or the gains of real controllers are not known.

@@ -184,7 +184,16 @@ class Controllers(CanDrives):
         self._send(i, SERIAL, reply=True)
 
     def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
-        """Send a command, unless the controller was restarted or may be restarting: a command would enable it."""
+        """Send a command, unless the controller was restarted or may be restarting: a command would enable it.
+
+        The controller adds position, velocity and torque control; what a mode does not use gets a gain of 0.
+
+        Args:
+            i: index of the controller on the bus.
+            mode: control mode.
+            target: target at the shaft in rad, rad/s or N·m, by the mode.
+            limit_nm: torque limit.
+        """
         was_restarted = self.states.drives[i].has_followed and self._mode[i] != MoteusMode.POSITION
         if was_restarted or self.readings.unanswered_requests(i):
             return

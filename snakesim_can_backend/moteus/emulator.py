@@ -156,7 +156,12 @@ class EmulatedMoteus(CanEmulator):
         return encode_subframe(REPLY, request.type, request.register, *values)
 
     def _read_register(self, i: int, register: int) -> float:
-        """Return the value of a register."""
+        """Return the value that an emulated controller has in a register, in the units of moteus.
+
+        Args:
+            i: index of the controller.
+            register: number of the register.
+        """
         serial_word = register - Register.SERIAL
         if serial_word in range(SERIAL_WORDS):
             return (i + 1, *UPPER_SERIAL_WORDS)[serial_word]
@@ -200,6 +205,9 @@ class EmulatedMoteus(CanEmulator):
 
         With a proportional gain this is position control, with a derivative gain alone velocity control, and without
         gains torque control.
+
+        Args:
+            i: index of the controller.
         """
         controller = self.controllers[i]
         joint = self.body.joints[i]

@@ -103,7 +103,10 @@ def encode_subframe(kind: int, type_: int, register: int, *values: float, count:
 
 
 def decode_subframes(data: bytes) -> Iterator[Subframe]:
-    """Yield the subframes of a frame.
+    """Yield the subframes of a CAN frame, each a read, write or reply of consecutive registers.
+
+    Args:
+        data: data of the frame.
 
     Raises:
         ValueError, LookupError, struct.error: a subframe is malformed or of a kind that is not used here.

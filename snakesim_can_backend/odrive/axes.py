@@ -77,7 +77,13 @@ class Axes(CanDrives):
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
-        """Read the endpoint files that the settings name.
+        """Prepare to drive the axes on a bus, and read the endpoint files that the settings name.
+
+        Endpoint files map settings of an axis to ids. Without them the limits of the axes cannot be read, so that the
+        driver allows only a low current.
+
+        Args:
+            context: the bus, its joints, and the settings of the driver type.
 
         Raises:
             ConfigError: a file cannot be read.
@@ -112,7 +118,12 @@ class Axes(CanDrives):
         return HOST if message in FROM_HOST else node
 
     def handle_answer(self, i: int, frame: Frame) -> None:
-        """Store what an answer or a heartbeat reports."""
+        """Store the measurements, errors, version or setting that an axis reports in a frame.
+
+        Args:
+            i: index of the axis on the bus.
+            frame: an answer or a heartbeat.
+        """
         message = MessageId(split_id(frame)[1])
         if message == MessageId.TX_SDO:
             self._store_setting(i, frame.data)
@@ -184,7 +195,13 @@ class Axes(CanDrives):
             axis.configured.clear()
 
     def find_mismatch(self, i: int) -> str:
-        """Return why the firmware or the configuration of an axis does not suit its joint; empty if both do."""
+        """Return why the firmware or the configuration of an axis does not suit its joint; empty if both do.
+
+        If both do, the axis' own current limit becomes the maximum that the driver sends.
+
+        Args:
+            i: index of the axis on the bus, whose version and settings have been read.
+        """
         firmware = _join_version(self.firmware[i])
         if self.firmware[i][:2] != FIRMWARE:
             return f"has firmware {firmware}; this driver knows {FIRMWARE[0]}.{FIRMWARE[1]}"
@@ -346,7 +363,12 @@ def needed_current_a(joint: Joint) -> float:
 
 
 def find_objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
-    """Yield what in the configuration of an axis does not suit its joint. NaN suits nothing."""
+    """Yield each setting of an axis that does not suit its joint, with its fix. NaN suits no joint.
+
+    Args:
+        axis: the axis, with the settings that it has reported.
+        watchdog_s: watchdog time of the driver.
+    """
     configured = axis.configured
     timeout_s = configured[AxisSetting.WATCHDOG_TIMEOUT]
     if not configured[AxisSetting.WATCHDOG_ENABLED]:

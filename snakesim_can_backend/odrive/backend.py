@@ -41,10 +41,15 @@ class OdriveBackend(CanDriveBackend):
 
     @classmethod
     def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
-        """Check that an axis suits a joint.
+        """Check that an ODrive axis can drive a joint as the robot file describes it.
+
+        Args:
+            config: configuration of the run, for messages.
+            settings: settings of the driver type.
+            joint: the joint.
 
         Raises:
-            ConfigError: it does not.
+            ConfigError: it has no damping or torque constant, or needs too much current.
         """
         where = joint_label(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
@@ -62,17 +67,22 @@ class OdriveBackend(CanDriveBackend):
 
     @classmethod
     def check_current(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
-        """Check that a joint needs no more current than the driver may set.
+        """Check that the torque limit of a joint needs no more current than the driver may set.
+
+        Args:
+            config: configuration of the run, for messages.
+            settings: settings of the driver type, with the maximum current and the endpoint files.
+            joint: the joint, with its torque limit and torque constant.
 
         Raises:
             ConfigError: it needs more.
         """
         limits_are_read = bool(settings.endpoints) or not cls.has_real_bus(settings)
-        allowed_a = settings.max_current_a
-        if allowed_a is None:
-            allowed_a = math.inf if limits_are_read else UNKNOWN_MAX_CURRENT_A
+        max_current_a = settings.max_current_a
+        if max_current_a is None:
+            max_current_a = math.inf if limits_are_read else UNKNOWN_MAX_CURRENT_A
         needed_a = needed_current_a(joint)
-        if needed_a <= allowed_a * (1 + ROUNDING):
+        if needed_a <= max_current_a * (1 + ROUNDING):
             return
         constant = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
         fix = "raise `backends.odrive.max_current_a`, if the axis is configured for more"
@@ -83,7 +93,7 @@ class OdriveBackend(CanDriveBackend):
             )
         raise ConfigError(
             f"{joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A "
-            f"at {constant:g} N·m/A, and the driver sets no more than {allowed_a:g} A: {fix}; or lower `torque_nm`",
+            f"at {constant:g} N·m/A, and the driver sets no more than {max_current_a:g} A: {fix}; or lower `torque_nm`",
             code="drive/unsupported-setting",
         )
 

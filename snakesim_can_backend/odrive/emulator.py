@@ -95,7 +95,11 @@ class EmulatedOdrive(CanEmulator):
     """All axes of a driver type."""
 
     def __init__(self, context: CanEmulatorContext) -> None:
-        """Start all axes."""
+        """Start one emulated axis for each joint, configured as the joint needs it unless the scenario differs.
+
+        Args:
+            context: joints, settings, and the body that the axes move.
+        """
         super().__init__(context)
         settings: OdriveSettings = context.settings
         self._endpoints = EMULATED
@@ -162,7 +166,14 @@ class EmulatedOdrive(CanEmulator):
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _obey(self, i: int, axis: EmulatedAxis, message: MessageId, values: tuple[float, ...]) -> None:
-        """Execute a command to an axis, with the values of its payload; an unknown command has no effect."""
+        """Execute a command that the host has sent to an axis; an unknown command has no effect.
+
+        Args:
+            i: index of the axis.
+            axis: the axis, whose state is changed.
+            message: kind of the command.
+            values: values of its payload, in the units of ODrive.
+        """
         match message:
             case MessageId.ESTOP:
                 self._fail(i, axis, AxisError.ESTOP_REQUESTED)
@@ -199,7 +210,13 @@ class EmulatedOdrive(CanEmulator):
             self.send_frame(i, encode_setting_answer(axis.node, endpoint, value))
 
     def _make_report(self, i: int, axis: EmulatedAxis, message: MessageId) -> Frame:
-        """Return a message in which an axis reports its state; without data if it does not know the message."""
+        """Return a message in which an axis reports its state; without data if it does not know the message.
+
+        Args:
+            i: index of the axis.
+            axis: the axis.
+            message: kind of the message that the host has requested or that is due.
+        """
         angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
         values: tuple[Any, ...]
         match message:
@@ -227,7 +244,14 @@ class EmulatedOdrive(CanEmulator):
         return encode_message(axis.node, message, *values)
 
     def _drive_motor(self, i: int, axis: EmulatedAxis) -> None:
-        """Apply what an axis controls to its motor. An unknown control mode counts as torque control."""
+        """Apply state, control mode and inputs of an axis to its motor.
+
+        An unknown control mode counts as torque control.
+
+        Args:
+            i: index of the axis.
+            axis: the axis.
+        """
         control = ControlMode.TORQUE
         if axis.control in list(ControlMode):
             control = ControlMode(axis.control)

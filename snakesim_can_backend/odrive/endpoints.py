@@ -67,7 +67,17 @@ def read_all_endpoints(paths: Sequence[str]) -> list[Endpoints]:
 
 
 def read_endpoints(path: str) -> Endpoints:
-    """Read a `flat_endpoints.json`. Raises ConfigError."""
+    """Read from a `flat_endpoints.json` of ODrive the ids of the settings that this driver uses.
+
+    Args:
+        path: path of the file.
+
+    Returns:
+        The ids, with the firmware and the hardware that the file is for.
+
+    Raises:
+        ConfigError: the file cannot be read, or a setting is missing.
+    """
     where = "`backends.odrive.endpoints`"
     advice = "take the flat_endpoints.json that ODrive publishes with the axes' firmware"
     try:

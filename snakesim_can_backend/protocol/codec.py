@@ -104,7 +104,13 @@ class MessageLayout:
     def make_reader(self, *names: str) -> Reader:
         """Return a function that reads some signals' raw numbers, in this order, from the data of a frame.
 
-        The signals must not overlap, and the data must have the length of this message. Raises CodecError.
+        The function is compiled once, because it runs for every frame. Its data must have the length of this message.
+
+        Args:
+            names: names of the signals, which must not overlap.
+
+        Raises:
+            CodecError: signals overlap.
         """
         signals = [self.signals[name] for name in names]
         # bitstruct begins with the highest bit, so the function reverses the bytes and reads the last signal first.
@@ -124,7 +130,11 @@ class MessageLayout:
         return lambda data: select(unpack(data[::-1]))
 
     def make_writer(self, *names: str) -> Writer:
-        """Return a function that makes the frame of a node from some signals' raw numbers, and adds the checksum."""
+        """Return a function that makes the frame of a node from some signals' raw numbers, and adds the checksum.
+
+        Args:
+            names: names of the signals, in the order in which the function takes their numbers.
+        """
         places = [(self.signals[name].shift, self.signals[name].mask) for name in names]
         opcode = self.opcode
         has_checksum = self._has_checksum

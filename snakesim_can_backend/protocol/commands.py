@@ -73,6 +73,10 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     """Return the frames to all modules when the robot's lifecycle changes.
 
     The lifecycle may have passed through other states between `before` and `now`, within one control cycle.
+
+    Args:
+        before: state in the cycle before.
+        now: present state.
     """
     if now == before:
         return []

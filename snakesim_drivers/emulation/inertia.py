@@ -41,7 +41,14 @@ class InertiaModel(PhysicsModel):
     Settings = InertiaSettings
 
     def __init__(self, config: RunConfig, settings: InertiaSettings) -> None:
-        """Begin at the run's start pose, at rest. The step is shortened so that a period is a multiple of it."""
+        """Begin at the run's start pose, at rest, with the inertia of each joint's rotor and of the link ahead of it.
+
+        The step is shortened so that a control period is a multiple of it.
+
+        Args:
+            config: configuration of the run, with robot and start pose.
+            settings: duration of a step, and friction in addition to that of the robot file.
+        """
         robot = config.robot
         joints = robot.joint_table
         count = len(joints)

@@ -106,12 +106,12 @@ def _list_differences(truth: Mounted, section: type[Drive | Motor]) -> dict[str,
 
 
 def check_mounted(robot: RobotFile, section: str, mounted: Mapping[str, Mounted], *, emulators: bool) -> None:
-    """Check the settings of emulated drives.
+    """Check the settings that mount emulated drives otherwise than the robot file describes.
 
     Args:
         robot: The robot as its file describes it.
         section: Section of the settings, for messages.
-        mounted: What differs, by the name of the joint.
+        mounted: The differences from the robot file, by the name of the joint.
         emulators: Whether this process emulates the drives.
 
     Raises:

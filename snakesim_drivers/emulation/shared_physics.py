@@ -41,12 +41,15 @@ class PhysicsSettings(Protocol):
 
 
 def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: str) -> PhysicsModel:
-    """Create the physics model that a backend's settings name, moved by motors as they are in truth.
+    """Create the physics model behind emulated drives, with the drives mounted as the settings name it.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        settings: The backend's settings.
+        settings: The backend's settings, which name the physics model.
         backend: Name of the backend, for messages.
+
+    Returns:
+        The model, with backlash in the gears if the settings name any.
 
     Raises:
         ConfigError: There is no such physics model, or it does not accept its settings.

@@ -37,6 +37,8 @@ class Braking:
     ) -> frozenset[int]:
         """Return those of the following joints that continue to brake in this control cycle of a fault.
 
+        A joint stops braking when it is slow enough or its time is over, and does not begin again.
+
         Args:
             following: Joints that have got setpoints until now.
             modes: Mode of every joint's setpoint in the stop mode. A passive joint does not brake.

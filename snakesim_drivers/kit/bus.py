@@ -34,12 +34,12 @@ class InlineBus:
     """A bus whose methods work at once, in the calling thread. Joints are numbered by their place on the bus."""
 
     def __init__(self, spec: BusSpec, joints: Sequence[Joint], clock_ns: Callable[[], int], period_ns: int) -> None:
-        """Open the bus.
+        """Open one bus of the robot, and guard its drives against pauses of the driver.
 
         Args:
-            spec: The bus.
+            spec: The bus, with its joints, its watchdog time, and the function that opens it.
             joints: All joints of the robot.
-            clock_ns: The driver's time.
+            clock_ns: Returns the driver's time.
             period_ns: Duration of the robot's control cycle.
 
         Raises:
@@ -130,7 +130,7 @@ class InlineBus:
     # --- for the thread that operates the bus -----------------------------------------------------------------
 
     def _recover_from_pause(self) -> bool:
-        """Read after a pause of the driver whether drives have stopped by themselves.
+        """Read the drives after a pause of the driver, to find those that have stopped meanwhile.
 
         A stop that a drive has latched would be lost with the next command that switches it off or clears its errors.
 

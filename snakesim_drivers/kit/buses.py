@@ -34,13 +34,13 @@ class Buses(Drives):
         clock_ns: Callable[[], int],
         pass_time: Callable[[int], None] | None = None,
     ) -> None:
-        """Open all buses.
+        """Open all buses of a robot; if one cannot be opened, close the others.
 
         Args:
             config: Configuration of the run, with the robot and the settings of its backend.
             readings: The readings of the whole robot, which this object fills.
             specs: The buses, which together have every joint once.
-            clock_ns: The driver's time.
+            clock_ns: Returns the driver's time.
             pass_time: In lockstep, lets the driver's time pass by some ns, for start-up; None: time passes by itself.
 
         Raises:
@@ -91,7 +91,11 @@ class Buses(Drives):
             bus.copy_readings_to(self._readings)
 
     def send_setpoints(self, command: BusCommand) -> None:
-        """Send setpoints on all buses that are due, and at once where drives begin to follow or stop."""
+        """Send setpoints on all buses that are due in this cycle, and at once where drives begin to follow or stop.
+
+        Args:
+            command: Setpoints of all joints of the robot, and which of them follow.
+        """
         for bus in self.buses:
             joints = list(bus.spec.joints)
             following_here = _local_indices(bus, command.following)

@@ -69,6 +69,11 @@ class DriveBackend(Backend):
     def __init__(self, config: RunConfig, parts: DriveBackendParts) -> None:
         """Open the buses and bring up every drive; no drive is enabled.
 
+        Args:
+            config: Configuration of the run, with robot, lease and safety settings.
+            parts: What differs between driver types: the function that opens the drives, the clock, motion capture,
+                times.
+
         Raises:
             ConfigError: the configuration does not suit the drives.
             BackendError: a bus cannot be opened, or a drive is missing.
@@ -203,6 +208,11 @@ class DriveBackend(Backend):
         """Return the joints whose drives get setpoints in this lifecycle state.
 
         In a fault these are the joints that followed before it and still brake: no other joint begins to follow.
+
+        Args:
+            lifecycle: State of the robot in this cycle.
+            connected: Joints that are not isolated.
+            modes: Mode of every joint's setpoint.
         """
         if lifecycle != "fault":
             self._braking.reset()

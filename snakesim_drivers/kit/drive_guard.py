@@ -16,10 +16,10 @@ class DriveGuard:
     """The drives of one bus, by their indices on it."""
 
     def __init__(self, clock_ns: Callable[[], int], *, gap_ns: int, grace_ns: int) -> None:
-        """Start with drives that were just brought up, none of them driven.
+        """Start to guard the drives of one bus, which were just brought up, and none of which is driven.
 
         Args:
-            clock_ns: The driver's time.
+            clock_ns: Returns the driver's time.
             gap_ns: A pause of the driver after which watchdogs of drives may have expired.
             grace_ns: Time after a reset in which drives may still report an error from before it.
         """

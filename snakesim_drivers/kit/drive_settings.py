@@ -72,13 +72,13 @@ def make_body(config: RunConfig, settings: BodySettings, backend: str, pose_addr
 def check_body(
     config: RunConfig, settings: BodySettings, *, emulators: bool, buses: int, bus_faults: Collection[str] = ()
 ) -> None:
-    """Check motion capture, mounting and the faults that the scenario injects.
+    """Check the settings that all drive types share: motion capture, mounting and injected faults.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
         settings: The settings of the backend.
         emulators: Whether this process emulates the drives.
-        buses: How many buses the settings name.
+        buses: Number of buses that the settings name.
         bus_faults: Kinds of faults that can be injected into these buses.
 
     Raises:

@@ -71,8 +71,11 @@ class DriveStates:
         """Return the commands to send now: to drives that change, and again to those that did not obey.
 
         Args:
-            following: The drives that should follow setpoints.
+            following: Indices of the drives that should follow setpoints.
             emergency: Whether the others stop by their own emergency stop.
+
+        Returns:
+            Indices of drives with their commands, such as enable, disable or emergency stop.
         """
         commands: list[tuple[int, DriveCommand]] = []
         for i, drive in enumerate(self.drives):

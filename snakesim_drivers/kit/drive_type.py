@@ -77,10 +77,15 @@ class BusesBackend(DriveBackend):
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
-        """Check the configuration of a run, without opening anything.
+        """Check that a run is possible with the drives of its robot, without opening anything.
+
+        Args:
+            config: Configuration of the run.
+            settings: Settings of this backend.
 
         Returns:
-            The clock modes that are possible: drives on a bus support real time only.
+            The clock modes that are possible: drives on a bus support real time only, emulators in this process also
+            lockstep.
 
         Raises:
             ConfigError: the configuration does not suit the drives.
@@ -99,7 +104,13 @@ class BusesBackend(DriveBackend):
         return ("lockstep", "realtime") if emulated_here else ("realtime",)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:
-        """Open the buses and bring up every drive; no drive is enabled.
+        """Open the buses of all driver types and bring up every drive; no drive is enabled.
+
+        Without channels in the settings, the drives are emulated in this process, on one body.
+
+        Args:
+            config: Configuration of the run.
+            settings: Settings of this backend.
 
         Raises:
             ConfigError: the configuration does not suit the drives.
@@ -182,10 +193,10 @@ class DriverTypeBackend(BusesBackend):
 
     @classmethod
     def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
-        """Return all joints as those of this driver type.
+        """Return all joints as one part, because a robot with this backend has drives of this type alone.
 
         Args:
-            config: The run.
+            config: Configuration of the run, with the robot.
             settings: An instance of `Settings`.
 
         Raises:
@@ -226,7 +237,7 @@ def group_by_port(
         joints: The joints of a driver type, by their indices in the robot.
         settings: The settings of the driver type.
         ports: Names of the ports.
-        open_drives: Opens the port of this name with the drives of these joints, which fill the readings.
+        open_drives: Opens a port, from its name, the indices of its joints, and the readings that its drives fill.
     """
     port_indices = assign_ports(list(joints.values()), ports)
     specs: list[BusSpec] = []

@@ -54,7 +54,11 @@ class MixedBackend(BusesBackend):
 
 
 def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
-    """Return the driver type of a joint.
+    """Return the class of the driver type that the robot file names for a joint.
+
+    Args:
+        robot: The robot file, for messages.
+        joint: The joint.
 
     Raises:
         ConfigError: the robot file does not name one, or names something else.

@@ -24,11 +24,11 @@ class DriveReadings:
     """The newest values of every drive, from tail to head. All methods take the index of a drive as `i`."""
 
     def __init__(self, joints: Sequence[Joint], clock_ns: Callable[[], int]) -> None:
-        """Begin without any value.
+        """Allocate the readings of some drives, none of which has reported a value yet.
 
         Args:
-            joints: The joints of these drives.
-            clock_ns: The time at which values are read.
+            joints: The joints of these drives, tail to head.
+            clock_ns: Returns the time at which a value is read.
         """
         count = len(joints)
         self.mounting = Mounting(joints)
@@ -216,7 +216,7 @@ class DriveReadings:
         return max(self._clock_ns() - read_ns, 0)
 
     def joint_state(self, tick: int, timestamp_ns: int, lease_ns: int) -> JointState:
-        """Return the joint state. Values older than the lease are invalid, and a torque that is not measured is 0.
+        """Return the joint state as a message. Values older than the lease are invalid, and an unmeasured torque is 0.
 
         Args:
             tick: Number of the control cycle.

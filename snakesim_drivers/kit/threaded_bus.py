@@ -46,15 +46,15 @@ class ThreadedBus(InlineBus):
         lease_ns: int,
         max_wait_s: float,
     ) -> None:
-        """Open the bus; the thread begins with `start`.
+        """Open a bus that a thread of its own will use; the thread begins with `start`.
 
         Args:
-            spec: The bus.
+            spec: The bus, with its joints, its watchdog time, and the function that opens it.
             joints: All joints of the robot.
-            clock_ns: The driver's time.
+            clock_ns: Returns the driver's time.
             period_ns: Duration of the robot's control cycle.
             lease_ns: Time after which setpoints are no longer valid.
-            max_wait_s: Time that the host waits at most for a reading.
+            max_wait_s: Maximum time that the host waits for a reading.
         """
         super().__init__(spec, joints, clock_ns, period_ns)
         self._lease_s = lease_ns * 1e-9
@@ -187,7 +187,10 @@ class ThreadedBus(InlineBus):
                 self._error = error
 
     def _run_cycle(self) -> None:
-        """Wait for work and do it. What stops or moves drives comes before a reading."""
+        """Wait for work and do it, in the bus thread. Commands that stop or move drives come before a reading.
+
+        Work is a request to reset faults, new setpoints, expired setpoints, or a requested reading.
+        """
         with self._condition:
             self._condition.wait_for(self._has_work, self._setpoint_time_left_s())
             reading_requested = self._request_time_s is not None

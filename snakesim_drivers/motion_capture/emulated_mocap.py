@@ -70,7 +70,7 @@ class PoseCamera:
         self._sigma = np.repeat(sigma, 3)
 
     def capture(self, timestamp_ns: int) -> MocapSample | None:
-        """Capture the pose of the base. Velocities have no noise of their own.
+        """Capture the pose of the base, with noise, and return the capture that arrives now. Velocities have no noise.
 
         Args:
             timestamp_ns: The present time of the motion-capture system.

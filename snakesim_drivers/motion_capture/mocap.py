@@ -61,13 +61,13 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
 def make_receiver(
     config: RunConfig, pose_listen: str | None, *, emulators: bool, clock: Callable[[int], int]
 ) -> "MocapReceiver | None":
-    """Create a receiver if the robot has a pose sensor and there is an address.
+    """Create a receiver of motion capture if the robot has a pose sensor and there is an address.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
         pose_listen: HOST:PORT to listen on; None or empty: emulators send to any free port.
         emulators: Whether this process emulates the drives, and motion capture with them.
-        clock: As in `MocapReceiver`.
+        clock: Returns the time of the driver's clock in ns, for a robot time in ns.
 
     Raises:
         ConfigError: The address cannot be used.
@@ -83,7 +83,7 @@ class MocapReceiver:
     """Receives datagrams and returns the newest pose."""
 
     def __init__(self, address: str, delay_s: float, clock: Callable[[int], int], setting: str = "pose_listen") -> None:
-        """Listen.
+        """Listen for datagrams of a motion-capture system on a UDP port.
 
         Args:
             address: HOST:PORT to listen on.

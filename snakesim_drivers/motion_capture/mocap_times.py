@@ -42,7 +42,7 @@ class CaptureTimes:
         self.jumps = 0  # of the other clock
 
     def find_refusals(self, timestamps_ns: Sequence[int], now_ns: int) -> list[Refusal | None]:
-        """Check the timestamps of one reading.
+        """Find duplicate, outdated and implausible timestamps among those of one reading.
 
         Args:
             timestamps_ns: The timestamps, in their order of arrival.
@@ -89,7 +89,9 @@ class CaptureTimes:
         return None
 
     def _has_clock_jumped(self, timestamp_ns: int, now_ns: int) -> bool:
-        """Judge a reading with rejected timestamps only; if the other clock has jumped, accept its new time.
+        """Decide after a reading whose timestamps were all rejected whether the other clock has jumped.
+
+        A jump is believed after READINGS_TO_BELIEVE readings that agree with each other. Then the new time is accepted.
 
         Args:
             timestamp_ns: The last timestamp of the reading.

@@ -16,9 +16,14 @@ class RecentAdvance:
         self._recent: deque[tuple[float, Vector]] = deque()  # time in s and smoothed center in m, over WINDOW_S
 
     def add(self, time_s: float, center_w: Vector) -> None:
-        """Add the center at a time; a time that is not later than the last one is ignored.
+        """Add the center of mass at a time; ignore a time that is not later than the last one.
 
-        A low-pass filter smooths it: c = center + exp(-dt / SMOOTHING_S) (c_last - center).
+        A low-pass filter smooths the centers: c = center + exp(-dt / SMOOTHING_S) (c_last - center). Centers that are
+        older than WINDOW_S are dropped.
+
+        Args:
+            time_s: time of the measurement.
+            center_w: (2,) x and y of the body's center of mass in the world, m.
         """
         recent = self._recent
         if recent and time_s <= recent[-1][0]:

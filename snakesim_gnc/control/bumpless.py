@@ -60,7 +60,7 @@ class HandOver:
         self._faded_in = min(1.0, self._faded_in + fraction)
 
     def pass_to(
-        self, torque_joint: int | None, joints: JointState, reference_rad: Floats, *, anew: bool = False
+        self, torque_joint: int | None, joints: JointState, reference_rad: Floats, *, fade_in_again: bool = False
     ) -> None:
         """Hand the propulsion over to another joint.
 
@@ -68,9 +68,9 @@ class HandOver:
             torque_joint: index of the joint that is in torque mode from now on; None for no joint.
             joints: measured joint states.
             reference_rad: reference angles of all joints.
-            anew: fade in again even if the joint is the same, because the requested torque may have jumped.
+            fade_in_again: fade in again even if the joint is the same, because the requested torque may have jumped.
         """
-        if torque_joint == self._torque_joint and not anew:
+        if torque_joint == self._torque_joint and not fade_in_again:
             return
         released = self._torque_joint
         if released is not None and torque_joint != released:
@@ -128,10 +128,15 @@ class BumplessReference:
         """Note that the joints leave position mode; on return they start from the torques that they have then."""
         self.reference_rad = None
 
-    def hold(self, observation: Observation, why: str) -> ControllerCommand:
-        """Keep every joint at its last reference, or at its pose if there was none. `why` is reported."""
+    def hold_pose(self, observation: Observation, reason: str) -> ControllerCommand:
+        """Keep every joint at its last reference, or at its pose if there was none.
+
+        Args:
+            observation: inputs of this tick.
+            reason: why the joints hold, for the telemetry.
+        """
         reference_rad = self.reference_rad
         if reference_rad is None:
             reference_rad = np.array(observation.joints.angle_rad)
         setpoints = self.follow(observation, reference_rad)
-        return ControllerCommand(setpoints, Telemetry(reason=why, reference_rad=reference_rad.tolist()))
+        return ControllerCommand(setpoints, Telemetry(reason=reason, reference_rad=reference_rad.tolist()))

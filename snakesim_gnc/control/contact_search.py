@@ -37,11 +37,11 @@ class ContactSearch:
     """Decides whether to search, and by which wave."""
 
     def __init__(self, robot: Description, *, after_s: float, for_s: float) -> None:
-        """Prepare the waves.
+        """Prepare the waves with which a stationary body searches for obstacles to push off.
 
         Args:
             robot: description of the robot.
-            after_s: how long the body is stationary until a search begins; 0: it never begins.
+            after_s: how long the body must be stationary before a search begins; 0: no search ever begins.
             for_s: duration of a search.
         """
         # Waves.
@@ -67,7 +67,7 @@ class ContactSearch:
         self.changed = False  # a wave began or ended in this tick
 
     def decide(
-        self, observation: Observation, center_w: Floats, *, desired_m_s: float, near: bool
+        self, observation: Observation, center_w: Floats, *, desired_m_s: float, has_near_obstacles: bool
     ) -> LateralUndulation | None:
         """Decide whether the body searches for contacts at this tick, and by which wave it moves.
 
@@ -78,16 +78,16 @@ class ContactSearch:
             observation: inputs of this tick.
             center_w: (2,) m, center of the body.
             desired_m_s: desired speed along the path.
-            near: whether obstacles are within reach of the body.
+            has_near_obstacles: whether obstacles are within reach of the body.
 
         Returns:
             The wave to move by, or None to follow the path.
         """
         last_wave = self._wave
         if last_wave is None:
-            if self._stands_still(observation, center_w, abs(desired_m_s)):
+            if self._is_stationary(observation, center_w, abs(desired_m_s)):
                 self._begin_s = observation.time_s
-                self._begin_wave(self._choose_first_wave(center_w, near=near), observation)
+                self._begin_wave(self._choose_first_wave(center_w, has_near_obstacles=has_near_obstacles), observation)
         elif observation.time_s - self._begin_s >= self._for_s:
             self.stop()
         elif not self._makes_progress(observation, center_w):
@@ -105,8 +105,8 @@ class ContactSearch:
         self._wave = None
         self._standstill.reset()
 
-    def _choose_first_wave(self, center_w: Floats, *, near: bool) -> LateralUndulation:
-        if not near:
+    def _choose_first_wave(self, center_w: Floats, *, has_near_obstacles: bool) -> LateralUndulation:
+        if not has_near_obstacles:
             return self._forward_wave
         if self._origin_w is not None and math.dist(center_w, self._origin_w) > PUSHED_M:
             return self._slow_feedback_wave
@@ -130,7 +130,7 @@ class ContactSearch:
             self._nearest_m = distance_m
         return observation.time_s - self._progress_s < PROGRESS_S
 
-    def _stands_still(self, observation: Observation, center_w: Floats, desired_m_s: float) -> bool:
+    def _is_stationary(self, observation: Observation, center_w: Floats, desired_m_s: float) -> bool:
         if self._origin_w is None:
             self._origin_w = center_w
         max_distance_m = min(STANDSTILL_M, 0.5 * desired_m_s * self._after_s)

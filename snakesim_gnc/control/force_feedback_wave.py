@@ -61,7 +61,7 @@ class ForceFeedbackWave(LateralUndulation):
     """A wave that bends towards the goal and yields to measured forces; its amplitude is largest at the head."""
 
     def __init__(self, robot: Description, *, time_scale: float = 1.0) -> None:
-        """Scale the trained wave to a robot.
+        """Scale a wave that was trained on one robot to the size and torque of another.
 
         Args:
             robot: description of the robot.

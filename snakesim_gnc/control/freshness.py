@@ -74,22 +74,22 @@ class AgeLimits:
         return "; ".join(filter(None, reasons))
 
     def check_sensors(self, timestamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
-        """Check the samples that a controller gets itself.
+        """Find the sensor samples that are too old for the controller.
 
         Args:
             timestamps_ns: timestamp of the newest sample by key, for every key that has had one.
             now_ns: robot time.
 
         Returns:
-            Why samples are rejected, by key; fresh ones are left out.
+            The reason for each rejected sample, by key; fresh samples are left out.
         """
         rejected: dict[str, str] = {}
         for key, timestamp_ns in timestamps_ns.items():
             if key not in self.sensors_s:
                 continue
-            why = _check_age(key, timestamp_ns, now_ns, self.sensors_s[key])
-            if why:
-                rejected[key] = why
+            rejection = _check_age(key, timestamp_ns, now_ns, self.sensors_s[key])
+            if rejection:
+                rejected[key] = rejection
         return rejected
 
     def check_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
@@ -124,7 +124,7 @@ def _sensor_limits_s(
             default_s = sensor.delay_s + guidance_cycle_s + guidance_latency_s + _margin_s(1.0 / sensor.rate_hz)
             limits_s[sensor.key] = configured_s[sensor.key] or default_s
 
-    if config.dead_reckons(robot):
+    if config.uses_dead_reckoning(robot):
         limits_s.pop(keys.POSE, None)
     elif keys.POSE not in limits_s and SENSOR in config.services and config.mission.map == "known":
         # The robot's description does not list what this service publishes.

@@ -56,7 +56,7 @@ class _Gait(Controller[GaitParametersT]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Advance the gait while motion is requested; a robot without the necessary joints holds its pose."""
         if self._missing or not is_motion_requested(observation):
-            return self._bumpless.hold(observation, self._missing)
+            return self._bumpless.hold_pose(observation, self._missing)
         self._phase_rad += math.tau * observation.period_s / self.parameters.period_s
         reference_rad = np.zeros(len(self._from_head))
         self._shape(reference_rad, self._phase_rad)

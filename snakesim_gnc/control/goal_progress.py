@@ -20,7 +20,7 @@ class GoalProgress:
     """
 
     def __init__(self, robot: Description, task: Task) -> None:
-        """Start at the scenario's start pose.
+        """Prepare to measure the advance of a body from the start pose of its task.
 
         Args:
             robot: description of the robot.
@@ -52,11 +52,13 @@ class GoalProgress:
         self.follow(nodes_w[0], centers_w[0])
 
     def follow(self, nodes_w: Floats, center_w: Floats) -> None:
-        """Measure the advance of a body that has been located.
+        """Update the advance towards the goal and the bearing of the goal with a new position of the body.
+
+        The first call also sets the start of the advance.
 
         Args:
-            nodes_w: (joints + 2, 3), tail end, joints and head end.
-            center_w: (2,), center of mass on the ground.
+            nodes_w: (joints + 2, 3) tail end, joints and head end in the world, m.
+            center_w: (2,) center of mass on the ground, m.
         """
         self._nodes_w = nodes_w
         self.center_w = center_w

@@ -66,11 +66,11 @@ class GuardedController:
 
 
 def check(command: ControllerCommand, described: Sequence[JointDescription]) -> None:
-    """Check a command.
+    """Check that a command of a controller, which may be a plug-in, has valid types, modes and numbers.
 
     Args:
-        command: what a controller returned; it may be of any type.
-        described: the joints, tail to head.
+        command: what the controller returned; it may be of any type.
+        described: descriptions of the joints, tail to head.
 
     Raises:
         ValueError: the command cannot be sent; the error names the field, its value and what is allowed.

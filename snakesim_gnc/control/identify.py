@@ -78,10 +78,13 @@ class Identify(Controller[IdentifyParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Return position targets that swing and shake every joint about its start angle, within its limits.
 
-        The measured response serves system identification. Amplitudes fade in, and the speed is limited.
+        System identification uses the response of the joints. Amplitudes fade in, and the speed is limited.
 
         Args:
-            observation: the inputs of this tick.
+            observation: the inputs of this tick; the first one sets the start angles.
+
+        Returns:
+            Position setpoints of all joints, with a telemetry that names the present motion.
         """
         if not self._start_rad:
             self._start_rad = list(observation.joints.angle_rad)
@@ -97,8 +100,8 @@ class Identify(Controller[IdentifyParameters]):
         if self._last_rad:
             targets_rad = self._limit_speed(targets_rad, observation.period_s)
         self._last_rad = targets_rad
-        why = "shaking every joint" if shake_rad else "slowly back and forth, every joint"
-        return ControllerCommand(positions(self.robot, targets_rad), Telemetry(reason=why, reference_rad=targets_rad))
+        phase = "shaking every joint" if shake_rad else "slowly back and forth, every joint"
+        return ControllerCommand(positions(self.robot, targets_rad), Telemetry(reason=phase, reference_rad=targets_rad))
 
     def _fade_in(self, time_s: float) -> float:
         """Return the fraction of the full size at a time after the beginning of a motion, 0 to 1."""

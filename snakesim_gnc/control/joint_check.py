@@ -60,21 +60,27 @@ class JointCheck(Controller[JointCheckParameters]):
         self._offset_rad = 0.0  # between its target and its start angle
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return position targets that move the joint under test out and back, while all others hold.
+        """Return position targets that move the joint under test, while all others hold their start angles.
+
+        Each joint in turn rests, moves out until its encoder shows the motion, and moves back; then the same to the
+        other side. After the last joint, all joints hold.
 
         Args:
-            observation: the inputs of this tick.
+            observation: the inputs of this tick; the first one sets the start angles.
+
+        Returns:
+            Position setpoints of all joints, with a telemetry that names the joint under test.
         """
         if not self._start_rad:
             self._start_rad = list(observation.joints.angle_rad)
             self._sides = self._plan_sides(self._joint)
         if self._joint == len(self.robot.joints):
-            return self._hold("every joint was moved")
+            return self._hold_pose("every joint was moved")
         name = self.robot.joints[self._joint].name
         match self._phase:
             case _Phase.REST:
-                self._rest(observation)
-                return self._hold(f"resting beside the motion of {name}")
+                self._update_rest(observation)
+                return self._hold_pose(f"resting beside the motion of {name}")
             case _Phase.OUT:
                 self._move_out(observation)
             case _Phase.BACK:
@@ -86,10 +92,10 @@ class JointCheck(Controller[JointCheckParameters]):
             positions(self.robot, targets), Telemetry(reason=f"moving {name}", reference_rad=targets)
         )
 
-    def _hold(self, why: str) -> ControllerCommand:
+    def _hold_pose(self, why: str) -> ControllerCommand:
         return ControllerCommand(positions(self.robot, self._start_rad), Telemetry(reason=why))
 
-    def _rest(self, observation: Observation) -> None:
+    def _update_rest(self, observation: Observation) -> None:
         """Wait before a motion, and after the last one of a joint."""
         self._rested_s += observation.period_s
         if self._rested_s < self.parameters.rest_s:

@@ -33,7 +33,15 @@ class LiveParameters:
     """The parameters in force. Constructs controllers with them."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Find the controller and check its parameters. Raises ConfigError."""
+        """Load the controller class of a run, and check its parameters, which clients may change while it runs.
+
+        Args:
+            client: connection to the robot, on which requests arrive and parameters are published.
+            config: configuration of the run, with the controller's name and parameters.
+
+        Raises:
+            ConfigError: there is no such controller, or its parameters are invalid.
+        """
         self._client = client
         self._config = config
 
@@ -125,7 +133,10 @@ class LiveParameters:
     def _publish(self, clock: Clock) -> None:
         """Publish the parameters in force, unless they or their schema are too long for a message.
 
-        Clients cannot change what is not published.
+        Clients cannot change parameters that are not published.
+
+        Args:
+            clock: the current tick, which the message names.
         """
         parameters = _to_json(self._parameters)
         if len(parameters) > MAX_PARAMETERS_JSON or len(self._schema) > MAX_SCHEMA:

@@ -114,14 +114,17 @@ DEFAULT = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m",
 
 
 def select_parts(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
-    """Return parts of an observation by their names.
+    """Return the parts that make up the observation of a policy, by their names.
 
     Args:
         robot: the robot that observes.
         observe: names of the parts, in their order; None: those in DEFAULT that the robot has sensors for.
 
+    Returns:
+        The parts by name, in the order of `observe`.
+
     Raises:
-        ConfigError: there is no part with a name, or the robot does not have its sensor.
+        ConfigError: there is no part of that name, or the robot does not have its sensor.
     """
     parts = make_parts(robot)
     sensors = {sensor.key for sensor in robot.sensors}

@@ -150,6 +150,14 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     Parameters = ObstacleAidedParameters
 
     def __init__(self, robot: Description, parameters: ObstacleAidedParameters) -> None:
+        """Create a controller that moves the body along a planned path by pushing off obstacles.
+
+        It starts with all integrals and forces at zero, before the first measurement.
+
+        Args:
+            robot: description of the robot; the joints with a vertical axis bend the body.
+            parameters: gains, limits and time constants of this controller.
+        """
         super().__init__(robot, parameters)
         # Models and estimators.
         self._body = PlanarBody(robot)
@@ -182,22 +190,27 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
 
         The joints follow angles of the body further along the path, plus the torques of a push against obstacles. While
         the body can be soft, it commands torques instead of angles. If the body stays stationary, a contact-search gait
-        moves it.
+        moves it. While its position on the path is unknown, or no motion is desired, the joints hold their pose.
 
         Args:
             observation: the inputs of this tick.
+
+        Returns:
+            Setpoints of all joints, with telemetry about push and contacts.
         """
         located = self._progress.update(observation)
         if isinstance(located, str):
             self._holding = True
-            return self._bumpless.hold(observation, located)
+            return self._bumpless.hold_pose(observation, located)
         self._contacts.add_world(located.world)
         desired_m_s = located.trajectory.speed_m_s
         if desired_m_s == 0.0:  # whatever path is planned meanwhile
-            return self._rest(observation)
+            return self._rest_in_pose(observation)
         lift_rad = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
         center_w = located.nodes_w.mean(axis=1)
-        wave = self._search.decide(observation, center_w, desired_m_s=desired_m_s, near=self._has_near_obstacles())
+        wave = self._search.decide(
+            observation, center_w, desired_m_s=desired_m_s, has_near_obstacles=self._has_near_obstacles()
+        )
         if wave is not None:
             return self._undulate(observation, wave, lift_rad)
 
@@ -237,7 +250,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         """Whether the joints can be in torque mode: obstacles have been able to balance a push for a while."""
         if not self._has_torque_mode or self.parameters.shape_nm_per_rad <= 0.0:
             return False
-        if self._snapshot is None or self._snapshot.push.rest > MAX_UNBALANCED_SOFT:
+        if self._snapshot is None or self._snapshot.push.residual > MAX_UNBALANCED_SOFT:
             self._unbalanced_at_s = time_s
         return time_s - self._unbalanced_at_s > SOFT_AFTER_S
 
@@ -296,14 +309,14 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         why = "it does not come on: it moves by a wave, in search of contacts"
         return ControllerCommand(setpoints, Telemetry(reason=why, reference_rad=reference.tolist()))
 
-    def _rest(self, observation: Observation) -> ControllerCommand:
+    def _rest_in_pose(self, observation: Observation) -> ControllerCommand:
         """Keep every joint where it is, without a push: the desired speed is 0."""
         self._stop_pushing()
         self._look_ahead_integral_m = 0.0
         self._moved_at_s = observation.time_s
         self._search.stop()
         if self._holding or self._bumpless.reference_rad is None:
-            command = self._bumpless.hold(observation, "")
+            command = self._bumpless.hold_pose(observation, "")
         else:
             reference = np.array(observation.joints.angle_rad)
             setpoints = self._bumpless.follow(observation, reference, restarted=True)
@@ -398,7 +411,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._unit_torques_nm = np.zeros(len(self.robot.joints))
         self._max_force_n = 0.0
         max_lambda = float(push.lambdas.max(initial=0.0))
-        is_balanced = push.rest < MAX_UNBALANCED
+        is_balanced = push.residual < MAX_UNBALANCED
         # All contact forces (lambdas) may be 0: a body bent into a U has hardly any drag, and needs no push.
         if is_balanced and max_lambda > 0.0:
             self._unit_torques_nm[self._bends] = push.torques_nm
@@ -427,21 +440,24 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _make_telemetry(
         self, observation: Observation, located: Located, look_ahead_n: float, reference: Floats
     ) -> Telemetry:
-        """Report the push, and why the body is stationary, if it is.
+        """Report the push along the path, and why the body is stationary if it is.
 
         Args:
             observation: the inputs of this tick.
             located: position and speed of the body on the path.
             look_ahead_n: force along the path that the look-ahead causes.
             reference: (n_joints,) reference angles, rad.
+
+        Returns:
+            The telemetry of this tick, with desired contact forces in N and joint torques in N·m.
         """
         if abs(located.speed_m_s) > STANDSTILL_SPEED_M_S:
             self._moved_at_s = observation.time_s
-        stands_still = observation.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
+        is_stationary = observation.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
         points = self._report_push_points()
         jammed, reason = self._explain_standstill(located, points)
         return Telemetry(
-            reason=reason if stands_still else "",
+            reason=reason if is_stationary else "",
             reason_if_stationary=reason if observation.time_s > STANDSTILL_S else "",
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + self._force_n,
@@ -451,7 +467,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             reference_rad=reference.tolist(),
             torque_headroom_nm=self.parameters.max_torque_nm - float(np.abs(self._torques_nm).max()),
             saturated=0.0 < self._max_force_n <= self._force_n,
-            jammed=stands_still and jammed,
+            jammed=is_stationary and jammed,
         )
 
     def _report_push_points(self) -> list[WorldContact]:

@@ -51,7 +51,7 @@ class PathFollowing(Controller[PathFollowingParameters]):
         """Return the joint angles of the body slightly further along the path; hold if its position is unknown."""
         located = self._progress.update(observation)
         if isinstance(located, str):
-            return self._bumpless.hold(observation, located)
+            return self._bumpless.hold_pose(observation, located)
         tail_s_m = located.tail_s_m
         if located.restarted:
             self._reference_s_m = tail_s_m

@@ -136,11 +136,18 @@ class Policy(Controller[PolicyParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the model's targets, or setpoints that hold the pose while a sensor that the model needs is late.
 
-        The command limiter limits the targets.
+        The model runs every `frame_skip` ticks; between two inferences its last targets are repeated. The command
+        limiter limits the targets.
+
+        Args:
+            observation: the inputs of this tick.
+
+        Returns:
+            Setpoints of all joints in the mode of the model.
         """
         why_late = self._describe_late_sensors(observation)
         if why_late:
-            return self._hold(observation, why_late)
+            return self._hold_pose(observation, why_late)
         self._hold_setpoints = None
         if self._target is None or observation.tick - self._target_tick >= self._model.frame_skip:
             self._target = self._model(self._observer.update(observation))
@@ -159,7 +166,7 @@ class Policy(Controller[PolicyParameters]):
         late = observation.sensor_samples.late
         return "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys()))
 
-    def _hold(self, observation: Observation, why: str) -> ControllerCommand:
+    def _hold_pose(self, observation: Observation, why: str) -> ControllerCommand:
         """Hold the pose that the robot had when the sensor became late."""
         if self._hold_setpoints is None:
             self._hold_setpoints = positions(self.robot, observation.joints.angle_rad)
@@ -251,7 +258,7 @@ def _find_model_file(name: str) -> Path:
 
 
 def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
-    """Load a model.
+    """Load a policy's ONNX model into an inference session that gives the same results on every computer.
 
     Args:
         file: path of an ONNX file, or the name of a shipped policy.
@@ -285,8 +292,8 @@ def _check_tensor(kind: str, tensors: Sequence[Any], width: int, meaning: str, f
     Args:
         kind: "input" or "output", for the error.
         tensors: all inputs or all outputs of the model.
-        width: the tensor must be float32 of shape (1, width); its first dimension may be left open.
-        meaning: what the numbers are, for the error.
+        width: the tensor must be float32 of shape (1, width); its first dimension may be dynamic.
+        meaning: what the numbers of the tensor mean, for the error.
         file: the model's file, for the error.
 
     Raises:

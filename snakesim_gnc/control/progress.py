@@ -49,10 +49,10 @@ class PathProgress:
     """
 
     def __init__(self, body: PlanarBody, *, speed_filter_s: float) -> None:
-        """Start without a position.
+        """Prepare to track a body along a path, before any world model or path is known.
 
         Args:
-            body: the robot's body.
+            body: lengths and indices of the robot's body.
             speed_filter_s: time constant of the filter; 0 takes every measurement as it is.
         """
         self._planar = body
@@ -73,7 +73,16 @@ class PathProgress:
         self._speed_m_s = 0.0
 
     def update(self, observation: Observation) -> Located | str:
-        """Return the position of the body at this tick, or why it is unknown. Call it in every tick."""
+        """Return the position and the speed of the body on the path at this tick. Call it in every tick.
+
+        Between two poses the body is assumed to move on at its last speed.
+
+        Args:
+            observation: the inputs of this tick, with the newest world model and trajectory.
+
+        Returns:
+            The position, or the reason as text why it is unknown.
+        """
         self._angles.add(observation.joints.timestamp_ns, observation.joints.angle_rad)
         world = observation.world
         trajectory = observation.trajectory
@@ -109,7 +118,7 @@ class PathProgress:
         )
 
     def _measure(self, body: BodyOnPath, world: World, observation: Observation, *, is_new_path: bool) -> int:
-        """Localize the body on the path if the path or the pose is new.
+        """Localize the body on the path if the path or the pose is new since the last tick.
 
         Args:
             body: the body on the path.

@@ -61,12 +61,12 @@ class UnitPush:
 
     lambdas: Floats  # (k,) N/N
     torques_nm: Floats  # (n_joints,) N·m/N, of the joints that bend
-    rest: float  # fraction of the push that no contact can balance
+    residual: float  # fraction of the push that no contact can balance
 
     @property
     def balanced(self) -> bool:
         """Whether these contacts can push at all."""
-        return self.rest < MAX_RESIDUAL and bool((self.lambdas > 0.0).any())
+        return self.residual < MAX_RESIDUAL and bool((self.lambdas > 0.0).any())
 
 
 class PushFilter:
@@ -81,10 +81,10 @@ class PushFilter:
         self._time_s = -np.inf
         self._lambdas: dict[str, float] = {}
         self._torques_nm: Floats | float = 0.0
-        self._rest = 0.0
+        self._residual = 0.0
 
     def update(self, time_s: float, push: UnitPush, obstacles: Sequence[str]) -> UnitPush:
-        """Filter a push by a low-pass filter of first order, contact by contact.
+        """Filter the contact forces of a push by a low-pass filter of first order, contact by contact.
 
         Args:
             time_s: time of the push.
@@ -100,33 +100,36 @@ class PushFilter:
         for name, new_lambda in zip(obstacles, push.lambdas, strict=True):
             lambdas.append(new_gain * new_lambda + last_gain * self._lambdas.get(name, 0.0))
         torques_nm = new_gain * push.torques_nm + last_gain * self._torques_nm
-        rest = new_gain * push.rest + last_gain * self._rest
+        residual = new_gain * push.residual + last_gain * self._residual
         self._time_s = time_s
         self._lambdas = dict(zip(obstacles, lambdas, strict=True))
         self._torques_nm = torques_nm
-        self._rest = rest
-        return UnitPush(np.array(lambdas), torques_nm, rest)
+        self._residual = residual
+        return UnitPush(np.array(lambdas), torques_nm, residual)
 
 
 def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:
-    """Find the point of the body that is nearest to each obstacle within reach.
+    """Find the point of the body that is nearest to each obstacle within reach and beside the body.
 
     Args:
         nodes_w: (2, n) m, nodes of the body's center line, tail to head.
         radius_m: radius of the body.
         outlines: outlines of all obstacles.
-        reach_m: largest gap of a contact.
+        reach_m: largest gap between skin and obstacle that still counts as a contact.
         friction: friction coefficient mu between body and obstacles.
+
+    Returns:
+        The contacts, each with its place on the skin, its direction of push, and its gap.
     """
     samples, nearest_w, distances_m = nearest_on_chain(nodes_w.T, outlines)
-    near = np.flatnonzero(distances_m - radius_m < reach_m)
-    center_w = nearest_w[near]  # (k, 2) on the center line
-    link, fraction_index = np.divmod(samples[near], len(LINK_FRACTIONS))
+    near_obstacles = np.flatnonzero(distances_m - radius_m < reach_m)
+    center_w = nearest_w[near_obstacles]  # (k, 2) on the center line
+    link, fraction_index = np.divmod(samples[near_obstacles], len(LINK_FRACTIONS))
 
     # Normal, tangent and arc length of each contact.
     link_vectors_w = np.diff(nodes_w, axis=1).T  # (n_links, 2)
     lengths_m = np.hypot(*link_vectors_w.T)
-    distance_m, normal = outlines.distance_and_normal(center_w, near)
+    distance_m, normal = outlines.distance_and_normal(center_w, near_obstacles)
     tangent = (link_vectors_w / lengths_m[:, None])[link]
     link_start_m = np.concatenate(([0.0], np.cumsum(lengths_m)[:-1]))
     body_s_m = link_start_m[link] + LINK_FRACTIONS[fraction_index] * lengths_m[link]
@@ -136,14 +139,14 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
 
     # An obstacle in front of the head or behind the tail, whose normal is along the body, cannot be pushed sideways.
     normal_along_body = np.abs(np.einsum("ij,ij->i", normal, tangent))
-    beside = np.flatnonzero(normal_along_body < MAX_NORMAL_ALONG_BODY)
+    beside_body = np.flatnonzero(normal_along_body < MAX_NORMAL_ALONG_BODY)
     return Touches(
-        obstacle=near[beside],
-        places_w=(center_w - radius_m * normal)[beside],
-        directions_w=direction[beside],
-        tangents_w=tangent[beside],
-        body_s_m=body_s_m[beside],
-        gap_m=(distance_m - radius_m)[beside],
+        obstacle=near_obstacles[beside_body],
+        places_w=(center_w - radius_m * normal)[beside_body],
+        directions_w=direction[beside_body],
+        tangents_w=tangent[beside_body],
+        body_s_m=body_s_m[beside_body],
+        gap_m=(distance_m - radius_m)[beside_body],
     )
 
 
@@ -204,14 +207,21 @@ def push_forward(
     return UnitPush(
         lambdas=lambdas,
         torques_nm=lever @ lambdas + drag_torque,
-        rest=float(np.linalg.norm(a @ lambdas - b)),
+        residual=float(np.linalg.norm(a @ lambdas - b)),
     )
 
 
-def _solve_nonnegative(matrix: Floats, right: Floats) -> Floats:
+def _solve_nonnegative(matrix: Floats, right_side: Floats) -> Floats:
     """Return the x >= 0 that minimizes |matrix x - right|.
 
     Source: the active-set algorithm NNLS of Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
+
+    Args:
+        matrix: (m, k).
+        right: (m,) right side.
+
+    Returns:
+        (k,) solution.
     """
     count = matrix.shape[1]
     x = np.zeros(count)
@@ -219,13 +229,13 @@ def _solve_nonnegative(matrix: Floats, right: Floats) -> Floats:
     if count == 0:
         return x
     for _ in range(MAX_ITERATIONS):
-        gradient = matrix.T @ (right - matrix @ x)
+        gradient = matrix.T @ (right_side - matrix @ x)
         gradient[free] = -np.inf
         entering = int(np.argmax(gradient))
         if gradient[entering] < MIN_GRADIENT:
             break
         free[entering] = True
-        x = _solve_free(matrix, right, x, free)
+        x = _solve_free(matrix, right_side, x, free)
     return x
 
 

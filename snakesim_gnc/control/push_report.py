@@ -30,10 +30,10 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: UnitPush
 
 
 def _describe_push_point(body: PlanarBody, world: World, touches: Touches, k: int, push_n: float) -> WorldContact:
-    """Return the message for one contact.
+    """Return the message that reports one contact and the force with which the body pushes there.
 
     Args:
-        body: the robot.
+        body: lengths and indices of the robot's body.
         world: the world model.
         touches: all contacts.
         k: index of the contact in `touches`.
@@ -68,13 +68,13 @@ def explain_push_standstill(
     net_force: NetContactForce | None,
     push_points: Sequence[str],
 ) -> tuple[bool, str]:
-    """Explain why a body that should move does not.
+    """Explain why a body that is pushed forward does not move.
 
     Args:
         touches: contacts of the body.
-        push: forces for 1 N along the body.
+        push: contact forces and joint torques for 1 N along the body.
         force_n: desired force along the body.
-        max_force_n: what torques and contacts allow of it.
+        max_force_n: maximum of that force within the limits of torques and contact forces.
         net_force: measured contact forces along the body; None without a sensor.
         push_points: names of the obstacles that should be pushed.
 

@@ -47,7 +47,15 @@ class Control(Service):
     urgent = True
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Find the controller, check its parameters, and subscribe to its inputs."""
+        """Create the service that runs one controller: it reads the robot's state in every tick, and sends setpoints.
+
+        Args:
+            client: connection to the robot, on which inputs are subscribed.
+            config: configuration of the run, with the controller and its parameters.
+
+        Raises:
+            ConfigError: there is no such controller, or its parameters are invalid.
+        """
         self._client = client
         self._config = config
         self._parameters = LiveParameters(client, config)
@@ -97,6 +105,11 @@ class Control(Service):
 
     def outputs(self, clock: Clock) -> Outputs | None:
         """Command the robot in one tick: by the controller while the robot is armed, otherwise to hold its pose.
+
+        Without the command lease, or with joint states that are too old, nothing is sent to the robot.
+
+        Args:
+            clock: the current tick, with the lifecycle state of the robot.
 
         Returns:
             The state of control if it is due; None if there is no joint state for this tick.
@@ -154,6 +167,10 @@ class Control(Service):
     def _run_controller(self, clock: Clock, joints: JointState) -> Outputs:
         """Call the controller with its fresh inputs, send its setpoints, and return its state if it is due.
 
+        Args:
+            clock: the current tick, in which the robot is armed and this service has the command lease.
+            joints: the joint state of this tick.
+
         Raises:
             ControllerError: the controller has failed; its last state has been published.
         """
@@ -186,14 +203,14 @@ class Control(Service):
         return _state_messages(state)
 
     def _read_fresh_plan(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
-        """Read the newest world model and trajectory, and reject them if they are too old.
+        """Read the newest world model and trajectory, and replace those that are too old by None.
 
         Args:
-            clock: of the current tick.
+            clock: the current tick.
 
         Returns:
-            The world model and the trajectory, each None if it is missing or too old, and why inputs are too old;
-            empty if none is.
+            The world model and the trajectory, each None if it is missing or too old, and why inputs are too old; empty
+            if none is.
         """
         world = self._client.read(self._world)
         trajectory = self._client.read(self._trajectory)

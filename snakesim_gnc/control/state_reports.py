@@ -20,10 +20,10 @@ class StateReports:
     """Makes a message of control's state when one is due."""
 
     def __init__(self, controller: str, robot: Description) -> None:
-        """Start without a message.
+        """Prepare the reports about a controller that control publishes, before the first one is due.
 
         Args:
-            controller: the controller as configured.
+            controller: name of the controller as configured.
             robot: description of the robot.
         """
         self.too_slow = ""  # why the controller misses its deadlines; it is in every message from then on
@@ -57,17 +57,17 @@ class StateReports:
         missing: str = "",
         rests: str = "",
     ) -> ControlState | None:
-        """Return the message of this tick if one is due.
+        """Return the message about the state of control at this tick if one is due.
 
         Args:
             clock: the last clock.
             telemetry: the controller's telemetry; None if the controller was not called.
-            silent: why neither clock nor status arrives; see `locomotion_state`.
+            silent: why neither clock nor status arrives; else empty.
             paused: why no clock arrives. If `silent` or `paused` is set, the message is always due, because robot
                 time does not advance.
-            armed: see `locomotion_state`.
-            missing: see `locomotion_state`.
-            rests: see `locomotion_state`.
+            armed: whether the robot is armed.
+            missing: inputs that control does not have, such as a fresh pose; else empty.
+            rests: why no motion is intended; empty if motion is intended.
 
         Returns:
             None if nothing has changed and the last message is recent.
@@ -78,13 +78,13 @@ class StateReports:
         if telemetry is None:
             telemetry = Telemetry()
         state, reason = locomotion_state(
-            silent=silent,
+            silence=silent,
             armed=armed,
-            missing=missing or paused,
-            rests=rests,
+            missing_inputs=missing or paused,
+            rest_reason=rests,
             usable_push_points=telemetry.usable_push_points,
-            obstacle=telemetry.reason,
-            still=telemetry.reason_if_stationary,
+            obstruction=telemetry.reason,
+            standstill_reason=telemetry.reason_if_stationary,
             advanced_m=self._advance.distance_m,
         )
         # A change of any of these is published at once.
@@ -111,7 +111,17 @@ class StateReports:
         return msgspec.structs.replace(message, failed=True)
 
     def _make_message(self, clock: Clock, state: LocomotionState, reason: str, telemetry: Telemetry) -> ControlState:
-        """Return a message that a receiver accepts. Raises ValueError for an invalid value in the telemetry."""
+        """Return the state of control as a message that every receiver accepts.
+
+        Args:
+            clock: the current tick.
+            state: whether the robot is moving, idle, or not moving although it should.
+            reason: why it is in that state; it is cut to the maximum length of a message.
+            telemetry: what the controller reports about its push; a plug-in may have put any value into it.
+
+        Raises:
+            ValueError: a value of the telemetry is invalid; the error names the field.
+        """
         joint_name = None
         if telemetry.propulsion_joint is not None:
             joint_name = self._joints[telemetry.propulsion_joint]

@@ -71,13 +71,13 @@ class BodyOnPath:
         return self.refine_tail_s_m(nodes_w, first_guess_m, steps=FIRST_STEPS)
 
     def refine_tail_s_m(self, nodes_w: Floats, near_s_m: float, *, steps: int = REFINE_STEPS) -> float:
-        """Return the arc length at which the body on the path is closest to a measured one.
+        """Return the arc length of the tail at which the body on the path is closest to a measured body.
 
         Gauss-Newton on the squared distances of the nodes: with e = measured - p(s), each step is e . p' / p' . p'.
 
         Args:
-            nodes_w: (2, n_nodes) as measured.
-            near_s_m: first guess.
+            nodes_w: (2, n_nodes) measured nodes of the body in the world, m.
+            near_s_m: first guess of the arc length.
             steps: number of corrections.
         """
         measured = nodes_w.ravel()
@@ -106,7 +106,16 @@ class BodyOnPath:
         return pose
 
     def _lay_body(self, tail_s_m: float) -> Floats:
-        """Compute a pose, node by node from the tail."""
+        """Compute the pose of a body that lies on the path, node by node from the tail.
+
+        Each node is the point of the path at the length of one segment ahead of the last node.
+
+        Args:
+            tail_s_m: arc length of the tail end on the path.
+
+        Returns:
+            One array: the angles in rad of the n joints that bend, then x, y and arc length in m of the n + 2 nodes.
+        """
         s_m = tail_s_m
         x, y = self.route.point_at(s_m)
         node_s_m = [s_m]
@@ -156,13 +165,16 @@ class BodyOnPath:
 def chain_nodes(
     tail_w: tuple[float, float], heading_rad: float, angles_rad: Sequence[float], segments_m: Sequence[float]
 ) -> Floats:
-    """Return the nodes (2, n_nodes) of a planar chain: tail end, joints that bend, head end.
+    """Compute the nodes of a planar chain from its joint angles: tail end, joints that bend, head end.
 
     Args:
-        tail_w: x and y of the tail end.
-        heading_rad: of the tail's segment.
-        angles_rad: of the joints that bend, tail to head, left turn positive.
+        tail_w: x and y of the tail end, m.
+        heading_rad: heading of the tail's segment.
+        angles_rad: angles of the joints that bend, tail to head, left turn positive.
         segments_m: lengths between the nodes.
+
+    Returns:
+        (2, n_nodes) x and y of the nodes, m.
     """
     x, y = tail_w
     node_x = [x]

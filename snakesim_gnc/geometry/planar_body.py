@@ -22,6 +22,13 @@ class PlanarBody:
     """Lengths, limits and indices of a robot. Nodes are the tail end, the joints that bend, and the head end."""
 
     def __init__(self, robot: Description) -> None:
+        """Derive from a description the lengths, limits and indices that planar computations use.
+
+        Joints with another axis than yaw are rigid in the plane: the links on both sides of them are one segment.
+
+        Args:
+            robot: description of the robot, whose joints and links are listed from tail to head.
+        """
         axes = [joint.axis for joint in robot.joints]
         lengths = [link.length_m for link in robot.links]
         self._robot = robot

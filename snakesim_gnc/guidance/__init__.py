@@ -5,7 +5,7 @@
 
 For a robot without a pose sensor or contact sensors on a known map:
 
-`reckoned_pose`       dead reckoning, corrected by `anchoring` to known obstacles
+`dead_reckoned_pose`  dead reckoning, corrected by `anchoring` to known obstacles
 `estimated_contacts`  contacts from joint torques: `contact_estimate`, with `planar_dynamics` and `sparse_fit`
 
 For a map that begins empty:

@@ -51,7 +51,9 @@ class Anchors:
         self._radii_m = np.array([link.radius_m for link in robot.links])
         self._ratios = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK  # of each link's length
 
-    def hold(self, localizer: Localizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust) -> None:
+    def correct_pose(
+        self, localizer: Localizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust
+    ) -> None:
         """Correct an estimated base pose by the known obstacles near the body.
 
         For each obstacle, the gap between its outline and the skin counts as a measurement of zero if a contact pushes
@@ -61,7 +63,7 @@ class Anchors:
             localizer: has the estimate of the base pose, which is changed.
             angles_rad: (n_joints,) joint angles at the time of the estimate.
             contacts: contacts of the links at that time.
-            trust: standard deviations of such measurements.
+            trust: standard deviations of the gaps that are measured in this way.
         """
         if not len(self._outlines):
             return
@@ -70,13 +72,13 @@ class Anchors:
         gaps_m = self._outlines.distance_m(axis_w) - np.repeat(self._radii_m, POINTS_PER_LINK)[:, None]
         nearest_points = gaps_m.argmin(axis=0)  # index of the body point nearest to each obstacle
         min_gaps_m = gaps_m.min(axis=0)
-        near = np.flatnonzero((min_gaps_m < MAX_GAP_M) & (min_gaps_m > -MAX_DEPTH_M))
-        _, normals_w = self._outlines.distance_and_normal(axis_w[nearest_points[near]], near)
+        near_obstacles = np.flatnonzero((min_gaps_m < MAX_GAP_M) & (min_gaps_m > -MAX_DEPTH_M))
+        _, normals_w = self._outlines.distance_and_normal(axis_w[nearest_points[near_obstacles]], near_obstacles)
 
         rows: list[Floats] = []
         measured_gaps_m: list[float] = []
         sds_m: list[float] = []
-        for obstacle, normal_w in zip(near.tolist(), normals_w, strict=True):
+        for obstacle, normal_w in zip(near_obstacles.tolist(), normals_w, strict=True):
             point = int(nearest_points[obstacle])
             gap_m = float(gaps_m[point, obstacle])
             is_sunk = gap_m < 0.0

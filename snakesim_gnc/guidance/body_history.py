@@ -121,18 +121,18 @@ class BodyHistory:
             return self._entries[-1]
         if after == 0 or timestamps_ns[after] == timestamp_ns:
             return self._entries[after]
-        early, early_rad = self._entries[after - 1]
-        late, late_rad = self._entries[after]
-        early_ns = timestamps_ns[after - 1]
-        ratio = (timestamp_ns - early_ns) / (timestamps_ns[after] - early_ns)
-        step = late.planar_w - early.planar_w
+        previous, previous_rad = self._entries[after - 1]
+        following, following_rad = self._entries[after]
+        previous_ns = timestamps_ns[after - 1]
+        ratio = (timestamp_ns - previous_ns) / (timestamps_ns[after] - previous_ns)
+        step = following.planar_w - previous.planar_w
         step[2] = wrap_angle(step[2])
         base = Base(
-            planar_w=early.planar_w + ratio * step,
-            z_m=early.z_m + ratio * (late.z_m - early.z_m),
-            tilt=late.tilt if ratio > 0.5 else early.tilt,
+            planar_w=previous.planar_w + ratio * step,
+            z_m=previous.z_m + ratio * (following.z_m - previous.z_m),
+            tilt=following.tilt if ratio > 0.5 else previous.tilt,
         )
-        return base, early_rad + ratio * (late_rad - early_rad)
+        return base, previous_rad + ratio * (following_rad - previous_rad)
 
 
 def rotation_about_z(yaw_rad: float) -> Floats:

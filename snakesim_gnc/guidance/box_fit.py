@@ -93,9 +93,9 @@ def fit_boxes(points: Floats, weight: Floats, outward: Floats) -> Boxes:
     best = misfit.argmin(axis=1)
 
     yaw_rad = fine_rad[rows, best] + _interpolate_minimum_rad(misfit, best)
-    turned = _Points.in_headings(points, outward, yaw_rad[:, None])
-    faces, misfit = _fit_faces(turned, weight)
-    return _close_boxes(turned, weight, yaw_rad, faces, misfit[:, 0])
+    rotated_points = _Points.in_headings(points, outward, yaw_rad[:, None])
+    faces, misfit = _fit_faces(rotated_points, weight)
+    return _close_boxes(rotated_points, weight, yaw_rad, faces, misfit[:, 0])
 
 
 def _rotate(vectors: Floats, yaw: Floats) -> tuple[Floats, Floats]:
@@ -179,14 +179,17 @@ def _interpolate_minimum_rad(misfit: Floats, best: NDArray[np.intp]) -> Floats:
 
 
 def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces, misfit: Floats) -> Boxes:
-    """Return boxes from the faces that the sensor saw, with assumed faces where it saw none.
+    """Return boxes from the faces that the sensor saw, with assumed faces on the sides that it did not see.
 
     Args:
         points: the points of b obstacles, each in the coordinates of its one fitted heading.
         weight: (b, p) information of the points in 1 / m².
         yaw_rad: (b,) fitted headings.
         faces: places of the four faces, (b, 1) each.
-        misfit: (b,) of the fit.
+        misfit: (b,) sum of the weighted squared distances of the points from the faces.
+
+    Returns:
+        The b boxes, with their centers in the world and the standard deviations of their sizes.
     """
     extents = _measure_extents(points, weight, faces)
     extent_x_m = extents.high_m[0] - extents.low_m[0]
@@ -228,10 +231,15 @@ class _Extents:
 def _measure_extents(points: _Points, weight: Floats, faces: Faces) -> _Extents:
     """Find the faces that the sensor saw, and the range of the points along both axes of each box.
 
+    A face was seen if the points on it extend over more than MIN_FACE_M.
+
     Args:
         points: the points of b obstacles, each in the coordinates of its one fitted heading.
         weight: (b, p) information of the points in 1 / m²; 0 for padding.
         faces: places of the four faces, (b, 1) each.
+
+    Returns:
+        Ranges for both axes, and whether each face was seen and with which information.
     """
     extents = _Extents([], [], [], [])
     _, is_first_axis = _assign_faces(points, faces)

@@ -33,7 +33,9 @@ class Circles:
     misfit: Floats  # (b,) sum of squared, weighted, limited distances
 
 
-def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: Floats, began_w: Floats) -> Circles:
+def fit_circles(
+    points: Floats, weight: Floats, outward: Floats, normal_weight: Floats, initial_center_w: Floats
+) -> Circles:
     """Fit a circle with center c and radius r to the points q of each obstacle.
 
     Minimizes the sum of w (|q - c| - r)² with Huber weights, of (r - r_0)² / sd_0², and of v (a . (q - c))²: the
@@ -44,13 +46,13 @@ def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: 
         weight: (b, p) w, information in 1 / m²; 0 for padding.
         outward: (b, p, 2) unit vectors from the surface towards the sensor, or normals.
         normal_weight: (b, p) v, information of `outward` as a normal; 0 for points that were only seen.
-        began_w: (b, 2) centers of earlier fits, from which the iteration starts; NaN without one.
+        initial_center_w: (b, 2) centers of earlier fits, from which the iteration starts; NaN without one.
 
     Returns:
         One circle for each obstacle, with the covariance (3, 3) of x, y and radius, and the misfit.
     """
     weight = soften_weights(weight)
-    center, radius = _first_guess(points, weight, outward, began_w)
+    center, radius = _first_guess(points, weight, outward, initial_center_w)
     information = np.zeros((len(points), 3, 3))
     for _ in range(ITERATIONS):
         offset = points - center[:, None]
@@ -74,11 +76,11 @@ def soften_weights(weight: Floats) -> Floats:
     return weight / (1.0 + weight * MODEL_SD_M**2)
 
 
-def _first_guess(points: Floats, weight: Floats, outward: Floats, began_w: Floats) -> tuple[Floats, Floats]:
+def _first_guess(points: Floats, weight: Floats, outward: Floats, initial_center_w: Floats) -> tuple[Floats, Floats]:
     """Return centers (b, 2), from the earlier fit or one prior radius behind the surface, and mean radii (b,)."""
     ratio = weight / weight.sum(axis=1, keepdims=True)
     behind_surface = np.einsum("bp,bpk->bk", ratio, points - RADIUS_M * outward)
-    center = np.where(np.isnan(began_w), behind_surface, began_w)
+    center = np.where(np.isnan(initial_center_w), behind_surface, initial_center_w)
     distance_m = np.hypot(points[..., 0] - center[:, None, 0], points[..., 1] - center[:, None, 1])
     return center, np.einsum("bp,bp->b", ratio, distance_m)
 

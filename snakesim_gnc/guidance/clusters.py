@@ -28,6 +28,9 @@ def find_clusters(scan: Scan) -> list[Indices]:
     A cluster ends at a missing stretch of bins, at a gap that is too wide for a surface seen at a grazing angle, and at
     a corner.
 
+    Args:
+        scan: ranges by azimuth, with their points in the world.
+
     Returns:
         The indices of the bins of each cluster, in order of azimuth.
     """
@@ -40,10 +43,10 @@ def find_clusters(scan: Scan) -> list[Indices]:
     gaps_m = np.hypot(steps[:, 0], steps[:, 1])
     bin_steps = np.diff(hits)
     nearer_m = np.minimum(ranges_m[:-1], ranges_m[1:])
-    allowed_m = bin_steps * nearer_m * scan.step_rad / math.sin(GRAZING_RAD)
+    max_gap_m = bin_steps * nearer_m * scan.step_rad / math.sin(GRAZING_RAD)
     noise_m = NOISE_SD * np.maximum(scan.sd_m[hits[1:]], scan.sd_m[hits[:-1]])
     has_missed_bins = bin_steps > MAX_MISSED_BINS + 1
-    is_wide_gap = gaps_m > np.maximum(allowed_m, MIN_JUMP_M) + noise_m
+    is_wide_gap = gaps_m > np.maximum(max_gap_m, MIN_JUMP_M) + noise_m
     is_break = has_missed_bins | is_wide_gap
     clusters: list[Indices] = []
     for surface_bins in np.split(hits, np.flatnonzero(is_break) + 1):

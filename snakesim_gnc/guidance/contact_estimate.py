@@ -123,9 +123,12 @@ def estimate_pushes(
 
 
 def _list_unit_pushes(chain: ChainDynamics) -> list[_UnitPush]:
-    """Return a push of 1 N at every place that is considered, with its effect on the equations of motion.
+    """Return a push of 1 N at every candidate place, with its effect on the equations of motion.
 
     The places are on both sides of both ends of each link, and on the tip of the head.
+
+    Args:
+        chain: lengths, radii and frames of the links.
     """
     last_link = len(chain.rear_b) - 1
     places: list[tuple[int, int, float]] = []  # link, side, and end: 0.0 rear, 1.0 front

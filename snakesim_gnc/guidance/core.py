@@ -28,10 +28,10 @@ class WorldModel:
     """Makes world models from the newest sample of each sensor."""
 
     def __init__(self, robot: Description, known: Sequence[Obstacle], *, reach_m: float = 0.5) -> None:
-        """Create a world model.
+        """Create world models of a robot among surveyed obstacles.
 
         Args:
-            robot: the description of the robot.
+            robot: description of the robot.
             known: the surveyed obstacles.
             reach_m: distance from the robot up to which obstacles are part of the published world model.
         """
@@ -48,7 +48,7 @@ class WorldModel:
         self._reach_m = reach_m
 
     def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:
-        """Compute the world model from the newest samples.
+        """Compute the world model from the newest samples, with contacts and center of mass in the world frame.
 
         Args:
             tick: tick of the clock.

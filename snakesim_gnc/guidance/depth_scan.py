@@ -98,14 +98,17 @@ class DepthScanner:
             position_w: (3,) position of the camera in the world, m.
             rotation: (3, 3) world_from_camera.
             plane: (3,) first guess of the ground: z = a + b x + c y in the world, with x and y from the camera.
+
+        Returns:
+            The scan, with one range, point and height for each bin of azimuth.
         """
-        seen = np.flatnonzero(depth_m)
-        rays = self._rays[seen] @ rotation.T.astype(np.float32)
-        points = rays * depth_m[seen, None]  # from the camera, in the world's axes
+        pixels_with_depth = np.flatnonzero(depth_m)
+        rays = self._rays[pixels_with_depth] @ rotation.T.astype(np.float32)
+        points = rays * depth_m[pixels_with_depth, None]  # from the camera, in the world's axes
         points[:, 2] += position_w[2]
         ranges_m = np.hypot(points[:, 0], points[:, 1])
-        near = np.flatnonzero(ranges_m < NEAR_M)[::PLANE_EVERY]
-        a, b, c = refine_plane(plane, points[near].astype(np.float64)).astype(np.float32)
+        near_points = np.flatnonzero(ranges_m < NEAR_M)[::PLANE_EVERY]
+        a, b, c = refine_plane(plane, points[near_points].astype(np.float64)).astype(np.float32)
         heights_m = points[:, 2] - (a + b * points[:, 0] + c * points[:, 1])
 
         # Bins of azimuth, counter-clockwise from the right edge of the view.

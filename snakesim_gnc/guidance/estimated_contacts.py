@@ -29,12 +29,15 @@ class ContactEstimator:
         self._robot = robot
 
     def contacts(self, joints: JointState, imu: Imu | None, pose: Pose | None) -> EstimatedContacts | None:
-        """Return the contacts at a joint state, or None while a joint's values are outdated.
+        """Estimate the contacts of the body from its joint torques, or return None while a joint's values are outdated.
 
         Args:
-            joints: with torques.
+            joints: joint state with torques.
             imu: used only if it has the same timestamp as the joints.
-            pose: velocity of the base; None if it is unknown.
+            pose: pose sample, used for the velocity of the base; None if it is unknown.
+
+        Returns:
+            The contacts as a sensor would publish them, with a confidence for each.
         """
         if not all(joints.valid):
             return None

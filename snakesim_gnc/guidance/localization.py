@@ -91,6 +91,9 @@ class Localizer:
         The first sample replaces the estimate. A later one that is implausibly far from the estimate is rejected and
         counted in `refused`. If samples have been rejected for JUMP_S, the robot was probably moved: the sample then
         replaces the estimate, and `carried_m` is the distance. Repeated and outdated samples change nothing.
+
+        Args:
+            pose: the sample; it corrects the estimate of the time at which it was measured.
         """
         self.carried_m = 0.0
         is_first = self.pose_timestamp_ns is None
@@ -117,29 +120,33 @@ class Localizer:
         self.base = Base(self.base.planar_w, pose.position_w[2], rotation_about_z(-yaw_rad) @ rotation)
         self.correct(estimate_then, measured_w, np.diag(self._pose_variance))
 
-    def correct(self, then: Base, measured_w: Floats, spread: Floats, common_m2: float = 0.0) -> None:
+    def correct(
+        self, estimate: Base, measured_w: Floats, measurement_covariance: Floats, common_m2: float = 0.0
+    ) -> None:
         """Correct the base pose by a measurement of x, y and heading at some time (Kalman update, Joseph form).
 
         With P the covariance of the estimate, without the part that is common with the map, and R the covariance of
         the measurement, the gain is K = P (P + R)^-1, and P becomes (I - K) P (I - K)^T + K R K^T.
 
         Args:
-            then: the estimate at the time of the measurement.
+            estimate: the estimate at the time of the measurement.
             measured_w: (3,) measured x and y in m, and heading in rad.
-            spread: (3, 3) covariance R of the measurement.
+            measurement_covariance: (3, 3) covariance R of the measurement.
             common_m2: variance in m² of the position of the obstacles against which the pose was measured. It is added
                 at the end, because no number of measurements lowers it.
         """
         mean_m2 = 0.5 * float(np.trace(self.covariance[:2, :2]))
-        own_ratio = max(1.0 - common_m2 / max(mean_m2, 1e-12), MIN_OWN_RATIO)
-        own = self.covariance * own_ratio
-        error = measured_w - then.planar_w
+        independent_ratio = max(1.0 - common_m2 / max(mean_m2, 1e-12), MIN_OWN_RATIO)
+        independent = self.covariance * independent_ratio
+        error = measured_w - estimate.planar_w
         error[2] = wrap_angle(error[2])
-        gain = own @ np.linalg.inv(own + spread)
+        gain = independent @ np.linalg.inv(independent + measurement_covariance)
         remaining = np.eye(3) - gain
-        common = np.diag([common_m2, common_m2, 0.0])
-        self.covariance = remaining @ own @ remaining.T + gain @ spread @ gain.T + common
-        self._shift(then.planar_w[:2], gain @ error)
+        common_covariance = np.diag([common_m2, common_m2, 0.0])
+        self.covariance = (
+            remaining @ independent @ remaining.T + gain @ measurement_covariance @ gain.T + common_covariance
+        )
+        self._shift(estimate.planar_w[:2], gain @ error)
 
     def correct_along(self, rows: Floats, errors_m: Floats, sds_m: Floats) -> None:
         """Correct the base by m present measurements, each along one direction.
@@ -175,6 +182,9 @@ class Localizer:
 
         With F and G the Jacobians of the new pose by the old pose and by the step, and Q the covariance of the step, P
         becomes F P F^T + G Q G^T.
+
+        Args:
+            step: motion forward, to the left and about the vertical axis in the frame of the base, with its covariance.
         """
         x, y, yaw_rad = self.base.planar_w
         forward, left, turn_rad = step.motion

@@ -98,20 +98,20 @@ class ObstacleMap:
             scan: the scan, with its points in the world.
             sd_m: standard deviation of the sensor's position relative to the map.
         """
-        near = [track for track in self.tracks if _is_in_range(track, scan)]
-        outlines = make_outlines(near)
+        nearby_tracks = [track for track in self.tracks if _is_in_range(track, scan)]
+        outlines = make_outlines(nearby_tracks)
         bins_by_track: dict[int, list[Indices]] = {}  # by the track's number
         seen: dict[int, Track] = {}  # by the track's number
         adjacent: list[tuple[Track, Track]] = []  # tracks side by side in one cluster
         for cluster in find_clusters(scan):
-            claims = self._divide_cluster(cluster, scan, near, outlines, sd_m)
+            claims = self._divide_cluster(cluster, scan, nearby_tracks, outlines, sd_m)
             for track, bins in claims:
                 seen.setdefault(track.number, track)
                 bins_by_track.setdefault(track.number, []).append(bins)
             for (track, _), (next_track, _) in pairwise(claims):
                 if track is not next_track:
                     adjacent.append((track, next_track))
-        self._doubt_what_is_seen_through(near, scan, set(seen))
+        self._doubt_what_is_seen_through(nearby_tracks, scan, set(seen))
         for track in seen.values():
             self._add_points(track, scan, np.concatenate(bins_by_track[track.number]))
         fit_shapes(list(seen.values()))
@@ -151,26 +151,26 @@ class ObstacleMap:
         """Remove surfaces where the body is, because nothing else can be there.
 
         Args:
-            axis_w: (n, 2) points along the body, closer together than its radius.
-            radius_m: of the body.
+            axis_w: (n, 2) points along the body's axis, closer together than its radius, m.
+            radius_m: radius of the body.
             sd_m: standard deviation of the body's position relative to the map.
         """
-        near = [track for track in self.tracks if len(track.surface)]
-        if not near:
+        tracks_with_surface = [track for track in self.tracks if len(track.surface)]
+        if not tracks_with_surface:
             return
-        gaps_m = make_outlines(near).distance_m(axis_w)  # (n, tracks)
-        allowed_m = radius_m - SUNK_M - 2 * sd_m
+        gaps_m = make_outlines(tracks_with_surface).distance_m(axis_w)  # (n, tracks)
+        min_distance_m = radius_m - SUNK_M - 2 * sd_m
         left = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # (n, 2)
         left = left / np.maximum(np.hypot(left[:, 0], left[:, 1]), 1e-9)[:, None]
         changed: list[Track] = []
-        for index in np.flatnonzero(gaps_m.min(axis=0) < allowed_m):
-            is_sunk = gaps_m[:, index] < allowed_m
-            _carve_track(near[index], axis_w, left, is_sunk, radius_m, allowed_m)
-            changed.append(near[index])
+        for index in np.flatnonzero(gaps_m.min(axis=0) < min_distance_m):
+            is_sunk = gaps_m[:, index] < min_distance_m
+            _carve_track(tracks_with_surface[index], axis_w, left, is_sunk, radius_m, min_distance_m)
+            changed.append(tracks_with_surface[index])
         self._drop_disproved()
         fit_shapes([track for track in changed if len(track.surface)])
 
-    def forget(self, axis_w: Floats) -> None:
+    def drop_distant(self, axis_w: Floats) -> None:
         """Forget obstacles far from the body's axis (n, 2), and the least believed ones if there are too many."""
         near_tracks = [
             track for track in self.tracks if _distance_m(track, axis_w) < FORGET_DISTANCE_M + _size_m(track)
@@ -179,7 +179,7 @@ class ObstacleMap:
         self.tracks = sorted(near_tracks[:MAX_TRACKS], key=lambda track: track.number)
 
     def _divide_cluster(
-        self, cluster: Indices, scan: Scan, near: Sequence[Track], outlines: Outlines, sd_m: float
+        self, cluster: Indices, scan: Scan, nearby_tracks: Sequence[Track], outlines: Outlines, sd_m: float
     ) -> list[Claim]:
         """Divide the bins of a cluster among tracks. New tracks are started as needed.
 
@@ -188,17 +188,17 @@ class ObstacleMap:
         Args:
             cluster: bins of the scan that show one surface.
             scan: the scan.
-            near: tracks in the range of the scan.
+            nearby_tracks: tracks in the range of the scan.
             outlines: outlines of these tracks.
             sd_m: standard deviation of the sensor's position relative to the map.
 
         Returns:
             Tracks with their bins, in order of azimuth.
         """
-        if not near:
+        if not nearby_tracks:
             return self._claim_for_new_track(cluster, scan)
         distance_m = np.abs(outlines.distance_m(scan.points_w[cluster]))  # (points, tracks)
-        track_gate_m = np.minimum(GATE_M + 2 * list_position_sd_m(near) + sd_m, MAX_GATE_M)
+        track_gate_m = np.minimum(GATE_M + 2 * list_position_sd_m(nearby_tracks) + sd_m, MAX_GATE_M)
         gate_m = track_gate_m + 2 * scan.sd_m[cluster][:, None]  # (points, tracks)
         rows = np.arange(len(cluster))
         nearest = distance_m.argmin(axis=1)
@@ -216,9 +216,9 @@ class ObstacleMap:
         owner = np.array(owners)[distance_m[:, owners].argmin(axis=1)]
         is_apart = np.zeros(len(cluster), dtype=bool)
         for index in owners:
-            if _is_well_known_circle(near[index]):
+            if _is_well_known_circle(nearby_tracks[index]):
                 is_apart |= (owner == index) & (distance_m[:, index] > gate_m[:, index] + APART_M)
-        claims = [(near[index], cluster[(owner == index) & ~is_apart]) for index in owners]
+        claims = [(nearby_tracks[index], cluster[(owner == index) & ~is_apart]) for index in owners]
         if np.count_nonzero(is_apart) > MIN_CLUSTER_POINTS:
             claims.append((self._start_seen_track(), cluster[is_apart]))
         claims = [(track, bins) for track, bins in claims if len(bins)]
@@ -270,7 +270,15 @@ class ObstacleMap:
         self.tracks = [track for track in self.tracks if track.number not in gone]
 
     def _find_overlaps(self, seen: Sequence[Track]) -> list[tuple[Track, Track]]:
-        """Return pairs of a seen track and another track whose outline covers a large part of its surface."""
+        """Find tracks that may be the same obstacle, because one covers a large part of the other's surface.
+
+        Args:
+            seen: the tracks that the last scan saw.
+
+        Returns:
+            Pairs of a seen track and another track of the map, whose outline covers more than MERGE_RATIO of its
+            surface.
+        """
         if not seen:
             return []
         outlines = make_outlines(self.tracks)
@@ -288,34 +296,34 @@ class ObstacleMap:
                     pairs.append((track, other))
         return pairs
 
-    def _try_merge(self, old: Track, new: Track, *, overlaps: bool) -> bool:
+    def _try_merge(self, older: Track, newer: Track, *, overlaps: bool) -> bool:
         """Merge a newer track into an older one, unless two shapes explain their points better than one.
 
         Args:
-            old: the older track. After a merge it has the points of both.
-            new: the newer track, which is only read.
+            older: the older track. After a merge it has the points of both.
+            newer: the newer track, which is only read.
             overlaps: whether the tracks overlap; then they are merged in any case.
 
         Returns:
             Whether the tracks were merged.
         """
-        both = Track(old.number, old.name)
-        self._update_drift(old)
-        self._update_drift(new)
-        both.surface.add_surface(old.surface)
-        both.surface.add_surface(new.surface)
-        if not len(both.surface):
+        merged = Track(older.number, older.name)
+        self._update_drift(older)
+        self._update_drift(newer)
+        merged.surface.add_surface(older.surface)
+        merged.surface.add_surface(newer.surface)
+        if not len(merged.surface):
             return False
-        fit_shapes([both])
-        if not overlaps and both.cost > old.cost + new.cost:
+        fit_shapes([merged])
+        if not overlaps and merged.cost > older.cost + newer.cost:
             return False
-        old.surface = both.surface
-        old.cost = math.inf
-        old.touched = old.touched or new.touched
-        old.top_m = max(old.top_m, new.top_m)
-        old.log_odds = max(old.log_odds, new.log_odds)
-        old.last_seen_ns = max(old.last_seen_ns, new.last_seen_ns)
-        fit_shapes([old])
+        older.surface = merged.surface
+        older.cost = math.inf
+        older.touched = older.touched or newer.touched
+        older.top_m = max(older.top_m, newer.top_m)
+        older.log_odds = max(older.log_odds, newer.log_odds)
+        older.last_seen_ns = max(older.last_seen_ns, newer.last_seen_ns)
+        fit_shapes([older])
         return True
 
     def _update_drift(self, track: Track) -> None:
@@ -346,17 +354,17 @@ class ObstacleMap:
 
 
 def _carve_track(
-    track: Track, axis_w: Floats, left: Floats, is_sunk: NDArray[np.bool_], radius_m: float, allowed_m: float
+    track: Track, axis_w: Floats, left: Floats, is_sunk: NDArray[np.bool_], radius_m: float, min_distance_m: float
 ) -> None:
     """Remove the part of a track's surface that is in the body, or move the surface to the body's skin.
 
     Args:
         track: the track, which is changed.
-        axis_w: (n, 2) points along the body.
+        axis_w: (n, 2) points along the body's axis, m.
         left: (n, 2) unit vectors to the left of the body.
         is_sunk: (n,) where the track's outline is too deep in the body.
-        radius_m: of the body.
-        allowed_m: distance from the axis at which a surface may be.
+        radius_m: radius of the body.
+        min_distance_m: smallest distance from the axis at which a surface may be.
     """
     surface = track.surface
     cell_count = len(surface)
@@ -364,7 +372,7 @@ def _carve_track(
     distance_m = np.hypot(offset[..., 0], offset[..., 1])  # (cells, n)
     nearest = distance_m.argmin(axis=1)
     is_left = (offset[np.arange(cell_count), nearest] * left[nearest]).sum(axis=1) > 0
-    surface.keep(distance_m.min(axis=1) > allowed_m)
+    surface.keep(distance_m.min(axis=1) > min_distance_m)
     body_goes_through = OTHER_SIDE_RATIO < np.mean(is_left) < ONE_SIDE_RATIO
     if len(surface) < cell_count or body_goes_through:
         track.add_evidence(MISS_LOG_ODDS)

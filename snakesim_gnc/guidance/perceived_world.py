@@ -15,7 +15,7 @@ from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, decode_de
 from snakesim_gnc.guidance.ground import fit_plane_under
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import Look, Noise, Scan, make_scan
+from snakesim_gnc.guidance.scan import Noise, RangingSample, Scan, make_scan
 from snakesim_gnc.guidance.scan_match import match_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
@@ -46,7 +46,7 @@ class PerceivedWorld:
     """Makes world models from sensor samples."""
 
     def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise) -> None:
-        """Begin at the start pose, with an empty map.
+        """Create an empty map and an estimate of the base pose, which the samples of sensors then update.
 
         Args:
             robot: description of the robot.
@@ -88,7 +88,13 @@ class PerceivedWorld:
             self.map.drift(self.localizer.carried_m**2)
 
     def add_contacts(self, contacts: Contacts) -> None:
-        """Store contacts, and add the touched places of upright surfaces to the map, at most every TOUCH_PERIOD_NS."""
+        """Store contacts, and add the touched places of upright surfaces to the map, at most every TOUCH_PERIOD_NS.
+
+        Contacts whose time is not covered by the history of the body are counted in `refused`.
+
+        Args:
+            contacts: contacts of the links, in the frames of the links.
+        """
         self._contacts = contacts
         has_touched = self._touched_ns != 0
         if has_touched and contacts.timestamp_ns - self._touched_ns < TOUCH_PERIOD_NS:
@@ -109,7 +115,7 @@ class PerceivedWorld:
                 touches.append((position_w[:2], normal_w[:2] / math.hypot(*normal_w[:2])))
         self.map.add_touches(touches, contacts.timestamp_ns)
 
-    def add_look(self, look: Look, noise: Noise) -> None:
+    def add_ranging_sample(self, look: RangingSample, noise: Noise) -> None:
         """Add an image or ranges of any camera, lidar or range finder to the map. noise: of its distances."""
         body = self._find_body(look.timestamp_ns, "image" if isinstance(look, DepthImage) else "ranges")
         if body is None or look.link >= len(body.origins_w):
@@ -142,7 +148,7 @@ class PerceivedWorld:
         body = localizer.history.compute_frames(base, np.asarray(joints.angle_rad))
         axis_w = body.axis_w()
         self.map.carve_body(axis_w, self._radius_m, min(localizer.position_sd_m, MAX_CARVE_SD_M))
-        self.map.forget(axis_w)
+        self.map.drop_distant(axis_w)
         middles_w = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
         contacts_timestamp_ns = None
         contacts_from = None
@@ -265,7 +271,7 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
     return tuple((best_row / np.linalg.norm(best_row)).tolist())
 
 
-def _sensor_pose(body: BodyFrames, sensor: Look) -> tuple[Floats, Floats]:
+def _sensor_pose(body: BodyFrames, sensor: RangingSample) -> tuple[Floats, Floats]:
     """Return position (3,) in the world and rotation (3, 3) world_from_sensor of a mounted sensor."""
     rotation = body.rotations[sensor.link]
     position_w = body.origins_w[sensor.link] + rotation @ np.array(sensor.position_l)

@@ -134,8 +134,13 @@ def _acceleration_model(chain: ChainDynamics, spins_rad_s: Floats) -> Floats:
 
     With w the spin and l the step of each link, tail to middle:  a = a_tail + sum of (dw/dt z x l - w² l).
 
+    Args:
+        chain: lengths and frames of the links.
+        spins_rad_s: (n + 1,) angular velocities of the links about the vertical axis.
+
     Returns:
-        (2, n + 1, n + 4): x and y; of each link; by (tail's x, tail's y, angular acceleration of each link, 1).
+        (2, n + 1, n + 4) coefficients. The first axis is x and y, the second the link. The last axis is the variable:
+        acceleration of the tail end in x and y, angular acceleration of each link, and the constant 1.
     """
     count = len(spins_rad_s)
     step_part = np.tril(np.ones((count, count)), -1) + np.eye(count) / 2  # of each link's step, to each link's middle

@@ -17,7 +17,7 @@ BAND_M = (0.02, 0.12)  # height above the ground of what a snake's body can touc
 MAX_RANGE_M = 4.0  # farther surfaces are too coarse to be mapped
 UNKNOWN_STEP_RAD = 1e-3  # of a range finder with one beam
 
-Look = DepthImage | Ranges  # the messages that the map is made of
+RangingSample = DepthImage | Ranges  # the messages that the map is made of
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,9 @@ def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: 
         rotation: (3, 3) world_from_sensor.
         ground_z_m: height of the ground in the world.
         noise: noise of the ranges.
+
+    Returns:
+        The scan, with one range, point and height for each beam, counter-clockwise.
     """
     measured_m = np.array([np.nan if value is None else value for value in ranges.range_m], dtype=np.float64)
     count = len(measured_m)

@@ -101,11 +101,14 @@ def _compute_residuals(
         landmark_sd_m: standard deviation of each landmark's position.
         predicted_w: (3,) predicted x and y in m, and heading in rad.
         correction: (3,) present correction of the predicted pose.
+
+    Returns:
+        The nearest outline and the weight of each point, the information (3, 3) and the gradient (3,).
     """
     cosine = np.cos(correction[2])
     sine = np.sin(correction[2])
-    turned = arms @ np.array([[cosine, sine], [-sine, cosine]])
-    points_w = predicted_w[:2] + correction[:2] + turned
+    rotated = arms @ np.array([[cosine, sine], [-sine, cosine]])
+    points_w = predicted_w[:2] + correction[:2] + rotated
     rows = np.arange(len(arms))
     all_distances_m = outlines.distance_m(points_w)  # (m, outlines)
     nearest = np.abs(all_distances_m).argmin(axis=1)
@@ -113,10 +116,10 @@ def _compute_residuals(
 
     slopes: list[Floats] = []  # of the distance along x and y
     for axis in np.eye(2):
-        moved_m = outlines.distance_m(points_w + PROBE_M * axis)[rows, nearest]
-        slopes.append((moved_m - distance_m) / PROBE_M)
+        probed_m = outlines.distance_m(points_w + PROBE_M * axis)[rows, nearest]
+        slopes.append((probed_m - distance_m) / PROBE_M)
     slope = np.stack(slopes, axis=1)
-    slope_by_heading = slope[:, 1] * turned[:, 0] - slope[:, 0] * turned[:, 1]
+    slope_by_heading = slope[:, 1] * rotated[:, 0] - slope[:, 0] * rotated[:, 1]
     jacobian = np.column_stack([slope, slope_by_heading])
 
     spread_m = np.hypot(np.hypot(sd_m, landmark_sd_m[nearest]), SENSOR_FLOOR_SD_M)

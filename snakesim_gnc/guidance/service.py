@@ -7,6 +7,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.core import WorldModel
+from snakesim_gnc.guidance.dead_reckoned_pose import DeadReckonedPose
 from snakesim_gnc.guidance.estimated_contacts import (
     ContactEstimator,
     EstimatedContacts,
@@ -15,8 +16,7 @@ from snakesim_gnc.guidance.estimated_contacts import (
 )
 from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
-from snakesim_gnc.guidance.reckoned_pose import ReckonedPose
-from snakesim_gnc.guidance.scan import Look, Noise
+from snakesim_gnc.guidance.scan import Noise, RangingSample
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig, find_start_pose, survey_obstacles
 from snakesim_hal.model.sensors import DepthCamera, DistanceSensor
@@ -95,14 +95,14 @@ class _SurveyedSource:
 
         # Models of the robot.
         self._model: WorldModel | None = None
-        self._reckoned: ReckonedPose | None = None  # for a robot without a pose sensor
+        self._dead_reckoned_pose: DeadReckonedPose | None = None  # for a robot without a pose sensor
         self._estimator: ContactEstimator | None = None  # for a robot without contact sensors
 
     def configure(self, robot: Description) -> None:
         self._model = WorldModel(robot, self._known)
-        self._reckoned = None
-        if self._config.dead_reckons(robot):
-            self._reckoned = ReckonedPose(robot, _start_pose(self._config), self._known)
+        self._dead_reckoned_pose = None
+        if self._config.uses_dead_reckoning(robot):
+            self._dead_reckoned_pose = DeadReckonedPose(robot, _start_pose(self._config), self._known)
             print_stderr(
                 "no pose sensor: the pose is estimated by dead reckoning from the start, with joints, contacts and map"
             )
@@ -117,39 +117,42 @@ class _SurveyedSource:
 
         Contacts without a sensor are estimated, and a pose without a sensor is dead-reckoned; both are marked as such.
 
+        Args:
+            clock: the current tick.
+
         Returns:
             The world model, or None if the joint state or the sensor's pose is missing.
         """
         read = self._client.read
         joints = read(self._joints)
         pose = None
-        if self._reckoned is None:
+        if self._dead_reckoned_pose is None:
             pose = read(self._pose)
             if pose is None:
                 return None
         if self._model is None or joints is None:
             return None
         contacts = read(self._contacts) if self._contacts else None
-        estimated = None
+        estimated_contacts = None
         if contacts is None:
-            estimated = self._estimate_contacts(joints, pose)
-            if estimated is not None:
-                contacts = estimated.contacts
-        if self._reckoned is not None:
-            pose = self._reckoned.move(joints, contacts, estimated=estimated is not None)
+            estimated_contacts = self._estimate_contacts(joints, pose)
+            if estimated_contacts is not None:
+                contacts = estimated_contacts.contacts
+        if self._dead_reckoned_pose is not None:
+            pose = self._dead_reckoned_pose.move(joints, contacts, estimated=estimated_contacts is not None)
         assert pose is not None
         world = self._model.update(clock.tick, clock.timestamp_ns, joints, contacts, pose)
-        if estimated is not None:
-            world = mark_estimated(world, estimated)
-        if self._reckoned is not None:
-            world = self._reckoned.mark_reckoned(world)
+        if estimated_contacts is not None:
+            world = mark_estimated(world, estimated_contacts)
+        if self._dead_reckoned_pose is not None:
+            world = self._dead_reckoned_pose.mark_dead_reckoned(world)
         return world
 
     def _estimate_contacts(self, joints: JointState, pose: Pose | None) -> EstimatedContacts | None:
         if self._estimator is None:
             return None
-        # With dead reckoning no IMU is used at all, see `reckoned_pose`.
-        imu = self._client.read(self._imu) if self._imu and self._reckoned is None else None
+        # With dead reckoning no IMU is used at all, see `dead_reckoned_pose`.
+        imu = self._client.read(self._imu) if self._imu and self._dead_reckoned_pose is None else None
         return self._estimator.contacts(joints, imu, pose)
 
 
@@ -157,6 +160,12 @@ class _PerceivedSource:
     """Uses only what the sensors measure, and the pose in which the robot starts."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
+        """Subscribe to the sensors from which the map and the pose are estimated.
+
+        Args:
+            client: connection to the robot.
+            config: configuration of the run, with the robot's sensors, their noise, and the start pose.
+        """
         robot = config.robot
         pose_sensor = robot.sensors.pose
         self._client = client
@@ -174,7 +183,11 @@ class _PerceivedSource:
         self._ranging_feeds: list[tuple[Any, Noise]] = []  # subscription to a ranging sensor, and its noise
         for key, sensor in robot.sensors.mounted():
             message_type = keys.find_message(key)
-            if isinstance(sensor, DistanceSensor) and message_type is not None and message_type in get_args(Look):
+            if (
+                isinstance(sensor, DistanceSensor)
+                and message_type is not None
+                and message_type in get_args(RangingSample)
+            ):
                 self._ranging_feeds.append((client.subscribe(key, message_type), _range_noise(sensor)))
 
         self._model: PerceivedWorld | None = None
@@ -186,6 +199,11 @@ class _PerceivedSource:
 
     def make_world(self, clock: Clock) -> World | None:
         """Update the perceived world by the newest samples, and return the world model.
+
+        Each sample of contacts, cameras and range finders is used once.
+
+        Args:
+            clock: the current tick.
 
         Returns:
             The world model, or None before the robot is described or before the first joint state.
@@ -206,7 +224,7 @@ class _PerceivedSource:
         for feed, noise in self._ranging_feeds:
             sample = read(feed)
             if sample is not None and self._is_new(feed.key, sample.timestamp_ns):
-                model.add_look(sample, noise)
+                model.add_ranging_sample(sample, noise)
         return model.make_world(clock.tick, clock.timestamp_ns)
 
     def _is_new(self, key: str, timestamp_ns: int) -> bool:

@@ -95,12 +95,12 @@ def _solve_nonnegative(columns: Floats, right_side: Floats, amounts: Floats, act
             return active
         steps_to_zero = present[is_negative] / (present[is_negative] - solution[is_negative] + TINY)
         step = float(np.min(steps_to_zero))
-        moved = present + step * (solution - present)
-        is_dropped = is_negative & (moved <= ZERO_AMOUNT)
+        stepped_amounts = present + step * (solution - present)
+        is_dropped = is_negative & (stepped_amounts <= ZERO_AMOUNT)
         if not is_dropped.any():
             is_dropped = is_negative
         amounts[:] = 0.0
         active = [column for column, dropped in zip(active, is_dropped, strict=True) if not dropped]
-        amounts[active] = np.maximum(moved[~is_dropped], 0.0)
+        amounts[active] = np.maximum(stepped_amounts[~is_dropped], 0.0)
     amounts[:] = 0.0
     return active

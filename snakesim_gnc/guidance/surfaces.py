@@ -123,8 +123,12 @@ class Surface:
 def stack_surfaces(surfaces: list[Surface]) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the cells of b surfaces as arrays, padded to the largest number of cells p.
 
+    Args:
+        surfaces: the surfaces of b obstacles, of which some may have no cells.
+
     Returns:
-        Points (b, p, 2), weights (b, p), outward directions (b, p, 2), normal weights (b, p). Padding has the weight 0.
+        Points (b, p, 2) in m, weights (b, p) in 1 / m², outward directions (b, p, 2), normal weights (b, p). Padding
+        has the weight 0.
     """
     shape = (len(surfaces), max(len(surface) for surface in surfaces))
     points = np.zeros((*shape, 2))

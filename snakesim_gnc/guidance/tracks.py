@@ -83,7 +83,7 @@ class Track:
         return self.log_odds * math.exp(-age_ns * 1e-9 / MEMORY_S)
 
     def to_obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
-        """Return the track as an obstacle of a world model.
+        """Return the track as an obstacle of a world model, with its shape, size, confidence and uncertainty.
 
         Args:
             now_ns: robot time; the confidence decreases with the time since the obstacle was last seen.
@@ -150,8 +150,8 @@ def fit_shapes(tracks: Sequence[Track]) -> None:
     cells = np.array([len(track.surface) for track in tracks])
     log_cells = np.log(np.maximum(cells, 2))
 
-    began_w = np.array([_known_center(track) for track in tracks])
-    circles = fit_circles(points, weight, outward, normal_weight, began_w)
+    initial_center_w = np.array([_known_center(track) for track in tracks])
+    circles = fit_circles(points, weight, outward, normal_weight, initial_center_w)
     circle_cost = circles.misfit + CIRCLE_PARAMETERS * log_cells
     circle_cost[circles.radius_m > MAX_CIRCLE_RADIUS_M] += TOO_LARGE_COST
 

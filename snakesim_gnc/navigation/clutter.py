@@ -143,13 +143,18 @@ class ClutterPlanner:
         self._trail_w.clear()
 
     def update(self, tick: int, world: World, nodes_w: Floats, desired: DesiredMotion) -> Trajectory:
-        """Return the trajectory, and do one update's share of planning.
+        """Return the trajectory of this tick, and continue the search for a new path by a limited number of nodes.
+
+        The trajectory has the last complete plan until the next one is found.
 
         Args:
-            tick: of the clock; a repeated tick does no more planning.
+            tick: tick of the clock; a repeated tick continues no search.
             world: the newest world model.
-            nodes_w: (n, 2) tail end, joints and head end.
-            desired: speed and direction.
+            nodes_w: (n, 2) tail end, joints and head end of the body in the world, m.
+            desired: desired speed and direction.
+
+        Returns:
+            The path with its push-points, the speed, and the reason if the robot should not move.
         """
         body_w = space_evenly(nodes_w)
         self._goal.update(body_w, desired.heading_w_rad)
@@ -187,7 +192,15 @@ class ClutterPlanner:
         return desired.speed_m_s, reason
 
     def _advance(self, body_w: Floats, world: World, desired: DesiredMotion) -> None:
-        """Decide whether another path is needed, and do one update's share of a plan in work."""
+        """Decide whether another path is needed, and continue a plan in progress by one update's share.
+
+        Without any plan yet, the first one is a straight line ahead of the body.
+
+        Args:
+            body_w: (n, 2) evenly spaced points along the body, tail to head, m.
+            world: the newest world model.
+            desired: desired speed and direction.
+        """
         self.searched_nodes = 0
         self._extend_trail(body_w[0])
         if self._plan is None:
@@ -207,7 +220,14 @@ class ClutterPlanner:
             self._continue_plan(self._planning, world.timestamp_ns)
 
     def _start_plan(self, reason: str, body_w: Floats, world: World, committed_m: float) -> None:
-        """Start to plan a path from where the body is now."""
+        """Start to plan a path from the present position of the body; later updates continue it.
+
+        Args:
+            reason: why another path is needed; it decides whether the path begins at the head or at the tail.
+            body_w: (n, 2) evenly spaced points along the body, tail to head, m.
+            world: the newest world model.
+            committed_m: length of the present path ahead of the head that the new path keeps.
+        """
         assert self._plan is not None
         self._planned_heading_rad = limit_turn_rad(body_w, self._goal.direction_w)
         if self._known is None:
@@ -267,7 +287,18 @@ class ClutterPlanner:
         return float(np.hypot(*(middle_w - oldest_w)))
 
     def _find_reason(self, plan: Plan, body_w: Floats, world: World, moved_m: float | None, committed_m: float) -> str:
-        """Return why another path is needed, or an empty string. Starts and ends backing out, too."""
+        """Return why another path is needed, or an empty string. It also starts and ends the backing out of a jam.
+
+        Reasons are checked in order of urgency: the body is off its path, the path ends soon, the body is stuck, the
+        goal has turned, the map has changed.
+
+        Args:
+            plan: the present plan.
+            body_w: (n, 2) evenly spaced points along the body, tail to head, m.
+            world: the newest world model.
+            moved_m: movement of the body within the last STUCK_S; None if it is not known yet.
+            committed_m: length of the path ahead of the head that a new path keeps.
+        """
         now_ns = world.timestamp_ns
         head_s_m = plan.route.project(body_w[-1])
         if self._back_out_from_m is not None:

@@ -60,6 +60,16 @@ class ObstacleGrid:
         return grid
 
     def _fill(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
+        """Compute the nearest obstacle of each cell, in steps that a planner can spread over several ticks.
+
+        Each obstacle is written into the cells within MAX_DISTANCE_M of its outline that have no nearer obstacle.
+
+        Args:
+            obstacles: the obstacles of the map.
+
+        Yields:
+            The cost of the next step in nodes of the search, before the step.
+        """
         self.obstacles = list(obstacles)
         self.outlines = Outlines.from_obstacles(self.obstacles)
         if not self.obstacles:
@@ -96,10 +106,12 @@ class ObstacleGrid:
         return NativeMarking(library, self).mark_obstacle
 
     def _mark_obstacle(self, index: int, first: Ints, last: Ints) -> None:
-        """Write an obstacle into the cells of a window that have no nearer one. This specifies the same in C.
+        """Write an obstacle into the cells of a window that have no nearer one.
+
+        It is the reference implementation of a function of the C library, which gives the same result.
 
         Args:
-            index: of the obstacle.
+            index: index of the obstacle.
             first: (2,) column and row of the first cell.
             last: (2,) column and row after the last cell; both are within the grid.
         """
@@ -115,7 +127,11 @@ class ObstacleGrid:
         nearest[is_nearer] = index
 
     def make_native_grid(self, memory: NativeMemory) -> NativeGrid:
-        """Return the grid as C functions read it. memory: keeps its arrays alive."""
+        """Return the grid as the structure that the functions of the C library read, with pointers to its arrays.
+
+        Args:
+            memory: keeps the arrays alive as long as C code may read them.
+        """
         columns, rows = self.shape
         outlines = self.outlines
         count = len(outlines)

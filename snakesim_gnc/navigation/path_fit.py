@@ -47,12 +47,12 @@ class PathFitParameters:
 def fit_path(
     points_w: Floats, fixed_points: int, obstacles: ObstacleGrid, goal_w: Floats, parameters: PathFitParameters
 ) -> Floats:
-    """Return a path that is moved sideways to have the wanted gaps.
+    """Move the points of a path sideways until it has the desired gaps to the obstacles beside it.
 
     Args:
-        points_w: (n, 2) the path, evenly spaced.
+        points_w: (n, 2) the path, evenly spaced, m.
         fixed_points: number of points at its beginning that stay where they are.
-        obstacles: what is beside it.
+        obstacles: the obstacles of the map.
         goal_w: (2,) unit vector of the direction of travel.
         parameters: gaps and weights.
 
@@ -64,7 +64,7 @@ def fit_path(
         chords = np.gradient(path, axis=0)
         tangents = chords / np.maximum(np.hypot(chords[:, 0], chords[:, 1]), 1e-9)[:, None]
         left = np.stack([-tangents[:, 1], tangents[:, 0]], axis=-1)
-        shift_m, weight = _find_wanted_shifts(path, tangents, left, obstacles, goal_w, parameters)
+        shift_m, weight = _find_desired_shifts(path, tangents, left, obstacles, goal_w, parameters)
         shift_m[:fixed_points] = 0.0
         weight[:fixed_points] = FIXED_WEIGHT
         path = path + _solve_shifts_m(path, left, shift_m, weight, parameters)[:, None] * left
@@ -80,7 +80,7 @@ def _space_evenly_after(path: Floats, fixed_points: int) -> Floats:
     return np.concatenate([path[:fixed_points], rest[1:]])
 
 
-def _find_wanted_shifts(
+def _find_desired_shifts(
     path: Floats,
     tangents: Floats,
     left: Floats,
@@ -88,9 +88,21 @@ def _find_wanted_shifts(
     goal_w: Floats,
     parameters: PathFitParameters,
 ) -> tuple[Floats, Floats]:
-    """Return how far each point should go to the left, in m, and the weight of that: (n,) each.
+    """Return how far each point of a path should move to the left for its desired gap, and the weight of that.
 
-    A point moves if its gap is too small, or if it is the nearest one to an obstacle that the body can push off.
+    A point moves if its gap is too small, or if it is the nearest one to an obstacle that the body can push off. The
+    desired gap depends on whether the obstacle pushes the body towards the goal, away from it, or neither.
+
+    Args:
+        path: (n, 2) points of the path in the world, m.
+        tangents: (n, 2) unit vectors along the path.
+        left: (n, 2) unit vectors to the left of the path.
+        obstacles: the obstacles of the map.
+        goal_w: (2,) unit vector of the direction of travel.
+        parameters: gaps and weights.
+
+    Returns:
+        The shifts in m, left positive, and their weights, (n,) each. Points that need not move have the weight 0.
     """
     nearest = obstacles.find_nearest(path[:, 0], path[:, 1])
     is_near = nearest.obstacle != NO_OBSTACLE
@@ -98,12 +110,12 @@ def _find_wanted_shifts(
     push = nearest.normal_w @ goal_w
     corner_cut_m = _corner_cut_m(tangents, sideways, parameters.segment_m)
     gap_m = nearest.distance_m - parameters.radius_m - CORNER_CUT_SCALE * corner_cut_m
-    wanted_gap_m = np.where(
+    desired_gap_m = np.where(
         push > MIN_PUSH,
         parameters.push_gap_m,
         np.where(push < -MIN_PUSH, parameters.brake_gap_m, parameters.min_gap_m),
     )
-    is_too_close = is_near & (gap_m < wanted_gap_m)
+    is_too_close = is_near & (gap_m < desired_gap_m)
     is_push_point = (
         is_near
         & (np.abs(sideways) > MIN_SIDEWAYS)
@@ -112,7 +124,7 @@ def _find_wanted_shifts(
         & _find_local_minima(nearest.obstacle, gap_m)
     )
     is_moved = is_push_point | is_too_close
-    shift_m = np.where(is_moved, (wanted_gap_m - gap_m) * np.sign(sideways), 0.0)
+    shift_m = np.where(is_moved, (desired_gap_m - gap_m) * np.sign(sideways), 0.0)
     weight = parameters.gap_weight * np.maximum(np.abs(sideways), MIN_SIDEWAYS_WEIGHT)
     return shift_m, np.where(is_moved, weight, 0.0)
 
@@ -140,26 +152,26 @@ def _find_local_minima(obstacle: NDArray[np.intp], gap_m: Floats) -> Bools:
 
 
 def _solve_shifts_m(
-    path: Floats, left: Floats, wanted_m: Floats, weight: Floats, parameters: PathFitParameters
+    path: Floats, left: Floats, desired_m: Floats, weight: Floats, parameters: PathFitParameters
 ) -> Floats:
-    """Return the shifts u to the left, (n,) in m, with which the path is smooth and has the wanted gaps.
+    """Return the shifts u to the left, (n,) in m, with which the path is smooth and has the desired gaps.
 
     They minimize
 
         sum_i u_i² + w_i (u_i - v_i)² + k |third difference of (p + u l)|²,   k = (smoothing / spacing)^6
 
     Args:
-        path: (n, 2) p.
-        left: (n, 2) l, unit vectors to the left of the path.
-        wanted_m: (n,) v, the shifts that give the wanted gaps.
-        weight: (n,) w.
-        parameters: smoothing.
+        path: (n, 2) points p of the path, m.
+        left: (n, 2) unit vectors l to the left of the path.
+        desired_m: (n,) shifts v that give the desired gaps.
+        weight: (n,) weights w.
+        parameters: length over which the path is smoothed.
     """
     count = len(path)
     window = count - 3
     stiffness = (parameters.smoothing_m / SPACING_M) ** 6
     matrix = np.diag(1.0 + weight)
-    right_side = weight * wanted_m
+    right_side = weight * desired_m
     rows = np.arange(window)
     for axis in (0, 1):
         # Column j of the third difference in this axis, as it depends on the shift of point i + j.

@@ -77,7 +77,14 @@ class PlanningTask:
 
 
 def make_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[int, None, Plan]:
-    """Make a plan, and return it.
+    """Search a path for the reason of a task, fit it to the obstacles beside it, and return it with its push-points.
+
+    It is a generator, so that a planner can spread the work over several ticks. If no path is found, the plan goes
+    straight ahead.
+
+    Args:
+        task: why a path is needed, the body, the map and the goal.
+        parameters: the robot, and the cost weights of the search.
 
     Yields:
         The cost of the next step in nodes, before doing it.
@@ -88,11 +95,11 @@ def make_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[int
             parameters = replace(parameters, kept_nodes=FIRST_KEPT_NODES, kept_per_wide_cell=FIRST_KEPT_PER_WIDE_CELL)
     else:
         grid = yield from ObstacleGrid.build_in_steps(task.obstacles)
-    begin_w, found = yield from _search(task, grid, parameters)
-    if found is None:
+    begin_w, searched_path = yield from _search(task, grid, parameters)
+    if searched_path is None:
         points_w = extend_straight(task.body_w)
     else:
-        points_w = np.concatenate([begin_w, space_evenly(found.points_w)[min(len(begin_w), 1) :]])
+        points_w = np.concatenate([begin_w, space_evenly(searched_path.points_w)[min(len(begin_w), 1) :]])
         yield NODES_PER_FITTED_POINT * len(points_w)
         fit_parameters = PathFitParameters(radius_m=parameters.radius_m, segment_m=parameters.segment_m)
         fixed_points = max(len(begin_w) - HEAD_POINTS, 0)
@@ -120,10 +127,19 @@ def limit_turn_rad(body_w: Floats, goal_w: Floats) -> float:
 def _search(
     task: PlanningTask, grid: ObstacleGrid, parameters: SearchParameters
 ) -> Generator[int, None, tuple[Floats, SearchedPath | None]]:
-    """Run the search that fits the reason of the plan.
+    """Run the search that fits the reason of the plan: from the head or from the present path, or for the whole body.
+
+    Args:
+        task: why a path is needed, the body and the goal.
+        grid: the map.
+        parameters: the robot, and the cost weights of the search.
+
+    Yields:
+        The cost of the next step in nodes, before doing it.
 
     Returns:
-        The curve (k, 2) to which the found path is joined, which is empty for a path of the whole body; and that path.
+        The curve (k, 2) to which the searched path is joined, which is empty for a path of the whole body; and that
+        path.
     """
     beam = BeamSearch(grid, parameters)
     heading_rad = limit_turn_rad(task.body_w, task.goal_w)
@@ -154,7 +170,19 @@ def _committed_path(task: PlanningTask, body_length_m: float) -> Floats:
 def _search_whole_body(
     beam: BeamSearch, task: PlanningTask, parameters: SearchParameters, heading_rad: float
 ) -> PathSearch:
-    """Search a path for the whole body that changes its shape as little as possible, and on which it can push well."""
+    """Search a path for the whole body that changes its shape as little as possible, and on which it can push well.
+
+    The search is repeated with wider limits until a path has a good propulsion margin ahead of the head.
+
+    Args:
+        beam: the search.
+        task: the body, and the paths that have failed.
+        parameters: the robot, and the desired propulsion margin in N.
+        heading_rad: direction of travel.
+
+    Returns:
+        The path, or None if none of the searches found one that is long enough.
+    """
     best: SearchedPath | None = None
     head_arc = round(parameters.body_length_m / STEP_M)
     for max_sideways_m in MAX_SIDEWAYS_M:

@@ -41,18 +41,22 @@ class Navigation(Service):
         self._intents = Intents(config.mission.speed_m_s)
 
     def configure(self, robot: Description) -> None:
-        """Create the planners for a robot, whose position is unknown again."""
+        """Create the planners for a robot, after a start or a reconnection, when the robot's position is unknown.
+
+        Args:
+            robot: description of the robot.
+        """
         config = self._config
-        known = survey_obstacles(config)
+        surveyed_obstacles = survey_obstacles(config)
         self._intents.start_over()
         self._body = PlanarBody(robot)
         self._recent_angles = RecentAngles()
         self._rises = PlatformRises(_find_platforms(config, robot))
-        self._known_path = _make_known_path(config, known) if config.mission.goal is None else None
+        self._known_path = _make_known_path(config, surveyed_obstacles) if config.mission.goal is None else None
         schedule = config.services.get(self.name, ServiceSchedule())
         self._planner = ClutterPlanner(
             config.mission.goal or HeadingGoal(),
-            known if config.mission.map == "known" else None,
+            surveyed_obstacles if config.mission.map == "known" else None,
             search=SearchParameters(
                 body_length_m=self._body.length_m,
                 radius_m=self._body.radius_m,

@@ -11,7 +11,6 @@ The host's thread makes every call.
 
 import functools
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, TypeVar
 
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
@@ -77,7 +76,7 @@ class GuardedBackend(Backend):
                 encoded[key] = encode_checked(key, message, self._custom_messages.get(key))
         except WireError as error:
             raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
-        return replace(samples, encoded=encoded)
+        return Samples(samples.joints, samples.others, encoded)
 
     @_guarded
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:

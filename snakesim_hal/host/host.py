@@ -397,6 +397,13 @@ class Host:
         """Return whether lockstep still shows tick 0."""
         return self._state.clock.clock_mode == "lockstep" and self.authority.arm_session == 0
 
+    def _next_published_tick(self) -> int:
+        """Return the tick that is published next: tick 0 again and again until the first arming."""
+        last_tick = self._published.last_tick
+        if last_tick is None or self._awaits_first_arming():
+            return 0
+        return last_tick + 1
+
     def _is_paused(self) -> bool:
         """Return whether the next tick has to wait. Tick 0 of lockstep is shown also in a pause."""
         return self._state.clock.simulated.is_paused and not self._awaits_first_arming()
@@ -528,7 +535,7 @@ class Host:
     def on_presence(self, service: str, present: bool) -> None:
         """Note that a service's liveliness token has appeared or vanished."""
         if present:
-            self.participants.mark_present(service)
+            self.participants.mark_present(service, self._next_published_tick())
             return
         if not self.participants.mark_absent(service):
             return

@@ -79,6 +79,7 @@ class CommandArrival:
     decoder: Decoder[JointCommand]
 
     def deliver(self, receiver: Receiver) -> None:
+        # Not `arrival.decode`, whose message readers in this process share: one of them might change it.
         command = self.decoder.decode(self.arrival.payload, self.arrival.encoding)
         receiver.on_command(command, self.arrival.monotonic_ns)
 
@@ -89,7 +90,7 @@ class _Done:
     decoder: Decoder[Done]
 
     def deliver(self, receiver: Receiver) -> None:
-        done = self.decoder.decode(self.arrival.payload, self.arrival.encoding)
+        done = self.arrival.decode(self.decoder)
         receiver.on_done(keys.parse_service(self.arrival.key), done.tick)
 
 

@@ -17,12 +17,16 @@ class Participant:
 
     service: ServiceSchedule
     done_tick: int = NOT_ANSWERED  # the newest tick for which it has published all output
+    first_tick: int = 0  # that it receives: it cannot answer ticks that were published before it was connected
     present: bool = False
     given_up: bool = False
 
     def behind(self, tick: int) -> bool:
         """Return whether the end of `tick` has to wait for this service."""
-        return self.present and not self.given_up and self.done_tick < self.service.used_output_tick(tick + 1)
+        if not self.present or self.given_up:
+            return False
+        awaited_tick = self.service.used_output_tick(tick + 1)
+        return awaited_tick >= self.first_tick and awaited_tick > self.done_tick
 
 
 class Participants(dict[str, Participant]):
@@ -67,12 +71,20 @@ class Participants(dict[str, Participant]):
         if participant is not None:
             participant.done_tick = max(participant.done_tick, tick)
 
-    def mark_present(self, service: str) -> None:
-        """Note that a service's liveliness token has appeared."""
+    def mark_present(self, service: str, next_tick: int) -> None:
+        """Note that a service's liveliness token has appeared.
+
+        Args:
+            service: name of the service, which has subscribed to its input already.
+            next_tick: the tick that is published next, also if it has been published before.
+        """
         participant = self.get(service)
-        if participant is not None:
-            participant.present = True
-            participant.given_up = False
+        if participant is None:
+            return
+        if not participant.present:
+            participant.first_tick = next_tick
+        participant.present = True
+        participant.given_up = False
 
     def mark_absent(self, service: str) -> bool:
         """Note that a service's token has vanished. Returns whether it is a service of the run."""

@@ -6,12 +6,13 @@ bounces off it within milliseconds. The impulse is what the contact does to the 
 
 from collections import deque
 from collections.abc import Mapping
+from typing import Any
 
 FORCE_WINDOW_S = 0.05  # duration of the mean
 
 
 class MeasuredForce:
-    """Moving averages of contact forces over FELT_OVER_S; before the first sample all forces were 0."""
+    """Moving averages of contact forces over FORCE_WINDOW_S; before the first sample all forces were 0."""
 
     def __init__(self, every_s: float) -> None:
         """Start without samples.
@@ -20,9 +21,9 @@ class MeasuredForce:
             every_s: time between two samples.
         """
         self._count = max(round(FORCE_WINDOW_S / every_s), 1)
-        self._samples: deque[Mapping[object, float]] = deque()
+        self._samples: deque[Mapping[Any, float]] = deque()
 
-    def add(self, forces_n: Mapping[object, float]) -> None:
+    def add(self, forces_n: Mapping[Any, float]) -> None:
         """Add a sample.
 
         Args:
@@ -35,7 +36,7 @@ class MeasuredForce:
     @property
     def max_n(self) -> float:
         """Return the mean force of the contact that pushes hardest; 0 without contacts."""
-        sums: dict[object, float] = {}
+        sums: dict[Any, float] = {}
         for forces_n in self._samples:
             for contact, force_n in forces_n.items():
                 sums[contact] = sums.get(contact, 0.0) + force_n

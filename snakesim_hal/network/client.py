@@ -140,7 +140,7 @@ class Client:
     # --- ticks -----------------------------------------------------------------------------------------------
 
     def announce(self) -> None:
-        """Declare the service's liveliness token. A lockstep run waits for the service from now on."""
+        """Declare the service's liveliness token. A lockstep run waits for its answers from the next tick on."""
         self.session.declare_alive(self.service)
 
     def ticks(self, silence_s: float | None = None, *, pauses: bool = False) -> Iterator[Clock | None]:
@@ -211,7 +211,7 @@ class Client:
         """Store a clock, in Zenoh's thread. Wakes the service only for its due ticks."""
         self._last_clock_s = arrival.monotonic_ns * 1e-9
         try:
-            clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+            clock = arrival.decode(self._clock_decoder)
         except WireError as error:
             self.session.rejected[error.reason] += 1
             return

@@ -20,7 +20,8 @@ from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, Description, 
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SILENCE_S = 2.0  # without a clock: the host has stalled
-LEASE_TIMEOUT_S = 10.0  # to get the lease
+LOCKSTEP_SILENCE_S = 15.0  # longer than a host waits for another service by default: `stall_limit_s` is 10 s
+LEASE_TIMEOUT_S = 20.0  # to get the lease, after at most one wait of the host for another service
 READABLE_KEYS = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 
@@ -39,6 +40,7 @@ class CommandingClient:
             RefusedError: another client commands the robot.
             StalledError: the robot publishes no clock.
         """
+        self._silence_s = LOCKSTEP_SILENCE_S if clock_mode == "lockstep" else SILENCE_S
         if session.present(keys.alive_key(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
@@ -50,7 +52,7 @@ class CommandingClient:
         for key, message in READABLE_KEYS.items():
             self._feeds[key] = self._client.subscribe(key, message)
         self._client.description()
-        self._ticks = self._client.ticks(SILENCE_S)
+        self._ticks = self._client.ticks(self._silence_s)
         self._commander = Commander(self._client, robot)
         self._last_setpoints: RequestedSetpoints | None = None
         self.clock: Clock | None = None  # of the current tick
@@ -60,7 +62,7 @@ class CommandingClient:
         self.turn_until(
             self._is_lease_shown,
             LEASE_TIMEOUT_S,
-            lambda: f"no right to command {robot.robot}: {self._commander.refusal}",
+            lambda: f"no right to command {robot.robot}: {self._commander.refusal or 'the host has not answered'}",
         )
 
     def wait(self) -> Clock:
@@ -69,13 +71,13 @@ class CommandingClient:
         If the last tick was not commanded, this reports it as done, because a lockstep host waits for its output.
 
         Raises:
-            StalledError: no clock arrived within SILENCE_S.
+            StalledError: no clock arrived within SILENCE_S, or in lockstep LOCKSTEP_SILENCE_S.
         """
         if self.clock is not None:
             self._client.report_done(self.clock.tick)
         clock = next(self._ticks)
         if clock is None:
-            raise StalledError(f"no tick of the robot for {SILENCE_S:g} s; is its HAL host running?")
+            raise StalledError(f"no tick of the robot for {self._silence_s:g} s; is its HAL host running?")
         self.clock = clock
         self._holds_lease = self._commander.ensure_lease(clock)
         return clock

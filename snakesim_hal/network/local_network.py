@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from queue import Empty
 from typing import Any
 
+import msgspec
+
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session, intersects
@@ -22,6 +24,22 @@ from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
 SampleHandler = Callable[[Arrival], None]
+
+
+class LocalArrival(Arrival, frozen=True):
+    """A sample that stays within this process. Its first reader decodes it, and the other readers get that message.
+
+    So no reader may change a message. The host decodes commands anew: what moves motors is shared with no service.
+    """
+
+    decoded: dict[type[Message], Any] = msgspec.field(default_factory=dict[type[Message], Any])
+
+    def decode(self, decoder: Decoder[MessageT]) -> MessageT:
+        message: MessageT | None = self.decoded.get(decoder.message)
+        if message is None:
+            message = super().decode(decoder)
+            self.decoded[decoder.message] = message
+        return message
 
 
 class LocalNetwork:
@@ -93,12 +111,14 @@ class LocalReader(Reader[MessageT]):
         self._arrivals = arrivals
 
     def _take_samples(self) -> list[Arrival]:
+        if not self._arrivals:
+            return []
         arrived = list(self._arrivals)
         self._arrivals.clear()
         return arrived
 
-    def _content(self, sample: Arrival) -> tuple[bytes, str]:
-        return sample.payload, sample.encoding
+    def _decode_sample(self, sample: Arrival, decoder: Decoder[MessageT]) -> MessageT:
+        return sample.decode(decoder)
 
 
 @dataclass
@@ -142,7 +162,7 @@ class LocalSession(Session):
         encoding = format_encoding(message)
 
         def send(payload: bytes) -> None:
-            arrival = Arrival(key, payload, encoding, time.monotonic_ns())
+            arrival = LocalArrival(key, payload, encoding, time.monotonic_ns())
             if latched:
                 network.latched[key] = arrival
             for handler in network.handlers_for(key):

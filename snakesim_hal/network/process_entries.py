@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Collection
 from importlib.metadata import version
+from typing import NamedTuple
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.base.process import get_user_name
@@ -121,6 +122,14 @@ def describe_place(entry: Process) -> str:
     return f"{entry.machine} ({entry.name}, process {entry.pid})"
 
 
+class _Compared(NamedTuple):
+    """Two entries that have been compared."""
+
+    entry: Process
+    own: Process
+    conflict: str  # empty: they fit
+
+
 class ProcessEntries:
     """The entries of all processes that are present now."""
 
@@ -130,17 +139,26 @@ class ProcessEntries:
         self._decoder = Decoder(Process)
         self._entries: dict[str, Process] = {}
         self._alive: set[str] = set()
+        self._compared: dict[str, _Compared] = {}  # only of known services, so there are few
         session.on_alive(self._on_token, keys.PROCESS_ALL)
         session.on_latched_arrival(keys.PROCESS_ALL, self._store_entry)
 
     def find_problems(self, own: Process, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
         problems = [f"{process} has not published its settings yet" for process in self.unpublished(names)]
-        for entry in self._published(names).values():
-            conflict = _describe_conflict(entry, own) if entry is not None else ""
+        for key, entry in self._published(names).items():
+            conflict = self._find_conflict(key, entry, own) if entry is not None else ""
             if conflict:
                 problems.append(conflict)
         return problems
+
+    def _find_conflict(self, key: str, entry: Process, own: Process) -> str:
+        """Return what `_describe_conflict` returns. Each entry is compared once, although every status asks for it."""
+        compared = self._compared.get(key)
+        if compared is None or compared.entry is not entry or compared.own is not own:
+            compared = _Compared(entry, own, _describe_conflict(entry, own))
+            self._compared[key] = compared
+        return compared.conflict
 
     def unpublished(self, names: Collection[str]) -> list[str]:
         """Return the present processes of these names that have not published their entry yet."""
@@ -176,6 +194,6 @@ class ProcessEntries:
             if len(self._entries) >= MAX_ENTRIES:
                 return
         try:
-            self._entries[arrival.key] = self._decoder.decode(arrival.payload, arrival.encoding)
+            self._entries[arrival.key] = arrival.decode(self._decoder)
         except WireError as error:
             self._session.rejected[error.reason] += 1

@@ -4,7 +4,9 @@ The wire's bounds do not depend on the robot. A joint state of three joints is v
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,8 @@ POWER_LISTS = ("voltage_v", "current_a", "motor_c", "board_c", "leak", "valid")
 IMU_LISTS = ("angular_velocity_rad_s", "acceleration_m_s2")
 UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
+Check = Callable[[Any, Description], WireError | None]
+
 
 def find_mismatch(message: Message, robot: Description) -> WireError | None:
     """Check whether the list lengths, link numbers, rotations and path of a message fit a robot.
@@ -43,40 +47,54 @@ def find_mismatch(message: Message, robot: Description) -> WireError | None:
     Returns:
         The error, or None if the message fits. `WireError.reason` is a short code, such as `wrong_length`.
     """
+    check = _find_check(type(message))
+    if check is None:
+        return None
+    return check(message, robot)
+
+
+@cache
+def _find_check(message_type: type[Message]) -> Check | None:
+    """Return the check for a class of messages; None if it has none. A mounted sensor's class may be a custom one."""
+    return next((check for kind, check in CHECKS.items() if issubclass(message_type, kind)), None)
+
+
+def _check_joint_state(state: JointState, robot: Description) -> WireError | None:
     joint_count = len(robot.joints)
-    last_link = len(robot.links) - 1
-    match message:
-        case JointState():
-            if message.has_joint_count(joint_count):
-                return None
-            return _check_lengths(message, JOINT_STATE_LISTS, joint_count, "one a joint")
-        case Power():
-            return _check_lengths(message, POWER_LISTS, joint_count, "one a joint")
-        case Imu():
-            error = _check_lengths(message, IMU_LISTS, len(message.link), "one for each of Imu.link")
-            return error or _check_link("Imu.link", max(message.link, default=0), last_link)
-        case Contacts():
-            return _check_contacts(message, last_link)
-        case DepthImage():
-            error = _check_lengths(message, ("depth",), 2 * message.width * message.height, "two bytes a pixel")
-            return error or _check_mount(message, last_link)
-        case ColorImage():
-            error = _check_lengths(message, ("rgb",), 3 * message.width * message.height, "three bytes a pixel")
-            return error or _check_mount(message, last_link)
-        case MountedSample():
-            return _check_mount(message, last_link)
-        case World():
-            error = _check_contacts(message, last_link)
-            return error or _check_rotation("World.base_orientation_wxyz", message.base_orientation_wxyz)
-        case Pose():
-            return _check_rotation("Pose.orientation_wxyz", message.orientation_wxyz)
-        case Trajectory():
-            return _check_path(message)
-        case _:
-            return None
+    if state.has_joint_count(joint_count):
+        return None
+    return _check_lengths(state, JOINT_STATE_LISTS, joint_count, "one a joint")
 
 
-def _check_path(trajectory: Trajectory) -> WireError | None:
+def _check_power(power: Power, robot: Description) -> WireError | None:
+    return _check_lengths(power, POWER_LISTS, len(robot.joints), "one a joint")
+
+
+def _check_imu(imu: Imu, robot: Description) -> WireError | None:
+    error = _check_lengths(imu, IMU_LISTS, len(imu.link), "one for each of Imu.link")
+    return error or _check_link("Imu.link", max(imu.link, default=0), robot)
+
+
+def _check_depth_image(image: DepthImage, robot: Description) -> WireError | None:
+    error = _check_lengths(image, ("depth",), 2 * image.width * image.height, "two bytes a pixel")
+    return error or _check_mount(image, robot)
+
+
+def _check_color_image(image: ColorImage, robot: Description) -> WireError | None:
+    error = _check_lengths(image, ("rgb",), 3 * image.width * image.height, "three bytes a pixel")
+    return error or _check_mount(image, robot)
+
+
+def _check_world(world: World, robot: Description) -> WireError | None:
+    error = _check_contacts(world, robot)
+    return error or _check_rotation("World.base_orientation_wxyz", world.base_orientation_wxyz)
+
+
+def _check_pose(pose: Pose, _robot: Description) -> WireError | None:
+    return _check_rotation("Pose.orientation_wxyz", pose.orientation_wxyz)
+
+
+def _check_path(trajectory: Trajectory, _robot: Description) -> WireError | None:
     """Return the error of a trajectory whose points are not a usable path."""
     if _is_path(np.array(trajectory.path_w)):
         return None
@@ -94,18 +112,19 @@ def _check_lengths(message: Message, fields: Sequence[str], expected_length: int
     return None
 
 
-def _check_contacts(message: Contacts | World, last_link: int) -> WireError | None:
+def _check_contacts(message: Contacts | World, robot: Description) -> WireError | None:
     furthest = max((contact.link for contact in message.contacts), default=0)
-    return _check_link(f"{type(message).__name__}.contacts: link", furthest, last_link)
+    return _check_link(f"{type(message).__name__}.contacts: link", furthest, robot)
 
 
-def _check_mount(message: MountedSample, last_link: int) -> WireError | None:
+def _check_mount(message: MountedSample, robot: Description) -> WireError | None:
     name = type(message).__name__
-    wrong = _check_link(f"{name}.link", message.link, last_link)
+    wrong = _check_link(f"{name}.link", message.link, robot)
     return wrong or _check_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
 
 
-def _check_link(where: str, link: int, last_link: int) -> WireError | None:
+def _check_link(where: str, link: int, robot: Description) -> WireError | None:
+    last_link = len(robot.links) - 1
     if link <= last_link:
         return None
     return WireError("wrong_length", f"{where} is {link}, must be 0 (tail) to {last_link} (head)")
@@ -125,3 +144,18 @@ def _check_rotation(where: str, wxyz: Sequence[float]) -> WireError | None:
     if abs(norm - 1.0) <= UNIT_NORM_ERROR:
         return None
     return WireError("no_rotation", f"{where} is {tuple(wxyz)} of norm {norm:g}, must be a rotation, of norm 1")
+
+
+# The first class that a message belongs to has its check.
+CHECKS: dict[type[Message], Check] = {
+    JointState: _check_joint_state,
+    Power: _check_power,
+    Imu: _check_imu,
+    Contacts: _check_contacts,
+    DepthImage: _check_depth_image,
+    ColorImage: _check_color_image,
+    MountedSample: _check_mount,
+    World: _check_world,
+    Pose: _check_pose,
+    Trajectory: _check_path,
+}

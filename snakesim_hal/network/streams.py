@@ -23,6 +23,10 @@ class Arrival(msgspec.Struct, frozen=True):
     encoding: str
     monotonic_ns: int
 
+    def decode(self, decoder: Decoder[MessageT]) -> MessageT:
+        """Return the message. Raises WireError if it is another one than the decoder's, or malformed."""
+        return decoder.decode(self.payload, self.encoding)
+
 
 class Publisher(Generic[MessageT]):
     """Publishes messages of one type on one key."""
@@ -95,15 +99,14 @@ class Reader(Generic[MessageT]):
 
     def _decode(self, sample: Any) -> MessageT | None:
         try:
-            payload, encoding = self._content(sample)
-            return self._decoder.decode(payload, encoding)
+            return self._decode_sample(sample, self._decoder)
         except WireError as error:
             self._rejected[error.reason] += 1
             return None
 
-    def _content(self, sample: Any) -> tuple[bytes, str]:
-        """Return the payload and the encoding of a sample."""
-        return sample.payload.to_bytes(), str(sample.encoding)
+    def _decode_sample(self, sample: Any, decoder: Decoder[MessageT]) -> MessageT:
+        """Return the message of a sample. Raises WireError."""
+        return decoder.decode(sample.payload.to_bytes(), str(sample.encoding))
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.programs.arguments import add_host
 from snakesim_hal.programs.preflight import backend_settings, check_backend, find_backend
-from snakesim_hal.programs.service_program import ProcessOptions, open_session_when_ready, process_options
+from snakesim_hal.programs.service_program import ProcessOptions, connect_process, process_options
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.wire import keys
@@ -81,7 +81,7 @@ def _run(options: ProcessOptions, config: RunConfig, on_network: Callable[[], No
         backend = open_backend(find_backend(config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
-        network = open_session(options.link) if options.link.listen else open_session_when_ready(options.link, "host")
+        network = open_session(options.link) if options.link.listen else connect_process(options.link, "host")
         session = opened.enter_context(network)
         refuse_second_host(session, options.link)
         on_network()

@@ -181,8 +181,8 @@ def _without_pose_services(config: RunConfig, controller: type[Controller[Any]])
     They stay if the scenario requires dead reckoning itself, or has further services.
     """
     # A scenario that requires dead reckoning names it as its localization.
-    dead_reckons = config.dead_reckons(describe_run_robot(config))
-    if not dead_reckons or config.mission.localization != "pose_sensor":
+    uses_dead_reckoning = config.uses_dead_reckoning(describe_run_robot(config))
+    if not uses_dead_reckoning or config.mission.localization != "pose_sensor":
         return config
     services = config.own_services.keys()
     if GUIDANCE not in services or not services <= {*POSE_SERVICES, CONTROL}:

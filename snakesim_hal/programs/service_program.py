@@ -8,13 +8,12 @@ waits, and connects to the next host after a restart: so services and hosts star
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
 
-from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.base.process import (
     SERVICE_PRIORITY,
     accept_interrupts,
@@ -25,12 +24,12 @@ from snakesim_hal.base.process import (
 )
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.scenario import Loaded, RunConfig
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import Link, Session
+from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.programs.arguments import add_service, create_link, load_scenario
 from snakesim_hal.programs.preflight import find_service
 from snakesim_hal.service import SERVICE_START_LIMIT_S, Service, ServiceLoop
 
-CONNECT_TIMEOUT_S = 2.0  # for one attempt
 REPORT_PERIOD_S = 20.0  # between two lines that report the wait
 
 
@@ -84,7 +83,7 @@ def serve(service_type: type[Service], options: ProcessOptions) -> None:
     if service_type.urgent and config.clock_mode == "realtime":
         enter_realtime(SERVICE_PRIORITY)
         drop_priority_after(config.lease_ns * 1e-9)
-    with open_session_when_ready(options.link, name) as session:
+    with connect_process(options.link, name) as session:
         waiting = StartupWait(name, f"a HAL host of {options.link.namespace} on {options.link.endpoint}")
         with closing(ServiceLoop(service_type, config, session, waiting.keeps_waiting)) as loop:
             loop.join()
@@ -111,19 +110,17 @@ class StartupWait:
         return now_s - self._began_s < SERVICE_START_LIMIT_S
 
 
-@contextmanager
-def open_session_when_ready(link: Link, name: str) -> Iterator[Session]:
-    """Connect as soon as there is a network. Raises NotConnectedError when there is none within START_LIMIT_S."""
-    waiting = StartupWait(name, f"the network: {link.endpoint}")
-    with ExitStack() as stack:
-        while True:
-            try:
-                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_TIMEOUT_S))
-                break
-            except NotConnectedError:
-                if not waiting.keeps_waiting():
-                    raise
-        yield session
+def connect_process(link: Link, name: str) -> AbstractContextManager[Session]:
+    """Connect a process as soon as there is a network, and report the wait on the terminal.
+
+    Args:
+        link: where and how to connect.
+        name: of the process.
+
+    Raises:
+        NotConnectedError: there was no network within SERVICE_START_LIMIT_S.
+    """
+    return open_session_when_ready(link, StartupWait(name, f"the network: {link.endpoint}").keeps_waiting)
 
 
 if __name__ == "__main__":

@@ -55,6 +55,10 @@ class Decoder(Generic[MessageT]):
         if encoding != self.encoding:
             detail = f"got {encoding[:MAX_ENCODING_LENGTH]!r}, want {self.encoding!r}"
             raise WireError(_classify_foreign(encoding, self.encoding), detail)
+        return self.decode_payload(payload)
+
+    def decode_payload(self, payload: bytes) -> MessageT:
+        """Decode a payload of the right encoding. Raises WireError if it is malformed."""
         if len(payload) > self._max_bytes:
             raise WireError("malformed", f"{len(payload)} bytes, at most {self._max_bytes}")
         try:

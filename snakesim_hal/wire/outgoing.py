@@ -12,7 +12,7 @@ import msgspec
 
 from snakesim_hal.base.errors import WireError, shorten, suggest_word
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import Decoder, encode
 from snakesim_hal.wire.custom_sample import CustomMessage
 from snakesim_hal.wire.messages import VERSIONS, CustomSample, Message
 
@@ -39,7 +39,7 @@ def encode_checked(key: str, message: Message, custom: CustomMessage | None = No
     expected = _find_message_type(key, message, custom)
     payload = encode_unchecked(message)
     try:
-        _decoder(expected).decode(payload, format_encoding(expected))
+        _decoder(expected).decode_payload(payload)
     except WireError as error:
         raise WireError(error.reason, find_wrong_value(message) or error.detail) from None
     return payload

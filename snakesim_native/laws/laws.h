@@ -83,23 +83,61 @@ void rub_links(const mjModel* m, mjData* d, const Chain* chain, const RoughConta
 int update_contacts(const mjModel* m, mjData* d, const Chain* chain, RoughContact* contacts, int count,
                     mjtNum min_friction);
 
-//---------------------------------- Touches ---------------------------------------------------------------------------
+//---------------------------------- Contacts of links with obstacles --------------------------------------------------
 
 enum {
-  OBSTACLE_GROUP = 2,    // MuJoCo's geom group of obstacles
-  TOUCHES_PER_LINK = 8,  // on average; those beyond that number are left out
+  OBSTACLE_GROUP = 2,          // MuJoCo's geom group of obstacles
+  TOUCHES_PER_LINK = 8,        // on average; those beyond that number are left out
+  MEASURED_PAIRS_PER_LINK = 4  // on average, of a link and an obstacle; those beyond that number are left out
 };
 
 // A contact of a link with an obstacle in the last step.
+typedef struct {
+  int link_geom;
+  int obstacle_geom;
+  mjtNum normal[3];          // from the obstacle into the link
+  mjtNum normal_force;
+  mjtNum friction_force[3];  // on the link
+} ObstacleContact;
+
+// Return whether one of MuJoCo's contacts is between a link and an obstacle, and describe it.
+//   contacts   those with friction, after `update_contacts`
+int find_obstacle_contact(const mjModel* m, const mjData* d, const RoughContact* contacts, int count, int number,
+                          ObstacleContact* result);
+
+// The force of a contact with an obstacle, for programs that see only the state.
 typedef struct {
   mjtNum link;      // 0 at the tail
   mjtNum force[3];  // on the link
 } Touch;
 
 // Write the contacts of links with obstacles, in MuJoCo's order. Returns their number.
-//   contacts   those with friction, after `update_contacts`
 int find_touches(const mjModel* m, const mjData* d, const Chain* chain, const RoughContact* contacts, int count,
                  Touch* touches, int capacity);
+
+// The forces between one link and one obstacle. The samples of the last steps follow: one number for each step.
+typedef struct {
+  mjtNum link_geom;
+  mjtNum obstacle_geom;
+  mjtNum idle_steps;  // steps since they touched
+} MeasuredPair;
+
+// The memory of the measured force. The pairs follow.
+typedef struct {
+  mjtNum max_mean_force;  // of the pair that pushes hardest, averaged over the window, in N
+  mjtNum pair_count;
+  mjtNum newest;          // index of the newest sample of every pair
+} MeasuredForce;
+
+// Return over how many steps the measured force is averaged.
+int count_window_steps(const mjModel* m);
+
+// Return how many numbers the memory of the measured force has.
+int count_measured_numbers(const mjModel* m, int pair_capacity);
+
+// Add the forces of the last step to the measured force.
+void measure_forces(const mjModel* m, const mjData* d, const RoughContact* contacts, int count, MeasuredForce* memory,
+                    int pair_capacity);
 
 //---------------------------------- Obstacles that yield --------------------------------------------------------------
 

@@ -2,7 +2,11 @@
 //
 //   snakesim.dry_friction   flat ground and contact friction; belongs to the tail link's body
 //   snakesim.yielding       obstacles that yield; one instance belongs to the bodies of all of them
-//   snakesim.touches        no law: it writes the forces between links and obstacles into the state, for batches
+//
+// Two more are no laws. They write forces between links and obstacles into the state, and belong to no body:
+//
+//   snakesim.touches         those of the last step, for batches
+//   snakesim.measured_force  their mean over 50 ms, for contact sensors
 //
 // MuJoCo calls `compute` when it computes forces. That changes nothing that a later step depends on, so `mj_forward`
 // may be called at any time. MuJoCo calls `advance` at the end of `mj_step`, which updates what is remembered. By then
@@ -101,7 +105,7 @@ static void advance_yielding(const mjModel* m, mjData* d, int instance) {
   update_anchors(find_anchors(m, d, instance), m->plugin_statenum[instance] / ANCHOR_NUMBERS);
 }
 
-//---------------------------------- Touches ---------------------------------------------------------------------------
+//---------------------------------- Contacts of links with obstacles --------------------------------------------------
 
 enum { TOUCH_NUMBERS = sizeof(Touch) / sizeof(mjtNum) };
 
@@ -115,15 +119,21 @@ static int find_friction_instance(const mjModel* m) {
   return -1;
 }
 
-static int count_touch_capacity(const mjModel* m) {
+// Return the number of links; 0 without the plugin of dry friction.
+static int count_links(const mjModel* m) {
   int friction = find_friction_instance(m);
-  return friction < 0 ? 0 : TOUCHES_PER_LINK * find_chain(m, friction).link_count;
+  return friction < 0 ? 0 : find_chain(m, friction).link_count;
 }
 
 // The number of touches comes first, then the touches.
 static int count_touch_numbers(const mjModel* m, int instance) {
   (void)instance;
-  return 1 + TOUCH_NUMBERS * count_touch_capacity(m);
+  return 1 + TOUCH_NUMBERS * TOUCHES_PER_LINK * count_links(m);
+}
+
+static int count_measured_force_numbers(const mjModel* m, int instance) {
+  (void)instance;
+  return count_measured_numbers(m, MEASURED_PAIRS_PER_LINK * count_links(m));
 }
 
 static void compute_nothing(const mjModel* m, mjData* d, int instance, int capability) {
@@ -144,6 +154,19 @@ static void advance_touches(const mjModel* m, mjData* d, int instance) {
   mjtNum* state = d->plugin_state + m->plugin_stateadr[instance];
   int capacity = TOUCHES_PER_LINK * chain.link_count;
   state[0] = find_touches(m, d, &chain, parts.contacts, (int)parts.memory->contact_count, (Touch*)(state + 1), capacity);
+}
+
+// Is called after dry friction has advanced, too.
+static void advance_measured_force(const mjModel* m, mjData* d, int instance) {
+  int friction = find_friction_instance(m);
+  if (friction < 0) {
+    return;
+  }
+  Chain chain = find_chain(m, friction);
+  Parts parts = find_parts(m, d, friction, &chain);
+  MeasuredForce* memory = (MeasuredForce*)(d->plugin_state + m->plugin_stateadr[instance]);
+  int capacity = MEASURED_PAIRS_PER_LINK * chain.link_count;
+  measure_forces(m, d, parts.contacts, (int)parts.memory->contact_count, memory, capacity);
 }
 
 //---------------------------------- Registration ----------------------------------------------------------------------
@@ -188,9 +211,16 @@ mjPLUGIN_LIB_INIT(snakesim_laws) {
   touches.compute = compute_nothing;
   touches.advance = advance_touches;
   mjp_registerPlugin(&touches);
+
+  mjpPlugin measured_force = describe_plugin("snakesim.measured_force");
+  measured_force.nstate = count_measured_force_numbers;
+  measured_force.compute = compute_nothing;
+  measured_force.advance = advance_measured_force;
+  mjp_registerPlugin(&measured_force);
 }
 
-// Change the memory of all laws as `mj_step` does at its end, for a program that calls `mj_forward` alone.
+// Change the memory of all laws as `mj_step` does at its end, for a program that calls `mj_forward` alone. A force is
+// measured over time, so it changes in `mj_step` only.
 void snakesim_advance(const mjModel* m, mjData* d);
 
 void snakesim_advance(const mjModel* m, mjData* d) {

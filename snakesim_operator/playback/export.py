@@ -7,8 +7,7 @@ states in its own way which data is missing.
 
 import csv
 import json
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +16,16 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import PrintLine, escape_invisible
-from snakesim_hal.model.field_words import find_unit_in_name
 from snakesim_hal.model.textfiles import exported
-from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.recording_contents import CONTROLLER
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import find_recording
+from snakesim_operator.results.signals import PARQUET_UNIT, arrays, table, unit_of
 
 MISSING = b"snakesim.missing"  # metadata of a Parquet file: JSON
-OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
-UNITS = {
-    "time_s": "s",
-    "age_s": "s",
-    "angle_rad": "rad",
-    "velocity_rad_s": "rad/s",
-    "torque_nm": "N·m",
-    "mode": "1",
-    "target": "rad, rad/s or N·m, by mode",
-    "torque_limit_nm": "N·m",
-    "position_w_m": "m",
-    "orientation_wxyz": "1",
-    "contact_peak_n": "N",
-    "contact_count": "1",
-}
 
 
 def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine) -> int:
@@ -83,10 +65,11 @@ def export(runs: Sequence[Path], form: str, out: Path | None, print_text: PrintL
                 _write_csv(table(record), partial, record.missing)
             case _:
                 columns = {name: values.tolist() for name, values in table(record).items()}
+                units = {name: unit_of(name, record) for name in columns}
                 metadata = None
                 if record.missing:
                     metadata = {MISSING: json.dumps(record.missing).encode()}
-                write_parquet(columns, partial, metadata)
+                write_parquet(columns, partial, metadata, units)
     print_text(f"{len(record.time_s)} ticks: {path}")
     return exit_code(run, record.missing)
 
@@ -147,53 +130,6 @@ def _default_path(run: Path, form: str) -> Path:
     return base.with_suffix(f".{form}")
 
 
-def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
-    """Return every signal as an array, (n,) or (n, width)."""
-    signals: dict[str, NDArray[Any]] = {}
-    for column in fields(record):  # `vars` would include what the record has computed and cached
-        value = getattr(record, column.name)
-        if isinstance(value, np.ndarray):
-            signals[column.name] = value
-    return signals | record.custom
-
-
-def unit_of(name: str, record: RunRecord) -> str:
-    """Return the unit of a column, or of a whole signal.
-
-    A number that a controller defined has the unit in which its name ends.
-    """
-    signal = name.partition(".")[0]
-    if name.endswith(f".{CONTROLLER}"):
-        return find_unit_in_name(signal) or "1"
-    units: dict[str, str] = {}
-    for kind in find_custom_messages(record.description).values():
-        units |= kind.units
-    units |= UNITS  # the robot's own signals win
-    return units[signal]
-
-
-def name_parts(signal: str, joints: Sequence[str]) -> Sequence[str]:
-    """Return the names of the columns of a signal that is wider than one, such as the joints of `angle_rad`."""
-    if signal in OF_JOINTS:
-        return joints
-    if signal == "position_w_m":
-        return "xyz"
-    return "wxyz"
-
-
-def table(record: RunRecord) -> dict[str, NDArray[Any]]:
-    """Return every column as numbers, (n,)."""
-    joints = [joint.name for joint in record.description.joints]
-    columns: dict[str, NDArray[Any]] = {}
-    for name, values in arrays(record).items():
-        if values.ndim == 1:
-            columns[name] = values
-            continue
-        for i, part in enumerate(name_parts(name, joints)):
-            columns[f"{name}.{part}"] = values[:, i]
-    return columns
-
-
 def _write_npz(record: RunRecord, path: Path) -> None:
     joints = np.array([joint.name for joint in record.description.joints])
     missing = np.array(record.missing, dtype=str)
@@ -212,16 +148,27 @@ def _write_csv(columns: dict[str, NDArray[Any]], path: Path, missing: Sequence[s
             writer.writerow(["" if value != value else value for value in row])  # NaN is not equal to itself
 
 
-def write_parquet(columns: dict[str, Any], path: Path, metadata: dict[bytes, bytes] | None = None) -> None:
+def write_parquet(
+    columns: dict[str, Any],
+    path: Path,
+    metadata: dict[bytes, bytes] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> None:
     """Write columns as a Parquet file. Needs the extra `report`.
 
     Args:
         columns: Values by column.
         path: The file.
         metadata: Metadata of the schema.
+        units: Unit by column, which becomes metadata of the column; None: the columns have no units.
     """
     import pyarrow
     import pyarrow.parquet
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(metadata), path)
+    table_of_columns = pyarrow.table(columns)
+    fields = list(table_of_columns.schema)
+    if units is not None:
+        fields = [field.with_metadata({PARQUET_UNIT: units[field.name].encode()}) for field in fields]
+    schema = pyarrow.schema(fields, metadata=metadata)
+    pyarrow.parquet.write_table(table_of_columns.cast(schema), path)

@@ -11,7 +11,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import count
@@ -19,14 +19,15 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.process import on_stop_signal
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import Link, Session
 from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.programs.service_program import ProcessOptions, process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
@@ -150,8 +151,47 @@ def record_to_file(
 
     Raises:
         ConfigError: The file exists or cannot be created.
-        NotConnectedError: There is no network at the link.
+        NotConnectedError: There was no network at the link until the end. No file is created.
     """
+    with _connect(link, goes_on) as session:
+        return _record_session(session, link, path, goes_on, show, raw_only=raw_only, after_host=after_host)
+
+
+@contextlib.contextmanager
+def _connect(link: Link, goes_on: Callable[[], bool] = lambda: True) -> Iterator[Session]:
+    """Connect as soon as there is a network, unless the recording ends before."""
+    give_up_s = time.monotonic() + SERVICE_START_LIMIT_S
+    is_stopped = False
+
+    def keeps_waiting() -> bool:
+        nonlocal is_stopped
+        is_stopped = not goes_on()
+        return not is_stopped and time.monotonic() < give_up_s
+
+    with contextlib.ExitStack() as stack:
+        try:
+            session = stack.enter_context(open_session_when_ready(link, keeps_waiting))
+        except NotConnectedError as error:
+            if not is_stopped:
+                raise
+            raise NotConnectedError(
+                f"nothing listened on {link.endpoint} until the recording was ended: nothing is recorded",
+                code="network/nothing-listens",
+            ) from error
+        yield session
+
+
+def _record_session(
+    session: Session,
+    link: Link,
+    path: Path,
+    goes_on: Callable[[], bool],
+    show: Show | None = None,
+    *,
+    raw_only: bool,
+    after_host: bool,
+) -> Recorder:
+    """Record over a session that is open. The arguments are those of `record_to_file`."""
     shown_as = None
     if not raw_only:
         shown_as = link.namespace or "robot"
@@ -159,17 +199,16 @@ def record_to_file(
         recorder = Recorder(path, shown_as, show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
-    with open_session(link, connect_timeout_s=SERVICE_START_LIMIT_S) as session:
-        tap = Tap(session)
-        hosts = _watch_hosts(session)
-        session.declare_alive(RECORDER)
-        show_process(session, own_entry(RECORDER))
-        while goes_on() and not recorder.recording.failure:
-            _write_arrivals(tap, recorder)
-            time.sleep(CYCLE_S)
-        if after_host:
-            _write_last_messages(tap, recorder, hosts)
+    tap = Tap(session)
+    hosts = _watch_hosts(session)
+    session.declare_alive(RECORDER)
+    show_process(session, own_entry(RECORDER))
+    while goes_on() and not recorder.recording.failure:
         _write_arrivals(tap, recorder)
+        time.sleep(CYCLE_S)
+    if after_host:
+        _write_last_messages(tap, recorder, hosts)
+    _write_arrivals(tap, recorder)
     for key, number in sorted(tap.dropped.items()):
         print_stderr(f"{number} messages on {key} were dropped: the disk was too slow")
     failure = recorder.close(dict(tap.dropped))
@@ -237,15 +276,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _record_run(options: ProcessOptions) -> int:
-    """Record as a child process of a run, with a low priority."""
-    stop_signals: list[bool] = []
-    on_stop_signal(lambda: stop_signals.append(True))
+    """Record as a child process of a run, with a low priority.
+
+    Until it is connected, a stop signal ends the process at once: it has no file that it would have to close, and the
+    network of a run that has ended never opens.
+    """
     os.nice(NICE)
     # A batch process: its threads are woken by each message, and must not displace the robot's processes.
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     path = options.arguments.out / RECORDING
     raw_only = options.arguments.raw_only
-    recorder = record_to_file(options.link, path, lambda: not stop_signals, raw_only=raw_only, after_host=True)
+    with _connect(options.link) as session:
+        stop_signals: list[bool] = []
+        on_stop_signal(lambda: stop_signals.append(True))
+        recorder = _record_session(
+            session, options.link, path, lambda: not stop_signals, raw_only=raw_only, after_host=True
+        )
     if recorder.recording.failure:
         return EXIT_DISK_FULL
     return 0

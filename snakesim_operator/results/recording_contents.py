@@ -25,6 +25,7 @@ from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
     Configuration,
+    Contacts,
     ControlState,
     Description,
     JointState,
@@ -33,6 +34,7 @@ from snakesim_hal.wire.messages import (
     World,
 )
 from snakesim_operator.recording.message import RecordedMessage
+from snakesim_operator.results.contact_log import ContactCollector, ContactLog
 from snakesim_operator.results.missing_data import describe_undecodable
 
 if TYPE_CHECKING:
@@ -40,15 +42,15 @@ if TYPE_CHECKING:
 
 SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 """What guidance, navigation and control publish."""
-OUTPUTS = (*SERVICE_STREAMS, keys.CUSTOM_ALL)
+OUTPUTS = (*SERVICE_STREAMS, keys.CUSTOM_ALL, keys.CONTACTS)
 """What the host's black box does not have."""
 CONTROLLER = "controller"  # ends the names of columns with numbers that a controller defined
 SAME_TIME_S = 1e-9  # two times that differ by less are of one tick
 MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
-_TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
+_TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.JOINT_COMMAND)
 _JOINT_COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm")  # of the messages at keys.JOINTS
 _SETPOINT_COLUMNS = ("target", "torque_limit_nm")  # of the messages at keys.APPLIED
-ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.CUSTOM_ALL, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+ALL: tuple[str, ...] = (*OUTPUTS, *_TICKED, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
 
 
 _decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
@@ -63,6 +65,7 @@ class RunOutputs:
     trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns that sensors and controllers define
+    contact_log: ContactLog = field(default_factory=lambda: ContactCollector().make_log())
     replay_of: str = ""  # the recording whose sensors the services read; empty: a run
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
     unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
@@ -85,6 +88,10 @@ class RecordingContents:
         default_factory=lambda: {key: {} for key in _TICKED}
     )
     custom: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
+    contacts: ContactCollector = field(default_factory=ContactCollector)
+    contact_summaries: dict[int, tuple[float, int]] = field(  # tick -> strongest force in N, number of obstacles
+        default_factory=dict[int, tuple[float, int]]
+    )
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     replay_of: str = ""  # the recording whose sensors these are
@@ -137,6 +144,9 @@ class RecordingContents:
                 self.messages_by_tick[key][message.tick] = message
                 if message.arm_session:
                     self.armed_wall_ns.append(wall_ns)
+            case Contacts():
+                self.contacts.add(message)
+                self.contact_summaries[message.tick] = summarize_contacts(message)
             case _:
                 self.messages_by_tick[key][message.tick] = message
 
@@ -188,6 +198,7 @@ class RecordingContents:
             trajectories=self.streams[keys.TRAJECTORY],
             searched_nodes=self.searched_nodes,
             custom=sensor_columns | telemetry_columns,
+            contact_log=self.contacts.make_log(),
             replay_of=self.replay_of,
             missing=[*newly_undecodable, *unreached, *self.missing],
             unreached=list(unreached),
@@ -227,7 +238,7 @@ class RecordingContents:
         applied = self.messages_by_tick[keys.APPLIED]
         clocks = self.messages_by_tick[keys.CLOCK]
         poses = self.messages_by_tick[keys.POSE]
-        contacts = self.messages_by_tick[keys.CONTACTS]
+        contacts = self.contact_summaries
         rows: list[_Row] = []
         newest_pose = [np.nan] * 7
         peak_n = 0.0
@@ -236,7 +247,7 @@ class RecordingContents:
             if tick in poses:
                 newest_pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
             if tick in contacts:
-                peak_n, contact_count = summarize_contacts(contacts[tick])
+                peak_n, contact_count = contacts[tick]
             is_complete = tick in joint_states and tick in applied and tick in clocks
             if not is_complete:
                 continue

@@ -19,6 +19,7 @@ from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
+from snakesim_operator.results.contact_log import ContactCollector, ContactLog
 from snakesim_operator.results.missing_data import describe_unwritten, replace_invalid_numbers
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_reader import MessageHandler, RunReader, open_run
@@ -57,6 +58,7 @@ class RunRecord:
     # More of the recording.
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
     custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # (n,) columns of custom sensors and telemetry
+    contact_log: ContactLog = field(default_factory=lambda: ContactCollector().make_log())  # of the recording
     replay_of: str = ""  # the recording whose sensors its services read; empty: a run
 
     # How much of the run is known.
@@ -125,6 +127,7 @@ class RunRecord:
             **columns,
             searched_nodes=outputs.searched_nodes,
             custom=outputs.custom,
+            contact_log=outputs.contact_log,
             replay_of=outputs.replay_of,
             ending=reader.describe_ending(),
             missing=[*invalid_sentences, *describe_unwritten(host), *outputs.missing],

@@ -11,7 +11,8 @@ from snakesim_hal.base.arithmetic import find_differing_parts
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, Mode, Timing
 from snakesim_operator.results.metrics.advance import Advance, body_center_w, energy_j, energy_j_per_m, work_j
-from snakesim_operator.results.metrics.effort import Directions, Effort
+from snakesim_operator.results.metrics.directions import Displacement, HeadingEffort
+from snakesim_operator.results.metrics.effort import Effort
 from snakesim_operator.results.metrics.estimates import Estimates
 from snakesim_operator.results.metrics.force_tracking import force_tracking
 from snakesim_operator.results.metrics.motion import Motion, measure_motion
@@ -132,15 +133,32 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     heading_cost_of_transport: Annotated[
         float | None, _number("1", "energy of the run over weight times that advance")
     ] = None
+    displacement_m_s: Annotated[
+        float | None, _number("m/s", "`net_displacement_m` over the time of the run, whatever the body's heading")
+    ] = None
+    displacement_bearing_rad: Annotated[
+        float | None,
+        _number("rad", "net displacement's direction from the body's first heading; left is positive"),
+    ] = None
     displacement_energy_j_per_m: Annotated[
-        float | None, _number("J/m", "energy of the run over `net_displacement_m`, whatever the body's heading")
+        float | None, _number("J/m", "energy of the run over `net_displacement_m`")
     ] = None
     displacement_body_lengths_s: Annotated[
-        float | None, _number("1/s", "`net_displacement_m` in lengths of the body over the time of the run")
+        float | None, _number("1/s", "`displacement_m_s` in lengths of the body")
     ] = None
     displacement_cost_of_transport: Annotated[
         float | None, _number("1", "energy of the run over weight times `net_displacement_m`")
     ] = None
+    displacement_efficiency: Annotated[
+        float | None,
+        _number("1", "sliding friction of the weight over `net_displacement_m`, over the energy; level ground"),
+    ] = None
+    displacement_slip: Annotated[
+        float | None, _number("1", "1 less `net_displacement_m` over the mean path length of the links")
+    ] = None
+    lateral_slip: Annotated[float | None, _number("1", "share of the links' paths that is across their own axes")] = (
+        None
+    )
     body_lengths_s: Annotated[float | None, _number("1/s", "`advance_m_s` in lengths of the body")] = None
     cost_of_transport: Annotated[float | None, _number("1", "energy until then over weight times advance")] = None
     propulsive_efficiency: Annotated[
@@ -247,7 +265,8 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         **_load_numbers(record, has_power=has_power),
         **_advance_numbers(record, advance, has_power=has_power),
         **vars(Effort.from_run(record, advance, has_power=has_power)),
-        **vars(Directions.from_run(record, advance, net_m, known_s, has_power=has_power)),
+        **vars(HeadingEffort.from_run(record, advance, known_s, has_power=has_power)),
+        **vars(Displacement.from_run(record, advance, known_s, has_power=has_power)),
         # The host and its processes.
         state_to_command_us=host.state_to_command_us,
         tick_times=host.tick_times,

@@ -4,6 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.base.process import tune_garbage_collector
 from snakesim_hal.base.terminal import tolerate_failed_output
 from snakesim_hal.programs.arguments import (
     add_host,
@@ -100,6 +101,8 @@ def _run_in_process(arguments: argparse.Namespace, pulse: "Pulse | None") -> int
 
     from snakesim_operator.run.in_process import run_in_process
 
+    if arguments.owns_process:
+        tune_garbage_collector()  # what has been imported by now is never garbage
     with tolerate_failed_output():
         return run_in_process(
             config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only, pulse=pulse

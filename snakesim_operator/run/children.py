@@ -46,19 +46,23 @@ class ProcessOutput:
         os.close(self._pipe)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Child:
     """One process, and its output."""
 
     name: str
     process: subprocess.Popen[bytes]
     output: ProcessOutput
+    end_requested: bool = False  # by this process, while the child ran
+    was_killed: bool = False  # by this process, because it did not end within STOP_LIMIT_S
 
     def describe_end(self) -> str | None:
         """Return the exit of the process as text, with its last error message; None while it runs."""
         code = self.process.poll()
         if code is None:
             return None
+        if self.was_killed:
+            return f"{self.name} was killed: it had not ended {STOP_LIMIT_S:g} s after the request to end"
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}"
         text = f"{self.name} ended with exit code {code}"
@@ -113,8 +117,12 @@ def start_child(
 
 
 def request_end(child: Child) -> None:
-    """Send SIGTERM to a child that runs, and SIGCONT, because a frozen child would not receive it otherwise."""
+    """Send SIGTERM to a child that runs, and SIGCONT, because a frozen child would not receive it otherwise.
+
+    A child that still starts has no handler, and ends at once. It has nothing that could be lost.
+    """
     if child.process.poll() is None:
+        child.end_requested = True
         child.process.send_signal(signal.SIGTERM)
         child.process.send_signal(signal.SIGCONT)
 
@@ -128,6 +136,7 @@ def stop_all(children: Sequence[Child]) -> None:
         try:
             child.process.wait(max(deadline - time.monotonic(), 0.05))
         except subprocess.TimeoutExpired:
+            child.was_killed = True
             child.process.kill()
             with contextlib.suppress(subprocess.TimeoutExpired):  # a disk that hangs may block even a killed process
                 child.process.wait(STOP_LIMIT_S)

@@ -49,3 +49,6 @@ def console_beside(common: Sequence[str], link: Link, files: RunFiles, report: C
             yield
         finally:
             children.stop_all([pages, front])
+            for child in (pages, front):
+                if child.was_killed:
+                    report(f"warning: {child.describe_end()}")

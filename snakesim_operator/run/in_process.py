@@ -153,7 +153,7 @@ def simulate(
         if files.folder is None:
             raise ConfigError(f"{out} cannot be written to; choose another folder", code="file/not-writable")
         opened.callback(files.close)
-        recorded_keys = SERVICE_STREAMS if out is None else _all_keys()
+        recorded_keys = (*SERVICE_STREAMS, keys.CONTACTS) if out is None else _all_keys()
         run, outcome, gave_up = _run_to_end(
             config,
             files,

@@ -5,14 +5,13 @@ import socket
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.endpoint import DEFAULT_PORT, check_loopback
+from snakesim_hal.network.free_ports import LOOPBACK, find_free_port, is_tcp_port_free
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.stop_port import open_stop_port, stop_address
 from snakesim_hal.wire import keys
 from snakesim_operator.base.targets import CONNECT_S, robots_on
 
-LOOPBACK = "127.0.0.1"
-ANY_PORT = 0  # the kernel chooses one
-MAX_ATTEMPTS = 10  # with ports that the kernel chooses
+MAX_ATTEMPTS = 10  # with ports that were free a moment ago
 
 
 def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tuple[Link, socket.socket]:
@@ -40,14 +39,14 @@ def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tup
     if endpoint is not None:
         host, port = stop_address(endpoint, listens=True)
         return Link(endpoint, namespace), open_stop_port(host, port)
-    for requested_port in (DEFAULT_PORT, *[ANY_PORT] * MAX_ATTEMPTS):
+    for attempt in range(1 + MAX_ATTEMPTS):
+        port = DEFAULT_PORT if attempt == 0 else find_free_port()
         try:
-            stop_port = open_stop_port(LOOPBACK, requested_port)
+            stop_port = open_stop_port(LOOPBACK, port)
         except NotConnectedError:
             continue
-        bound_port: int = stop_port.getsockname()[1]
-        if _is_tcp_port_free(bound_port):
-            return Link(f"tcp/{LOOPBACK}:{bound_port}", namespace), stop_port
+        if is_tcp_port_free(port):
+            return Link(f"tcp/{LOOPBACK}:{port}", namespace), stop_port
         stop_port.close()
     raise NotConnectedError("no free port on the loopback interface", code="network/port-in-use")
 
@@ -79,14 +78,3 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
                 f"--router {endpoint} with another --namespace",
                 code="robot/already-running",
             )
-
-
-def _is_tcp_port_free(port: int) -> bool:
-    """Return whether Zenoh can listen at this port of the loopback interface."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError:
-            return False
-    return True

@@ -5,6 +5,7 @@ Nothing here arms the robot: a restarted host boots disarmed, and a person arms 
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import time
@@ -267,8 +268,18 @@ class Supervisor:
         children.stop_all(running)
         for part in self._parts.values():
             if not part.vital and part.child.process.returncode:
-                self._continue_without(part, part.child.describe_end() or "")
+                self._note_loss(part)
+            elif part.child.was_killed:
+                self._print_text(f"warning: {part.child.describe_end()}")
         self._print_last_output()
+
+    def _note_loss(self, part: Part) -> None:
+        """Note what is missing from the record because a part that the run does not need did not end in order."""
+        if _was_starting(part.child):
+            self.lost[part.name] = f"{part.name} had not started when the run ended"
+            self._print_text(f"warning: {self.lost[part.name]}: there is nothing of it")
+        else:
+            self._continue_without(part, part.child.describe_end() or "")
 
     def _end_host(self) -> None:
         """End the host in order, and note how it ended if it wrote no record."""
@@ -279,8 +290,11 @@ class Supervisor:
         with contextlib.suppress(subprocess.TimeoutExpired):
             host.child.process.wait(children.STOP_LIMIT_S)
         how = host.child.describe_end()
-        if how is not None and host.child.process.returncode not in REGULAR_EXIT_CODES:
-            self._ending.add_cause(how)
+        if how is None or host.child.process.returncode in REGULAR_EXIT_CODES:
+            return
+        if _was_starting(host.child):
+            how = f"{HOST} had not started when the run ended"
+        self._ending.add_cause(how)
 
     def _note_early_ends(self) -> None:
         """Note the vital parts that ended before they were stopped: any fault that the host noted is a consequence."""
@@ -299,3 +313,8 @@ class Supervisor:
             self._print_text(f"--- output of {part.name}:")
             for line in lines:
                 self._print_text(line)
+
+
+def _was_starting(child: Child) -> bool:
+    """Return whether the request to end reached a host or recorder before it had a handler for that signal."""
+    return child.end_requested and child.process.returncode == -signal.SIGTERM

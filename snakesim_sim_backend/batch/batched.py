@@ -66,7 +66,13 @@ class BatchedSimulations(Simulations):
         return True
 
     def _make_batch(self, placed: PlacedRobot) -> None:
-        """Make the batch, with the simulation of this robot in every row."""
+        """Allocate the batch for all robots, with the simulation of the first robot in every row.
+
+        Other robots with equal joints and sensors replace their rows later. Attributes are views of the batch's arrays.
+
+        Args:
+            placed: the first robot, in its scene at the start of an episode.
+        """
         sim = placed.sim
         model = sim.model
         joints = self._joints
@@ -128,6 +134,15 @@ class BatchedSimulations(Simulations):
         return self._batch
 
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+        """Step the physics of some robots through one control period, and restore those that diverge.
+
+        Args:
+            robots: rows of the robots.
+            ticks: for every row, number of the control cycle that ends with this step, for messages.
+
+        Returns:
+            Why a simulation has diverged, by its row. Its state is the last good one.
+        """
         batch = self._require_batch()
         diverged: dict[int, str] = {}
         ids = None if len(robots) == self._count else np.array(robots)
@@ -163,7 +178,14 @@ class BatchedSimulations(Simulations):
         )
 
     def _explain_divergence(self, robot: int, tick: int) -> str:
-        """Return why a simulation has diverged, and restore its last good state."""
+        """Return why a simulation has diverged, and restore its last good state.
+
+        The step is repeated from the last good state in a simulation of its own, as for a single robot.
+
+        Args:
+            robot: row of the robot.
+            tick: number of the control cycle, for the message.
+        """
         placed = self._placed[robot]
         assert placed is not None
         batch = self._require_batch()

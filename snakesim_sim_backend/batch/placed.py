@@ -52,7 +52,10 @@ def find_touches(model: mujoco.MjModel) -> slice:
 
 
 def place(config: RunConfig) -> PlacedRobot:
-    """Build the scene, place the robot and let it come to rest, as `SimBackend` does.
+    """Build the scene of a run, place the robot at its start pose, and let it come to rest, as `SimBackend` does.
+
+    Args:
+        config: configuration of the run, with the settings of the simulator.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene.
@@ -69,7 +72,7 @@ def place(config: RunConfig) -> PlacedRobot:
     # MuJoCo's own sensors are the IMUs, which no environment observes.
     sim.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     touch_memory = data.plugin_state[find_touches(sim.model)] if sim.laws == "c" else None
-    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics), touch_memory)
+    return PlacedRobot(config, sim, data, physics, motors, TouchReader(sim, data, physics.contacts), touch_memory)
 
 
 def read_rotations(robot: PlacedRobot) -> np.ndarray:

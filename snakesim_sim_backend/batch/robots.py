@@ -37,10 +37,10 @@ class SimulatedRobots:
     """
 
     def __init__(self, robots: int, config: RunConfig, *, threads: int) -> None:
-        """Make room for robots.
+        """Allocate the simulations, motors and sensors of many robots; each is placed in its scene later.
 
         Args:
-            robots: their number.
+            robots: number of robots.
             config: configuration of one of them; those of the others agree with it in joints and sensors.
             threads: number of threads that step the simulations.
         """
@@ -69,6 +69,10 @@ class SimulatedRobots:
 
     def place(self, robot: int, config: RunConfig) -> bool:
         """Put a robot at the start of an episode in a row, and read its sensors at tick 0.
+
+        Args:
+            robot: row of the robot, whose former simulation is replaced.
+            config: configuration of the episode.
 
         Returns:
             False if its simulation does not fit to the others.
@@ -102,9 +106,9 @@ class SimulatedRobots:
 
         Args:
             mode: mode of all joints.
-            target: (robots, joints), in rad, rad/s or N·m.
-            torque_limit_nm: (robots, joints).
-            robots: which robots get them.
+            target: (robots, joints) targets in rad, rad/s or N·m.
+            torque_limit_nm: (robots, joints) torque limits.
+            robots: (robots,) which robots get new targets.
         """
         inputs = self._simulations.motor_inputs[:, INPUT_OF_MODE[mode] :: INPUTS]
         if robots is self.all_robots:
@@ -129,10 +133,10 @@ class SimulatedRobots:
         self._changing.add(robot)
 
     def advance(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
-        """Step the physics of robots through one control period.
+        """Step the physics of some robots through one control period.
 
         Args:
-            robots: their rows.
+            robots: rows of these robots.
             ticks: for every row, number of the control cycle that ends with this step, for messages.
 
         Returns:
@@ -160,12 +164,12 @@ class SimulatedRobots:
         return self._heat.remaining_fractions(self.sensors.windings.values)
 
     def make_joint_state(self, robot: int, tick: int, joints_of_robot: Floats) -> JointState:
-        """Return joint states as a message.
+        """Return the joint states of one robot as the message that a backend would send.
 
         Args:
             robot: row of the robot.
             tick: number of the control cycle in which they were delivered.
-            joints_of_robot: (3 * joints,), angles, velocities and torques.
+            joints_of_robot: (3 * joints,) angles in rad, velocities in rad/s and torques in N·m.
         """
         joints = self._joints
         numbers = joints_of_robot.tolist()
@@ -180,9 +184,13 @@ class SimulatedRobots:
         )
 
     def make_power(self, robot: int, tick: int) -> Power | None:
-        """Return the newest power sample of one robot as a message, as far as a limiter reads it; None: there is none.
+        """Return the newest power sample of one robot as a message; None if there is none yet.
 
-        Currents and the temperatures of the boards are left out: no limiter reads them.
+        It holds what a limiter reads. Currents and the temperatures of the boards are left out.
+
+        Args:
+            robot: row of the robot.
+            tick: number of the control cycle in which the sample was delivered.
         """
         windings = self.sensors.windings
         if windings is None or not windings.is_known[robot]:

@@ -73,12 +73,12 @@ class DelayedValues:
             self._waiting[age] = (values, others_due)
 
     def add(self, values: Floats, due: Mask, *, starts: bool = False) -> None:
-        """Take in the samples of a tick, and deliver those whose delay is over.
+        """Store the samples of a tick, and deliver those whose delay is over.
 
         Args:
-            values: (robots, n), which must not change afterwards.
-            due: which of them are samples.
-            starts: whether these are samples of robots that have just been reset, while the others go on.
+            values: (robots, n) values, which must not change afterwards.
+            due: (robots,) which robots have a sample in this tick.
+            starts: whether these are samples of robots that have just been reset, while the others continue.
         """
         if self._delay_ticks:
             if starts and self._waiting:

@@ -121,7 +121,12 @@ class SensorArrays:
             self.windings = DelayedValues(all_robots, joints, sensors.power.delay_s, config.period_ns)
 
     def restart(self, robot: int, config: RunConfig) -> None:
-        """Forget all samples of a robot, and use the noise of its new configuration."""
+        """Remove all samples of a robot that begins a new episode, and use the noise of its new configuration.
+
+        Args:
+            robot: row of the robot.
+            config: configuration of the new episode.
+        """
         sensors = config.robot.sensors
         joints = self._joint_count
         sigma = [sensors.joints.angle_noise_rad, sensors.joints.velocity_noise_rad_s, sensors.joints.torque_noise_nm]
@@ -149,12 +154,14 @@ class SensorArrays:
     ) -> None:
         """Read the sensors of the active robots at their present ticks, in the order of `Sensors.published`.
 
+        The order decides which random numbers each sensor uses, so that a robot has the same noise as in a single run.
+
         Args:
-            ticks: (robots,), the present tick of each robot.
-            active: which robots are read; the others keep their values.
+            ticks: (robots,) the present tick of each robot.
+            active: (robots,) which robots are read; the others keep their values.
             simulations: the states of all robots.
-            winding_c: (robots, joints), temperatures of the windings.
-            starts: whether the active robots have just been reset, while the others go on.
+            winding_c: (robots, joints) temperatures of the windings.
+            starts: whether the active robots have just been reset, while the others continue.
         """
         if self._contact_due is not None:
             self._sample_contacts(self._contact_due.find_due(ticks, active), simulations, starts)
@@ -214,6 +221,15 @@ class SensorArrays:
         self._raw_poses.add(raw, due, starts=starts)
 
     def _sample_joints(self, active: Mask, simulations: Simulations, starts: bool) -> None:
+        """Read angles, velocities and torques of the active robots with noise, and deliver the reading that is due.
+
+        Readings are delivered after the delay of the joint sensors, which is the length of the queue `_waiting_joints`.
+
+        Args:
+            active: (robots,) which robots are read.
+            simulations: the states of all robots.
+            starts: whether the active robots have just been reset; then the present reading fills the queue.
+        """
         joints = self._joint_count
         values = np.concatenate((simulations.angle_rad, simulations.velocity_rad_s, simulations.torque_nm), axis=1)
         if self._joints_have_noise:
@@ -316,15 +332,15 @@ def _replace_contacts(before: ContactSample, sample: ContactSample, due: Mask) -
         return NO_CONTACTS
     if due.all():
         return sample
-    kept = ~due[before.touches.robot]
-    new = due[sample.touches.robot]
+    is_retained = ~due[before.touches.robot]
+    is_new = due[sample.touches.robot]
     touches = TouchArrays(
-        np.concatenate((before.touches.robot[kept], sample.touches.robot[new])),
-        np.concatenate((before.touches.link[kept], sample.touches.link[new])),
-        np.concatenate((before.touches.force_w[kept], sample.touches.force_w[new])),
-        np.concatenate((before.touches.rotation[kept], sample.touches.rotation[new])),
+        np.concatenate((before.touches.robot[is_retained], sample.touches.robot[is_new])),
+        np.concatenate((before.touches.link[is_retained], sample.touches.link[is_new])),
+        np.concatenate((before.touches.force_w[is_retained], sample.touches.force_w[is_new])),
+        np.concatenate((before.touches.rotation[is_retained], sample.touches.rotation[is_new])),
     )
-    return ContactSample(touches, np.concatenate((before.noise[kept], sample.noise[new])))
+    return ContactSample(touches, np.concatenate((before.noise[is_retained], sample.noise[is_new])))
 
 
 # --- the arithmetic of `sensors.frames` and `sensors.pose` on arrays -------------------------------------------------

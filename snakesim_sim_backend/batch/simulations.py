@@ -139,6 +139,15 @@ class LoopedSimulations(Simulations):
         return True
 
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+        """Step the physics of some robots through one control period, one after the other.
+
+        Args:
+            robots: rows of the robots.
+            ticks: for every row, number of the control cycle that ends with this step, for messages.
+
+        Returns:
+            Why a simulation has diverged, by its row.
+        """
         diverged: dict[int, str] = {}
         is_view = len(self._placed) == 1
         for robot in robots:

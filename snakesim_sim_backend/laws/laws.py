@@ -1,7 +1,7 @@
 """What a version of the laws does, and what can be read of it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -41,6 +41,15 @@ class ContactForces(Protocol):
         ...
 
 
+class MeasuredContactForce(Protocol):
+    """The contact force as a robot would measure it, see `snakesim_hal.model.measured_force`."""
+
+    @property
+    def max_n(self) -> float:
+        """Return the mean force between the link and the obstacle that push each other hardest; 0 without contacts."""
+        ...
+
+
 class Laws(ABC):
     """Computes ground, friction and yielding obstacles of one simulation.
 
@@ -68,10 +77,13 @@ class Laws(ABC):
         """Compute all quantities of the present state, and remember the contacts."""
 
     @abstractmethod
-    def step(self, count: int, after_step: Callable[[], None] | None) -> None:
+    def measure_force(self) -> MeasuredContactForce:
+        """Begin to measure the force between links and obstacles in every step. Earlier steps are forgotten."""
+
+    @abstractmethod
+    def step(self, count: int) -> None:
         """Make physics steps.
 
         Args:
             count: how many.
-            after_step: called after each of them; None: nothing is to be called.
         """

@@ -7,18 +7,17 @@ has no memory of its own. A row of the batch's state then has the same numbers a
 To begin a simulation of a batch as `begin` and `forward` do here, do that once with one `MjData`, and copy its state
 (`mjSTATE_INTEGRATION`) into the row. After a reset of a row to zeros, the feet stick where they are in the next step.
 
-Source of the layout: the structs `Memory`, `Foot` and `RoughContact` in `snakesim_native/laws`.
+Source of the layout: the structs `Memory`, `Foot`, `RoughContact` and `MeasuredForce` in `snakesim_native/laws`.
 """
 
 import ctypes
-from collections.abc import Callable
 
 import mujoco
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.laws.laws import Laws, find_normal_forces_n
-from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, load_library
+from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, MEASURED_FORCE_INSTANCE, load_library
 from snakesim_sim_backend.model.build import SimModel
 
 # Numbers in the memory of the plugin instance.
@@ -34,6 +33,8 @@ CONTACT_FORCE = slice(17, 20)
 CONTACT_NUMBER = 20
 CONTACT_IS_NEW = 21
 CONTACT_NUMBERS = 22
+# Numbers in the memory of the measured force.
+MAX_MEAN_FORCE = 0
 
 
 class NativeContacts:
@@ -77,6 +78,23 @@ class NativeContacts:
         }
 
 
+class NativeMeasuredForce:
+    """The force that the C version has measured."""
+
+    def __init__(self, memory: Floats) -> None:
+        """Begin to measure.
+
+        Args:
+            memory: the memory of the plugin instance.
+        """
+        self._memory = memory
+        self._memory[:] = 0.0
+
+    @property
+    def max_n(self) -> float:
+        return float(self._memory[MAX_MEAN_FORCE])
+
+
 class NativeLaws(Laws):
     """Lets MuJoCo's engine compute the forces."""
 
@@ -85,9 +103,7 @@ class NativeLaws(Laws):
         model = sim.model
         self._model = model
         self._data = data
-        instance = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_PLUGIN, FRICTION_INSTANCE)
-        start = model.plugin_stateadr[instance]
-        self._memory = data.plugin_state[start : start + model.plugin_statenum[instance]]
+        self._memory = self._view_memory(FRICTION_INSTANCE)
         feet = len(sim.link_geoms) + 1
         first_contact = MEMORY_NUMBERS + FOOT_NUMBERS * feet
         self._feet = self._memory[MEMORY_NUMBERS:first_contact].reshape(feet, FOOT_NUMBERS)
@@ -116,10 +132,20 @@ class NativeLaws(Laws):
         mujoco.mj_forward(self._model, self._data)
         self._advance(self._model._address, self._data._address)
 
-    def step(self, count: int, after_step: Callable[[], None] | None) -> None:
-        if after_step is None:
-            mujoco.mj_step(self._model, self._data, count)
-            return
-        for _ in range(count):
-            mujoco.mj_step(self._model, self._data)
-            after_step()
+    def measure_force(self) -> NativeMeasuredForce:
+        return NativeMeasuredForce(self._view_memory(MEASURED_FORCE_INSTANCE))
+
+    def step(self, count: int) -> None:
+        mujoco.mj_step(self._model, self._data, count)
+
+    def _view_memory(self, instance_name: str) -> Floats:
+        """Return a view of the memory of a plugin instance.
+
+        Raises:
+            ValueError: the model was built without the instance.
+        """
+        instance = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_PLUGIN, instance_name)
+        if instance < 0:
+            raise ValueError(f"the model was built without the plugin instance `{instance_name}`")
+        start = self._model.plugin_stateadr[instance]
+        return self._data.plugin_state[start : start + self._model.plugin_statenum[instance]]

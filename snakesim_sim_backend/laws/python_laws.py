@@ -5,12 +5,14 @@ from collections.abc import Callable
 import mujoco
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_sim_backend.laws.chain import Chain
 from snakesim_sim_backend.laws.contact_friction import ContactFriction, count_numbers
 from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT, FlatGround
 from snakesim_sim_backend.laws.laws import Laws
 from snakesim_sim_backend.laws.yielding import Yielding
 from snakesim_sim_backend.model.build import SimModel
+from snakesim_sim_backend.state.contacts import TouchReader
 
 AFTER_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -40,6 +42,9 @@ class PythonLaws(Laws):
             self._force_laws.append(Yielding(model, data, len(sim.yielding)).apply)
         self._force_laws.append(chain.apply)  # last: it adds what the others have collected
 
+        self._touches = TouchReader(sim, data, self.contacts)
+        self._measured_force: MeasuredForce | None = None  # None: nothing measures it
+
     @property
     def foot_forces_n(self) -> Floats | None:
         if self._ground is None:
@@ -64,12 +69,16 @@ class PythonLaws(Laws):
         mujoco.mj_forwardSkip(self._model, self._data, AFTER_VELOCITIES, 0)
         self._friction.update_contacts()
 
-    def step(self, count: int, after_step: Callable[[], None] | None) -> None:
+    def measure_force(self) -> MeasuredForce:
+        self._measured_force = MeasuredForce(self._model.opt.timestep)
+        return self._measured_force
+
+    def step(self, count: int) -> None:
         for _ in range(count):
             mujoco.mj_step1(self._model, self._data)
             for apply in self._force_laws:
                 apply()
             mujoco.mj_step2(self._model, self._data)
             self._friction.update_contacts()
-            if after_step is not None:
-                after_step()
+            if self._measured_force is not None:
+                self._measured_force.add(self._touches.sum_forces_n())

@@ -20,9 +20,11 @@ LawsVersion = Literal["c", "python"]
 FRICTION_PLUGIN = "snakesim.dry_friction"
 YIELDING_PLUGIN = "snakesim.yielding"
 TOUCHES_PLUGIN = "snakesim.touches"
+MEASURED_FORCE_PLUGIN = "snakesim.measured_force"
 FRICTION_INSTANCE = "dry_friction"  # names in MuJoCo's model
 YIELDING_INSTANCE = "yielding"
 TOUCHES_INSTANCE = "touches"
+MEASURED_FORCE_INSTANCE = "measured_force"
 USER_NUMBERS_OF_GEOM = 1
 
 
@@ -46,7 +48,13 @@ def load_library() -> ctypes.CDLL:
 
 
 def add_laws(
-    spec: mujoco.MjSpec, laws: LawsVersion, links: int, yielding_bodies: list[str], *, keeps_touches: bool
+    spec: mujoco.MjSpec,
+    laws: LawsVersion,
+    links: int,
+    yielding_bodies: list[str],
+    *,
+    keeps_touches: bool,
+    measures_force: bool,
 ) -> None:
     """Add the laws' parameters and memory to a model that is otherwise complete.
 
@@ -56,6 +64,7 @@ def add_laws(
         links: number of links.
         yielding_bodies: names of the bodies of obstacles that yield.
         keeps_touches: whether the C version writes the forces between links and obstacles into the state.
+        measures_force: whether `Laws.measure_force` is possible.
     """
     spec.nuser_geom = USER_NUMBERS_OF_GEOM
     spec.nuser_body = SPRING_NUMBERS
@@ -69,6 +78,8 @@ def add_laws(
                 _add_plugin(spec, YIELDING_PLUGIN, YIELDING_INSTANCE, yielding_bodies)
             if keeps_touches:
                 _add_plugin(spec, TOUCHES_PLUGIN, TOUCHES_INSTANCE, [])
+            if measures_force:
+                _add_plugin(spec, MEASURED_FORCE_PLUGIN, MEASURED_FORCE_INSTANCE, [])
 
 
 def _add_plugin(spec: mujoco.MjSpec, plugin: str, instance: str, bodies: list[str]) -> None:

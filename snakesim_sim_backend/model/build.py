@@ -81,8 +81,9 @@ def build(
     motors: bool = True,
     laws: LawsVersion | None = None,
     keeps_touches: bool = False,
+    measures_force: bool = False,
 ) -> SimModel:
-    """Compile the model of a run.
+    """Compile the MuJoCo model of a run: robot, obstacles, ground, motors, sensors and friction.
 
     Args:
         config: the run, with its robot and its scene.
@@ -92,12 +93,18 @@ def build(
         laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
         keeps_touches: whether the C version writes the forces between links and obstacles into MuJoCo's state, for
             programs that see only the state.
+        measures_force: whether the simulation has a contact sensor, which `Physics.measure_force` is for.
+
+    Returns:
+        The model, with the indices by which other modules find links, feet and obstacles in it.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
     """
     laws = laws or choose_laws()
-    blueprint = make_blueprint(config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches)
+    blueprint = make_blueprint(
+        config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches, measures_force=measures_force
+    )
     model = _compile(blueprint.spec, config.robot.name)
     links = config.robot.chain.modules + 1
     first_link_body = model.body("link_0").id
@@ -118,9 +125,25 @@ def build(
 
 
 def make_blueprint(
-    config: RunConfig, settings: SimSettings, *, motors: bool, laws: LawsVersion, keeps_touches: bool = False
+    config: RunConfig,
+    settings: SimSettings,
+    *,
+    motors: bool,
+    laws: LawsVersion,
+    keeps_touches: bool = False,
+    measures_force: bool = False,
 ) -> Blueprint:
-    """Return the model of a run before it is compiled.
+    """Assemble the model of a run before it is compiled: bodies, geoms, motors, and the friction of each geom.
+
+    Args:
+        config: the run, with its robot and its scene.
+        settings: parameters of the physics.
+        motors: whether the joints have motors.
+        laws: which version of the laws computes ground and friction.
+        keeps_touches: whether the laws write the forces between links and obstacles into MuJoCo's state.
+
+    Returns:
+        The specification, with the number of physics steps in a control period and the obstacles that yield.
 
     Raises:
         ConfigError: the settings do not match the robot or the scene.
@@ -151,7 +174,8 @@ def make_blueprint(
     friction_of |= dict.fromkeys([f"link_{i}" for i in range(links)], settings.self_friction)
     for geom in spec.geoms:
         geom.friction[0] = friction_of.get(geom.name, 0.0)
-    add_laws(spec, laws, links, [geom_name(item) for item in yielding], keeps_touches=keeps_touches)
+    yielding_bodies = [geom_name(item) for item in yielding]
+    add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)
     return Blueprint(spec, steps_per_tick, yielding, laws)
 
 
@@ -185,7 +209,16 @@ def _add_obstacles(
     collide: bool,
     step_s: float,
 ) -> None:
-    """Add obstacles to the model. collide: obstacles also collide with each other, because some of them move."""
+    """Add obstacles to the model; on hills they reach further down, so that no gap is left below them.
+
+    Args:
+        spec: the model, which is changed.
+        placed: obstacles with their places.
+        config: the run, for the robot's radius and the heights of the ground.
+        contact: parameters of MuJoCo's contacts.
+        collide: whether obstacles also collide with each other, because some of them move.
+        step_s: duration of a physics step.
+    """
     hills_m = 0.0
     if config.scene.ground.heightfield is not None:
         hills_m = config.scene.ground.heightfield.height_m
@@ -230,10 +263,16 @@ def _obstacle_name(name: str) -> str | None:
 
 
 def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, contact: ContactParameters) -> None:
-    """Add the links, joints and feet.
+    """Add the links, joints and feet of the robot to the model.
 
     Links are capsules. Flat ground carries them at their feet, which are spheres at joints and ends: at a joint, two
     capsules would make two contacts.
+
+    Args:
+        spec: the model, which is changed.
+        config: the run, with the robot and the ground.
+        settings: parameters of the physics, such as a factor on all masses.
+        contact: parameters of MuJoCo's contacts.
     """
     robot = config.robot
     is_flat = config.scene.ground.heightfield is None
@@ -294,14 +333,16 @@ def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float, scale: float
 
 
 def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, stands: bool) -> None:
-    """Add a massless sphere of the body's radius, at a joint or an end. MuJoCo finds no contacts of it.
+    """Add a massless sphere of the body's radius at a joint or an end, on which flat ground carries the body.
+
+    MuJoCo itself finds no contacts of it; the law of flat ground computes them.
 
     Args:
         body: the link's body.
-        name: the geom's name.
+        name: name of the geom.
         along_m: distance from the link's rear joint.
         radius_m: radius of the body.
-        stands: flat ground carries the foot.
+        stands: whether flat ground carries the foot.
     """
     body.add_geom(
         name=name,

@@ -15,7 +15,12 @@ DEPTH_M = 0.5  # of the height field below its lowest point
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, contact: ContactParameters) -> list[str]:
-    """Add the ground to a model.
+    """Add the ground to a model: a plane, and hills above it if the scene has a heightfield.
+
+    Args:
+        spec: the model, which is changed.
+        ground: the ground of the scene.
+        contact: parameters of MuJoCo's contacts with hills.
 
     Returns:
         The names of the geoms of which MuJoCo finds contacts; none for flat ground, see flat_ground.py.
@@ -46,6 +51,14 @@ def _add_plane(spec: mujoco.MjSpec, height_m: float) -> mujoco.MjsGeom:
 
 
 def _add_hills(spec: mujoco.MjSpec, field: Heightfield, lowest_m: float, contact: ContactParameters) -> None:
+    """Add a heightfield with the heights of the scene's hills.
+
+    Args:
+        spec: the model, which is changed.
+        field: size, height, wavelength and seed of the hills.
+        lowest_m: height of the lowest point of the hills.
+        contact: parameters of MuJoCo's contacts.
+    """
     heights_m = make_heights(field)
     rows = len(heights_m)
     spec.add_hfield(

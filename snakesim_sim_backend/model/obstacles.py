@@ -96,7 +96,13 @@ def _add_yielding_body(spec: mujoco.MjSpec, name: str, foot_w: Floats) -> mujoco
 
 
 def _obstacle_shape(placed: Placed, body_radius_m: float, hills_m: float) -> Shape:
-    """Return the geom of an obstacle. One that stands on the ground reaches below it, so that no gap is left."""
+    """Return the geom of an obstacle. One that is fixed to the ground reaches below it, so that no gap is left.
+
+    Args:
+        placed: the obstacle with its place, and how far it leans.
+        body_radius_m: radius of the robot's body.
+        hills_m: difference in height between the highest and the lowest ground.
+    """
     obstacle = placed.obstacle
     x, y, z = obstacle.position_w
     if obstacle.shape == "sphere":

@@ -23,7 +23,15 @@ LIMIT_FORCE = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 
 
 def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_time_s: float) -> None:
-    """Add a slack tether to a model whose motors are complete.
+    """Add a slack tether between the world and a link to a model whose motors are complete.
+
+    It is a tendon with a maximum length. If it is reeled in, a winch shortens it with a limited force.
+
+    Args:
+        spec: the model, which is changed.
+        tether: the link, the point on it, the direction, and the speed of the winch.
+        robot: the robot, for the number of its links.
+        contact_time_s: time constant of the limit of the tether's length.
 
     Raises:
         ConfigError: the robot has no such link, or the tether has no direction.

@@ -5,7 +5,6 @@ import math
 import mujoco
 
 from snakesim_hal.model.kinematics import tangents
-from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
@@ -26,7 +25,7 @@ class ContactReader:
         self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
     ) -> None:
         first = sim.first_link_body
-        self._touches = TouchReader(sim, data, physics)
+        self._touches = TouchReader(sim, data, physics.contacts)
         self._origins = data.xpos[first:]  # of links, and of the bodies behind them
         self._rotations = data.xmat[first:]
         self._threshold_n = sensor.threshold_n
@@ -35,8 +34,7 @@ class ContactReader:
         self._noise: Normal | None = None
         if self._sigma_m or self._sigma_n:
             self._noise = noise
-        self._measured_force = MeasuredForce(sim.model.opt.timestep)
-        physics.after_step = self._measure_force
+        self._measured_force = physics.measure_force()
 
     def read(self, tick: int, timestamp_ns: int) -> Contacts:
         """Return all contacts above the threshold, and the largest force since the last reading."""
@@ -54,10 +52,6 @@ class ContactReader:
             contacts=contacts[:MAX_CONTACTS],
             measured_force_n=max_force_n,
         )
-
-    def _measure_force(self) -> None:
-        """Measure the forces of one physics step."""
-        self._measured_force.add(self._touches.sum_forces_n())
 
     def _measure_contact(self, touch: Touch) -> Contact:
         """Return a contact in the frame of its link, with noise."""

@@ -40,14 +40,14 @@ class RayCamera(SensorModel):
 def depth_image(
     camera: DepthCamera, mount: Mount, tick: int, timestamp_ns: int, depth_m: Floats, noise: np.random.Generator
 ) -> DepthImage:
-    """Make the message of a depth image.
+    """Make the message of a depth image from distances, with the noise and the range of a camera.
 
     Args:
         camera: the entry of the robot file.
-        mount: where the camera is on its link.
-        tick: of the image.
-        timestamp_ns: of the image.
-        depth_m: (height * width,), distances along the optical axis, row by row, without noise.
+        mount: place of the camera on its link.
+        tick: tick of the image.
+        timestamp_ns: robot time of the image.
+        depth_m: (height * width,) distances along the optical axis, row by row, without noise.
         noise: the camera's noise generator.
     """
     return DepthImage(

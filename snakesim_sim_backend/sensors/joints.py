@@ -33,7 +33,14 @@ class JointReader:
         self._waiting: deque[tuple[int, list[float]]] = deque(maxlen=1 + round_to_ticks(sensor.delay_s, period_ns))
 
     def read(self, tick: int, timestamp_ns: int) -> JointState:
-        """Return the reading that is delivered at this tick."""
+        """Measure all joints with noise, and return the reading that is delivered at this tick.
+
+        It is older than the tick by the delay of the joint sensors.
+
+        Args:
+            tick: tick of the message.
+            timestamp_ns: robot time of the tick.
+        """
         values = np.concatenate((self._angles, self._velocities, self._torques))
         count = self._count
         if self._noise is not None:

@@ -24,7 +24,12 @@ class PoseReader:
         self._noise = noise if any(sigma) else None
 
     def read(self, tick: int, timestamp_ns: int) -> Pose:
-        """Return the pose of the base, as motion capture measures it. Velocities have no noise of their own."""
+        """Return the pose and velocity of the base as motion capture measures them. Velocities have no noise.
+
+        Args:
+            tick: tick of the message.
+            timestamp_ns: robot time of the tick.
+        """
         px, py, pz, w, x, y, z = self._qpos.tolist()
         vx, vy, vz, ox, oy, oz = self._qvel.tolist()
         # MuJoCo gives a free joint's angular velocity in its own frame.

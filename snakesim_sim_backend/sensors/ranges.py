@@ -27,7 +27,14 @@ class RayBeams(SensorModel):
         self._rays = Rays(self._mount, scope, rays_s, sensor.range_max_m)
 
     def read(self, tick: int, timestamp_ns: int) -> Ranges:
-        """Return a scan from the present place of the link."""
+        """Measure the distances along all beams at the present place of the sensor's link.
+
+        Distances get noise. A beam without a hit within the sensor's range, or that drops out at random, is None.
+
+        Args:
+            tick: tick of the message.
+            timestamp_ns: robot time of the tick.
+        """
         sensor = self._sensor
         distances_m = self._rays.cast()
         measured = (distances_m >= sensor.range_min_m) & (distances_m <= sensor.range_max_m)

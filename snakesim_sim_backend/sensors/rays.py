@@ -41,7 +41,11 @@ class Rays:
         self._lengths = np.zeros(len(rays_s))
 
     def cast(self) -> Floats:
-        """Return the distance of the nearest surface along each ray, in lengths of the ray, (n,); inf without one."""
+        """Find the nearest surface along each ray from the present place of the sensor, flat ground included.
+
+        Returns:
+            (n,) distances in lengths of the ray; inf for a ray that reaches no surface.
+        """
         origin_w, world_from_sensor = self._mount.place()
         rays_w = self._rays_s @ world_from_sensor.T
         below_m = origin_w[2] - self._ground_z_m

@@ -56,7 +56,18 @@ class RecordedDepth(SensorModel):
 
 
 def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
-    """Read the images of a recording. Raises ConfigError."""
+    """Read the recorded images of a depth camera, one JSON message for each line.
+
+    Args:
+        file: path of the recording.
+        camera: the entry of the robot file, for messages.
+
+    Returns:
+        The images in their order.
+
+    Raises:
+        ConfigError: the file cannot be read, is too large, or has images that cannot be used.
+    """
     path = expand_home(file)
     decoder = msgspec.json.Decoder(Line)
     try:

@@ -37,11 +37,11 @@ MODELS: dict[str, tuple[type[SensorModel], ...]] = {
 
 
 def make_body_reader(sensor: BodySensor, scope: BodyScope) -> Reader:
-    """Make the reader of a sensor of the body.
+    """Make the reader of a sensor that measures the body itself, such as contacts, IMUs or the pose.
 
     Args:
         sensor: The entry of the robot file.
-        scope: What the reader may use.
+        scope: Model, state and noise generator that the reader may use.
     """
     draw_normal = scope.noise.standard_normal
     match sensor:
@@ -86,7 +86,19 @@ def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
 def _find_model(
     key: str, sensor: AnyMounted, find: Callable[[str, str], Any]
 ) -> tuple[type[SensorModel], msgspec.Struct] | None:
-    """Return a sensor's class and its checked settings; None if `find` does not load the model."""
+    """Return the class that simulates a mounted sensor, and its checked settings.
+
+    Args:
+        key: The key on which the sensor publishes.
+        sensor: The entry of the robot file, with the name of the model.
+        find: Loads a plug-in by group and name; it may return None if the plug-in is not needed here.
+
+    Returns:
+        The class and its settings; None if `find` does not load the model.
+
+    Raises:
+        ConfigError: The model has the wrong base class, makes another message, or does not accept the settings.
+    """
     message = keys.find_message(key)
     if message is ColorImage:
         return RenderedColor, RenderedColor.Settings()

@@ -64,7 +64,7 @@ class CameraRenderer:
     """Draws what a camera sees. It must be made and used in one thread."""
 
     def __init__(self, camera: DepthCamera, scope: Scope, *, smooth: bool) -> None:
-        """Prepare a renderer for a camera.
+        """Prepare a renderer for one camera of the robot. It must be made and used in one thread.
 
         Args:
             camera: the entry of the robot file.
@@ -147,9 +147,9 @@ def opened_context(width: int, height: int, what: str) -> Any:
     """Open an OpenGL context without a screen: EGL, or OSMesa if the environment has MUJOCO_GL=osmesa.
 
     Args:
-        width: of the pictures, in pixels.
-        height: of the pictures, in pixels.
-        what: what is drawn with it, for the error message.
+        width: width of the pictures in pixels.
+        height: height of the pictures in pixels.
+        what: subject of the pictures, for the error message.
 
     Raises:
         ConfigError: there is no OpenGL.

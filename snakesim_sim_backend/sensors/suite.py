@@ -38,7 +38,18 @@ class Sensors:
         physics: Physics,
         windings: Thermal,
     ) -> None:
-        """Make the readers of all sensors in the robot file.
+        """Create the readers of all sensors in the robot file.
+
+        Sensors of the body are read in the tick itself. Mounted sensors, such as cameras, are read in threads from
+        snapshots of the state.
+
+        Args:
+            sim: the compiled model, with the indices of links and obstacles.
+            data: its state.
+            config: configuration of the run, with the robot's sensors and the seed of their noise.
+            motors: the motors, whose torques and currents are measured.
+            physics: gives the forces of contacts.
+            windings: temperatures of the motors' windings.
 
         Raises:
             ConfigError: a sensor cannot be made.

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import mujoco
 
 from snakesim_hal.wire.quantities import Vector
+from snakesim_sim_backend.laws.laws import ContactForces
 from snakesim_sim_backend.model.build import SimModel
-from snakesim_sim_backend.physics import Physics
 
+GeomPair = tuple[int, int]  # in MuJoCo's order
 NO_FORCE = (0.0, 0.0, 0.0)
 
 
@@ -31,9 +32,9 @@ class Touch(NamedTuple):
 class TouchReader:
     """Finds the contacts with obstacles in a simulation's data."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
+    def __init__(self, sim: SimModel, data: mujoco.MjData, forces: ContactForces) -> None:
         self._contact = data.contact
-        self._friction = physics.contacts
+        self._forces = forces
         self._obstacle_of_geom = sim.obstacle_of_geom
         self._obstacle_geoms = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
         self._link_of_geom: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
@@ -41,12 +42,12 @@ class TouchReader:
     def read(self) -> Iterator[Touch]:
         """Yield all contacts of links with obstacles, in MuJoCo's order."""
         obstacle_geoms = self._obstacle_geoms
-        pairs = self._friction.geom_pairs
+        pairs = self._forces.geom_pairs
         touching = self._find_touching(pairs)
         if not touching:
             return
-        normal_force_n = self._friction.normal_force_n
-        friction_force_w = self._friction.friction_force_w
+        normal_force_n = self._forces.normal_force_n
+        friction_force_w = self._forces.friction_force_w
         # Whole columns are converted at once: a view of each contact would cost more.
         frames = self._contact.frame.tolist()
         points_w = self._contact.pos.tolist()
@@ -72,25 +73,26 @@ class TouchReader:
                 force_w=(fx + normal_n * x, fy + normal_n * y, fz + normal_n * z),
             )
 
-    def sum_forces_n(self) -> dict[object, float]:
+    def sum_forces_n(self) -> dict[GeomPair, float]:
         """Return the summed force between each link and each obstacle that it touches, in N, by their geoms.
 
-        It runs in every physics step, so it computes no vectors.
+        It runs in every physics step, so it computes no vectors: friction is at right angles to the normal force.
         """
-        pairs = self._friction.geom_pairs
+        pairs = self._forces.geom_pairs
         touching = self._find_touching(pairs)
         if not touching:
             return {}
-        normal_force_n = self._friction.normal_force_n
-        friction_force_w = self._friction.friction_force_w
-        sums_n: dict[object, float] = {}
+        normal_force_n = self._forces.normal_force_n
+        friction_force_w = self._forces.friction_force_w
+        sums_n: dict[GeomPair, float] = {}
         for i in touching:
             normal_n = normal_force_n[i]
             if normal_n > 0.0:
                 first, second = pairs[i]
                 force_n = normal_n
                 if i in friction_force_w:
-                    force_n = math.hypot(normal_n, *friction_force_w[i])
+                    fx, fy, fz = friction_force_w[i]
+                    force_n = math.sqrt(normal_n * normal_n + fx * fx + fy * fy + fz * fz)
                 sums_n[first, second] = sums_n.get((first, second), 0.0) + force_n
         return sums_n
 

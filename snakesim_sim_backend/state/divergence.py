@@ -31,7 +31,7 @@ class DivergenceWatch:
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, physics: Physics, steps: int, counted: str = "tick"
     ) -> None:
-        """Keep the present state as the last good one.
+        """Store the present state as the last good one, to which a diverged simulation returns.
 
         Args:
             model: the compiled model.

@@ -42,7 +42,7 @@ class LoadReader:
 
     def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
         first = sim.first_link_body
-        self._touches = TouchReader(sim, data, physics)
+        self._touches = TouchReader(sim, data, physics.contacts)
         self._origins = data.xpos[first:]  # of links, and of the bodies behind them
         self._rotations = data.xmat[first:]
 

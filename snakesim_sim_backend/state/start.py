@@ -28,8 +28,16 @@ def place_robot(
 ) -> None:
     """Put the snake at its start pose, at rest at time 0 with motors off; suspended, its head is below its tail.
 
-    It is placed above the highest ground under it and falls, while the motors hold its start angles. If it has not
-    come to rest after `settle_s`, it is stopped.
+    It is placed above the highest ground under it and falls, while the motors hold its start angles. If it has not come
+    to rest after `settle_s`, it is stopped.
+
+    Args:
+        sim: the compiled model.
+        data: its state, which is changed.
+        physics: steps the simulation.
+        config: the run, with the start pose and the robot.
+        motors: the motors, which hold the start angles meanwhile.
+        settle_s: maximum time in which the snake comes to rest.
     """
     model = sim.model
     pose = find_start_pose(config)
@@ -56,7 +64,14 @@ def place_robot(
 
 
 def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, pose: StartPose) -> float:
-    """Return the height of the highest ground or step under the snake's outline, found by rays from above."""
+    """Return the height of the highest ground or step under the snake's outline, found by rays from above.
+
+    Args:
+        model: the compiled model.
+        data: its state, which is not changed apart from the kinematics.
+        config: the run, with the robot.
+        pose: position, heading and joint angles at the start.
+    """
     mujoco.mj_kinematics(model, data)
     robot = config.robot
     radius_m = robot.module.radius_m
@@ -88,7 +103,20 @@ def _settle(
     pose: StartPose,
     settle_s: float,
 ) -> None:
-    """Let the snake fall and come to rest, with its motors holding the start angles."""
+    """Let the snake fall and come to rest, with its motors holding the start angles.
+
+    It ends when the snake was at rest for ROUNDS_AT_REST rounds. Friction is raised meanwhile, so that it does not
+    slide.
+
+    Args:
+        model: the compiled model.
+        data: its state, which is changed.
+        physics: steps the simulation.
+        config: the run, with the torque limits of the joints.
+        motors: the motors.
+        pose: position, heading and joint angles at the start.
+        settle_s: maximum duration.
+    """
     modes = [Mode.POSITION] * motors.count
     limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
     motors.drive(modes, pose.angles_rad.tolist(), limits_nm)

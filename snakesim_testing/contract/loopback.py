@@ -1,7 +1,6 @@
 """A backend behind the real host, with a real client that commands it and an observer, over Zenoh on loopback."""
 
 import contextlib
-import socket
 import sys
 import threading
 import time
@@ -14,6 +13,7 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -149,10 +149,7 @@ class Hosted:
     """Runs host and controller in threads until `close`, each with its own session, and observes them."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        link = Link(endpoint, f"contract/{config.robot.name}")
+        link = Link(f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}")
         self.backend = RecordingBackend(backend)
         self.controller = Controller()
         self.config = config

@@ -87,7 +87,7 @@ class Drive:
             if images and self.turn % IMAGE_EVERY == 0:
                 self.under_way.append((self.turn + DELAY_TURNS, self.image(here, timestamp_ns)))
             while self.under_way and self.under_way[0][0] <= self.turn:
-                self.world.add_look(self.under_way.pop(0)[1], NOISE)
+                self.world.add_ranging_sample(self.under_way.pop(0)[1], NOISE)
             self.world.make_world(self.turn, timestamp_ns)
             yield here
         self.turn += 1

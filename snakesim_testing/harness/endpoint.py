@@ -1,15 +1,8 @@
-"""Endpoints on the loopback interface that no process uses."""
+"""Endpoints on the loopback interface that no process uses, and that no other test gets."""
 
-import socket
-
-
-def free_port() -> int:
-    """A TCP port of the loopback."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+from snakesim_hal.network.free_ports import find_free_port
 
 
 def free_endpoint() -> str:
     """For a Zenoh network."""
-    return f"tcp/127.0.0.1:{free_port()}"
+    return f"tcp/127.0.0.1:{find_free_port()}"

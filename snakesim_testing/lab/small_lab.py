@@ -14,13 +14,13 @@ from typing import Any
 import zenoh
 
 from snakesim_hal.base.process import die_with_parent
+from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.certificates import write_certificates
 from snakesim_operator.features.lab.identities import Identity, identities
 from snakesim_operator.features.lab.lab_file import Lab, load_lab
 from snakesim_operator.features.lab.render import render
 from snakesim_operator.features.lab.zenoh_files import session_settings
-from snakesim_testing.harness.endpoint import free_port
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import SNAKESIM, environment
 
@@ -106,7 +106,7 @@ def opened(settings: dict[str, Any]) -> zenoh.Session:
 @contextmanager
 def small_lab(folder: Path) -> Iterator[SmallLab]:
     """Create the certificates and configuration files of a lab in a folder, and run its router meanwhile."""
-    port = free_port()
+    port = find_free_port()
     lab_file = folder / "lab.toml"
     lab_file.write_text(lab_text(folder, port))
     lab = load_lab(lab_file)

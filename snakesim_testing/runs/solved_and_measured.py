@@ -17,7 +17,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.measured_force import FORCE_WINDOW_S
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.results.metrics.force_tracking import ASKED_N, EMPTY_N
-from snakesim_sim_backend.sensors.contacts import ContactReader
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.state.contacts import GeomPair, TouchReader
 
 SCENARIOS = ("triplet", "peg_row")
 SHIPPED = (
@@ -66,20 +67,32 @@ def recorded() -> Iterator[list[dict[str, float]]]:
         One entry for each physics step: the force on each obstacle that the body touches, N, by its name.
     """
     steps: list[dict[str, float]] = []
-    measure_force = ContactReader._measure_force  # pyright: ignore[reportPrivateUsage] - called in every physics step
+    advance = SimBackend.advance
 
-    def record_and_measure(self: ContactReader) -> None:
-        touches = self._touches  # pyright: ignore[reportPrivateUsage]
-        obstacle_of_geom = touches._obstacle_of_geom  # pyright: ignore[reportPrivateUsage]
-        force_of_obstacle: dict[str, float] = {}
-        for geom_pair, force_n in touches.sum_forces_n().items():
-            name = next(obstacle_of_geom[geom] for geom in geom_pair if obstacle_of_geom[geom] is not None)  # pyright: ignore
-            force_of_obstacle[name] = force_of_obstacle.get(name, 0.0) + force_n
-        steps.append(force_of_obstacle)
-        measure_force(self)
+    def advance_and_record(self: SimBackend) -> None:
+        physics = self.physics
+        step = physics.step
+        touches = TouchReader(self.sim, self.data, physics.contacts)
 
-    with mock.patch.object(ContactReader, "_measure_force", record_and_measure):
+        def step_and_record(count: int) -> None:
+            for _ in range(count):
+                step(1)
+                steps.append(_sum_by_obstacle(touches.sum_forces_n(), self.sim.obstacle_of_geom))
+
+        with mock.patch.object(physics, "step", step_and_record):
+            advance(self)
+
+    with mock.patch.object(SimBackend, "advance", advance_and_record):
         yield steps
+
+
+def _sum_by_obstacle(forces_n: Mapping[GeomPair, float], obstacle_of_geom: list[str | None]) -> dict[str, float]:
+    """Return the force on each obstacle, from the forces between geoms of links and obstacles."""
+    force_of_obstacle: dict[str, float] = {}
+    for (first, second), force_n in forces_n.items():
+        name = obstacle_of_geom[first] or obstacle_of_geom[second] or ""
+        force_of_obstacle[name] = force_of_obstacle.get(name, 0.0) + force_n
+    return force_of_obstacle
 
 
 def case(scenario: str, label: str, controller: Any, **options: Any) -> tuple[float, str]:

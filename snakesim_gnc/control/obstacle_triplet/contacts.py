@@ -50,14 +50,17 @@ class PushPoint:
 def plan_contact(
     route: Route, obstacle: Obstacle, body_radius_m: float, *, near_s_m: float, window_m: float
 ) -> PlannedContact:
-    """Find the place on the route that is nearest to an obstacle of any shape.
+    """Find the place on the route that is nearest to an obstacle, where the body will push off it.
 
     Args:
         route: the path.
-        obstacle: the obstacle.
+        obstacle: an obstacle of any shape.
         body_radius_m: radius of the robot's body.
-        near_s_m: arc length around which the search begins.
-        window_m: how far from there it searches.
+        near_s_m: arc length on the route around which the search begins.
+        window_m: distance from there within which it searches.
+
+    Returns:
+        The contact, with the normal from the obstacle into the body and the tangent towards the head.
     """
     if obstacle.shape == "box":
         s, away_w, distance_m = _find_place_at_box(route, obstacle, near_s_m, window_m)

@@ -67,6 +67,15 @@ class ObstacleTriplet(Controller[TripletParameters]):
     required_measurements = ("torque",)
 
     def __init__(self, robot: Description, parameters: TripletParameters) -> None:
+        """Create a controller that pushes off three obstacles at a time, with one joint in torque mode.
+
+        It starts without push-points and triplet: all joints are in position mode until a world model shows three
+        obstacles that the body can push off.
+
+        Args:
+            robot: description of the robot; the joints with a vertical axis bend the body.
+            parameters: gains, limits and thresholds of this controller.
+        """
         super().__init__(robot, parameters)
         # Models and estimators.
         self._body = PlanarBody(robot)
@@ -104,10 +113,14 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the setpoints of the next period: one joint propels by its torque, the others follow the path.
 
-        Push-points and the triplet that propels are chosen anew for each new world model.
+        Push-points and the triplet that propels are chosen again for each new world model. While the position on the
+        path is unknown, all joints hold their reference angles.
 
         Args:
             observation: the inputs of this tick.
+
+        Returns:
+            Setpoints of all joints, with telemetry about the triplet and its forces.
         """
         located = self._progress.update(observation)
         if isinstance(located, str):
@@ -117,7 +130,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         last_choice = self._choice
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
-            self._stall_watch.forget()
+            self._stall_watch.reset()
         if located.fresh or located.restarted:
             self._update_push_points(located, body_pose)
             self._update_choice(observation, located, body_pose)
@@ -137,7 +150,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         if choice is not None:
             joint = self._body.bends[choice.joint]
             is_other_triplet = last_choice is not None and choice.triplet.names != last_choice.triplet.names
-        self._hand_over.pass_to(joint, observation.joints, reference, anew=is_other_triplet)
+        self._hand_over.pass_to(joint, observation.joints, reference, fade_in_again=is_other_triplet)
         self._hand_over.fade(
             observation.period_s / parameters.blend_s
             + abs(located.speed_m_s) * observation.period_s / parameters.blend_m
@@ -146,7 +159,17 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def _command(
         self, observation: Observation, located: Located, body_pose: BodyPose, reference: Floats
     ) -> ControllerCommand:
-        """Command all joints to the reference, and the propulsion joint, if there is one, to its torque."""
+        """Set all joints to position mode at their reference, and the propulsion joint, if there is one, to its torque.
+
+        Args:
+            observation: the inputs of this tick.
+            located: position and speed of the body on the path.
+            body_pose: the pose on the path that the joints follow.
+            reference: (n_joints,) reference angles in rad, with the compensation of the load.
+
+        Returns:
+            The setpoints, with telemetry. Without a chosen triplet, no joint propels.
+        """
         targets: list[float] = self._hand_over.positions_rad(reference).tolist()
         modes = [Mode.POSITION] * len(targets)
         setpoints = RequestedSetpoints(modes, targets, self._body.torque_limit_nm)
@@ -169,6 +192,13 @@ class ObstacleTriplet(Controller[TripletParameters]):
 
         Its arc length follows the measured one with slack, no faster than `overspeed_ratio` times the mission's speed,
         and at most `brake_m` behind.
+
+        Args:
+            observation: the inputs of this tick.
+            located: position of the body on the path.
+
+        Returns:
+            The updated pose; its joint angles are stored as the reference.
         """
         parameters = self.parameters
         s = located.tail_s_m
@@ -214,6 +244,14 @@ class ObstacleTriplet(Controller[TripletParameters]):
             tau = f * torque_per_n - damping q',             within the joint's torque limit
 
         fade is 1 while the joint has swung out by less than `angle_fade_rad`, and falls to 0 at twice as much.
+
+        Args:
+            observation: the inputs of this tick, with the joint's angle and velocity q'.
+            located: the body's speed v along the path, and the mission's speed.
+            choice: the triplet that propels, its joint, and the joint torque for 1 N of propulsion.
+
+        Returns:
+            The joint, its torque, the force before and after limits, and which limit applied.
         """
         parameters = self.parameters
         joint = self._body.bends[choice.joint]
@@ -247,7 +285,14 @@ class ObstacleTriplet(Controller[TripletParameters]):
     # --- push-points and triplets --------------------------------------------------------------------------------
 
     def _update_push_points(self, located: Located, body_pose: BodyPose) -> None:
-        """Plan the contacts with the obstacles near the body, and find those that the body is at."""
+        """Plan the contacts with the obstacles near the body, and find those that the body can push off now.
+
+        Obstacles that the body touches or pushes off already remain push-points up to a wider gap, `give_up_gap_m`.
+
+        Args:
+            located: position of the body, with the new world model.
+            body_pose: the pose on the path that the joints follow.
+        """
         if located.restarted:
             self._planned.clear()
         self._update_planned(located)
@@ -287,10 +332,15 @@ class ObstacleTriplet(Controller[TripletParameters]):
         )
 
     def _update_choice(self, observation: Observation, located: Located, body_pose: BodyPose) -> None:
-        """Choose the triplet that propels, with its joint, for the present push-points; `_choice` is None without one.
+        """Choose the triplet that propels, with its joint, from the present push-points; `_choice` is None without one.
 
         No triplet is chosen if no motion is desired, or for some time after a stall. A triplet at which the body was
         stationary is chosen only if there is no other.
+
+        Args:
+            observation: the inputs of this tick.
+            located: position of the body on the path, and the desired speed.
+            body_pose: the pose on the path that the joints follow.
         """
         self._expire_restrictions(observation.time_s, located.tail_s_m)
         barred_joint = None
@@ -339,10 +389,19 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def _watch_stall(
         self, observation: Observation, located: Located, choice: Choice, demand: PropulsionDemand
     ) -> None:
-        """Detect a standstill while pushing, and release a triplet that is strained but does not move the body."""
-        if not self._stall_watch.stands(observation.time_s, located.tail_s_m, demand.desired_n):
+        """Detect a standstill while pushing, and release a triplet that is strained but does not move the body.
+
+        A released triplet is banned near this place, and all joints go to position mode for `release_s`.
+
+        Args:
+            observation: the inputs of this tick.
+            located: position of the body on the path.
+            choice: the triplet that propels.
+            demand: force and torque of the propulsion joint, and which limit applied.
+        """
+        if not self._stall_watch.has_stalled(observation.time_s, located.tail_s_m, demand.desired_n):
             return
-        self._stall_watch.forget()
+        self._stall_watch.reset()
         joint_name = self._body.names[demand.joint]
         stall = explain(
             desired_n=demand.desired_n,
@@ -363,14 +422,20 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def _wait(self, observation: Observation, why: str) -> ControllerCommand:
         """Command every joint to its reference angle without propulsion, while the position of the body is unknown.
 
+        The first call takes the measured angles as reference. Later calls fade out what the last push added to the
+        targets.
+
         Args:
             observation: the inputs of this tick.
             why: why the position is unknown, for the telemetry.
+
+        Returns:
+            Position setpoints of all joints.
         """
         self._choice = None
         self._unlimited_n = 0.0
         self._force_n = 0.0
-        self._stall_watch.forget()
+        self._stall_watch.reset()
         if not len(self._reference):
             self._reference = np.array(observation.joints.angle_rad)
             self._hand_over.start(observation.joints, self._reference)
@@ -412,7 +477,17 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def _report_push(
         self, located: Located, body_pose: BodyPose, choice: Choice, demand: PropulsionDemand
     ) -> Telemetry:
-        """Report which joint pushes, at which contacts, and with which force."""
+        """Return the telemetry of a tick in which a triplet propels: its joint, its contacts and its forces.
+
+        Args:
+            located: position of the body on the path, and the world model.
+            body_pose: the pose on the path that the joints follow.
+            choice: the triplet that propels.
+            demand: force and torque of the propulsion joint, and which limit applied.
+
+        Returns:
+            The telemetry, with contact forces in N, and with the torque margin at full propulsion in N·m.
+        """
         stall_reason = ""
         if self._stall is not None:
             stall, _ = self._stall

@@ -155,11 +155,11 @@ def choose_triplet(
     Returns:
         The choice; None if there is none.
     """
-    allowed = [choice for choice in choices if choice.triplet.names not in banned]
-    if not allowed:
+    permitted_choices = [choice for choice in choices if choice.triplet.names not in banned]
+    if not permitted_choices:
         return None
-    min_torque = min(choice.triplet.torque_per_n for choice in allowed)
-    for choice in allowed:
+    min_torque = min(choice.triplet.torque_per_n for choice in permitted_choices)
+    for choice in permitted_choices:
         if choice.triplet is present and min_torque >= switch_fraction * choice.triplet.torque_per_n:
             return choice
     present_names: frozenset[str] = frozenset()
@@ -170,7 +170,7 @@ def choose_triplet(
         shared_count = len(present_names.intersection(choice.triplet.names))
         return shared_count, -round(choice.triplet.torque_per_n, TORQUE_DECIMALS), -choice.body_s_m[1]
 
-    candidates = [choice for choice in allowed if switch_fraction * choice.triplet.torque_per_n <= min_torque]
+    candidates = [choice for choice in permitted_choices if switch_fraction * choice.triplet.torque_per_n <= min_torque]
     return max(candidates, key=rank)
 
 

@@ -29,12 +29,12 @@ class StallWatch:
         self._recent: deque[tuple[float, float, float]] = deque()  # time in s, arc length in m, force in N
         self._force_sum_n = 0.0  # over the window
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Start a new window."""
         self._recent.clear()
         self._force_sum_n = 0.0
 
-    def stands(self, time_s: float, tail_s_m: float, force_n: float) -> bool:
+    def has_stalled(self, time_s: float, tail_s_m: float, force_n: float) -> bool:
         """Return whether the body was stationary through a whole window while pushing; call it in each such tick."""
         recent = self._recent
         recent.append((time_s, tail_s_m, force_n))
@@ -60,7 +60,7 @@ def explain(
     jam_force_n: float,
     drag_ratio: float,
 ) -> Stall:
-    """Explain a stall, as far as the measurements show its cause.
+    """Explain why the body does not move although it pushes, as far as the measurements show the cause.
 
     Args:
         desired_n: propulsion force from the speed alone.
@@ -72,6 +72,9 @@ def explain(
         swung: name of the propulsion joint if it has swung out so far that the propulsion was reduced.
         jam_force_n: a larger contact force strains the contacts.
         drag_ratio: ratio of propulsion to weight above which the propulsion strains the joint.
+
+    Returns:
+        Whether obstacles jam the body, whether to release the triplet, and the reason as text.
     """
     touches_something = net_force is None or net_force.strongest_n != 0.0
     joint_is_strained = saturated is not None or swung is not None or desired_n > drag_ratio * weight_n

@@ -114,6 +114,9 @@ def solve_unit_forces(
         normals_w: (m, 3, 2) unit vectors, from the obstacle into the body.
         tangents_1_w: (m, 2) unit vectors along the body at o_1 towards the head.
         condition_max: A is not solved above this condition number.
+
+    Returns:
+        For each triplet the forces along the normals, the condition number of A, and why it cannot propel.
     """
     span_w = points_w[:, 2] - points_w[:, 0]
     span_m = np.hypot(span_w[:, 0], span_w[:, 1])
@@ -196,9 +199,9 @@ def compute_bending_torque_nm(
     Args:
         joints_w: (n, 2) m, the joints.
         joints_s_m: (n,) m, the joints from the tail end along the body.
-        points_w: (k, 2) m, where the body is pushed.
+        points_w: (k, 2) m, the points at which forces act on the body.
         points_s_m: (k,) m, these points from the tail end along the body.
-        forces_w: (k, 2) N, with what it is pushed, the tether's force included.
+        forces_w: (k, 2) N, the forces at these points, the tether's force included.
 
     Returns:
         (n,) N·m.

@@ -56,12 +56,13 @@ class BeamSearch:
         parameters: SearchParameters,
         growth: type[PathGrowth] | None = None,
     ) -> None:
-        """Create a search on a map.
+        """Prepare to search paths on a map.
 
         Args:
             obstacles: the map.
-            parameters: the robot, and the costs.
-            growth: how layers are expanded; None: in C if its library is installed. The paths are the same.
+            parameters: the robot, and the cost weights.
+            growth: implementation that expands the layers of the search; None: the C library if it is installed,
+                otherwise NumPy. The paths are the same.
         """
         self._obstacles = obstacles
         self._parameters = parameters
@@ -81,14 +82,14 @@ class BeamSearch:
         Returns:
             A path of that many arcs, or of as many as there is room for; None if there is no room for one.
         """
-        lying_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
+        initial_body_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
         origin_w = body_w[-1]
-        middles_w, tangents = _middles_and_tangents(lying_w)
+        middles_w, tangents = _middles_and_tangents(initial_body_w)
         task = SearchTask(
             origin_w=origin_w,
             goal_rad=goal_rad,
             goal_w=np.array([np.cos(goal_rad), np.sin(goal_rad)]),
-            lying_drag_m=STEP_M * wrenches(middles_w - origin_w, tangents),
+            initial_drag_m=STEP_M * wrenches(middles_w - origin_w, tangents),
         )
         start = self._start_at_head(body_w, middles_w, tangents, task)
         return (yield from self._grow(start, steps, task))
@@ -99,26 +100,26 @@ class BeamSearch:
         """Search the best path for the whole body, which begins at the tail, and beyond the head.
 
         Args:
-            body_w: (n, 2) the body's curve, tail to head.
+            body_w: (n, 2) the body's curve, tail to head, m.
             goal_rad: direction of travel.
             steps: number of arcs beyond the head.
-            max_sideways_m: the path stays this near to where the body lies.
-            failed_w: (k, 2) points of paths on which the body got stuck here; the search prefers other ways round.
+            max_sideways_m: maximum distance of the path from the present body.
+            failed_w: (k, 2) points of paths on which the body got stuck here, m; the search prefers other ways round.
 
         Returns:
             A path, which may have fewer arcs; None if there is none.
         """
-        lying_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
+        initial_body_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
         task = SearchTask(
             origin_w=body_w[-1],
             goal_rad=goal_rad,
             goal_w=np.array([np.cos(goal_rad), np.sin(goal_rad)]),
-            lying_drag_m=np.zeros((self._body_arcs, 3)),
-            lying_w=lying_w,
+            initial_drag_m=np.zeros((self._body_arcs, 3)),
+            initial_body_w=initial_body_w,
             max_sideways_m=max_sideways_m,
             failed_w=failed_w,
         )
-        return (yield from self._grow(_start_at_tail(lying_w), self._body_arcs + steps, task))
+        return (yield from self._grow(_start_at_tail(initial_body_w), self._body_arcs + steps, task))
 
     def _grow(self, start: NodeLayer, steps: int, task: SearchTask) -> PathSearch:
         """Expand layer after layer, and return the cheapest path."""
@@ -133,7 +134,7 @@ class BeamSearch:
         """Return the node of the body as it lies, with its contacts. middles_w, tangents: (a, 2) of its arcs."""
         ahead = body_w[-1:] - body_w[-2:-1]
         node = make_start_nodes(body_w[-1:], np.arctan2(ahead[:, 1], ahead[:, 0]))
-        node.drag_m = task.lying_drag_m.sum(axis=0)[None]
+        node.drag_m = task.initial_drag_m.sum(axis=0)[None]
         touched = find_touched(self._obstacles, middles_w, tangents, self._parameters, task)
         for arc in np.flatnonzero(touched.counts):
             s_m = -STEP_M * (self._body_arcs - int(arc) - 0.5)
@@ -150,10 +151,10 @@ def _middles_and_tangents(points_w: Floats) -> tuple[Floats, Floats]:
     return 0.5 * (points_w[1:] + points_w[:-1]), chords / lengths_m[:, None]
 
 
-def _start_at_tail(lying_w: Floats) -> NodeLayer:
+def _start_at_tail(initial_body_w: Floats) -> NodeLayer:
     """Return nodes around the tail end of a lying body, as starts of the path of the whole body."""
-    tail_w = lying_w[0]
-    ahead = lying_w[1] - tail_w
+    tail_w = initial_body_w[0]
+    ahead = initial_body_w[1] - tail_w
     heading_rad = float(np.arctan2(ahead[1], ahead[0]))
     left = np.array([-np.sin(heading_rad), np.cos(heading_rad)])
     turns = len(TAIL_TURNS_RAD)

@@ -34,14 +34,17 @@ class TouchedObstacles:
 def find_touched(
     obstacles: ObstacleGrid, points_w: Floats, tangents: Floats, parameters: SearchParameters, task: SearchTask
 ) -> TouchedObstacles:
-    """Find what bodies touch at points on their axes.
+    """Find the obstacles that bodies touch at points on their axes, and the push that these contacts allow.
 
     Args:
         obstacles: the map.
-        points_w: (n, 2) the points.
+        points_w: (n, 2) the points, m.
         tangents: (n, 2) unit vectors along the axes.
-        parameters: the robot.
-        task: the search.
+        parameters: the robot, and the assumed friction of obstacles.
+        task: direction of the goal, and the origin of moments.
+
+    Returns:
+        For each point, the nearest obstacle, the gap, whether it counts as a contact, and the wrench of a unit push.
     """
     nearest = obstacles.find_nearest(points_w[:, 0], points_w[:, 1])
     normals = nearest.normal_w

@@ -44,11 +44,19 @@ def compute_margins_n(contacts: Floats, drag: Floats) -> Floats:
 
 
 def _margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floats:
-    """Return the margins of bodies that all have k contacts: contacts (n, k, 3), drag (n, 3).
+    """Return the propulsion margins of n bodies that all have k contacts.
 
-    Cramer's rule gives the forces of three contacts a, b, c under the drag d, with V = a . (b x c):
+    The margin is the largest force along the body that any three contacts can balance within the limit of contact
+    forces. Cramer's rule gives the forces of three contacts a, b, c under the drag d, with V = a . (b x c):
 
         lambda_a = d . (b x c) / V,   lambda_b = -c . (d x a) / V,   lambda_c = b . (d x a) / V
+
+    Args:
+        contacts: (n, k, 3) wrenches of a unit push at each contact.
+        drag: (n, 3) wrench of the ground's drag on each body.
+
+    Returns:
+        (n,) margins in N; 0 if no three contacts can push.
     """
     scaled = contacts * WRENCH_SCALE
     scaled_drag = drag * WRENCH_SCALE

@@ -44,6 +44,18 @@ class NativeGrowth(PathGrowth):
     def __init__(
         self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
     ) -> None:
+        """Copy a search into the structures of the C library, which then expands it layer by layer.
+
+        Args:
+            obstacles: the map.
+            parameters: the robot, and the cost weights.
+            task: goal of the search, and the body from which it starts.
+            start: nodes of the first layer.
+            steps: maximum number of layers after the first.
+
+        Raises:
+            NativeGrowthError: the C library is not installed.
+        """
         library = load_library()
         if library is None:
             raise NativeGrowthError(f"there is no C library of the planner: {explain_absence()}")
@@ -102,64 +114,83 @@ class NativeGrowth(PathGrowth):
         table.needed_m = arcs.needed_m
         table.surely_blocked_m = arcs.surely_blocked_m
 
-    def _fill_parameters(self, given: SearchParameters) -> None:
-        parameters = self._search.parameters
-        # The robot.
-        parameters.step_m = STEP_M
-        parameters.body_length_m = given.body_length_m
-        parameters.body_arcs = count_body_arcs(given)
-        parameters.radius_m = given.radius_m
-        parameters.contact_distance_m = given.contact_distance_m
-        parameters.max_frontal = search_parameters.MAX_FRONTAL
-        parameters.min_push = search_parameters.MIN_PUSH
-        parameters.obstacle_friction = given.assumed_obstacle_friction
-        parameters.max_heading_error_rad = search_parameters.MAX_HEADING_ERROR_RAD
-        # Costs; the products are those that `specified_growth` computes first.
-        parameters.push_reward = given.push_reward
-        parameters.push_reward_of_body = given.push_reward_of_body
-        parameters.brake_cost = given.brake_cost
-        parameters.progress_reward = given.progress_reward
-        parameters.curvature_change_cost_m2 = given.curvature_change_cost_m * STEP_M
-        parameters.weak_margin_cost_m = STEP_M * given.weak_margin_cost
-        parameters.weak_margin_cost_near_m = STEP_M * given.weak_margin_cost_near
-        parameters.near_m = given.near_m
-        parameters.failed_path_cost_m = STEP_M * given.failed_path_cost
-        parameters.failed_path_m = search_parameters.FAILED_PATH_M
-        parameters.sideways_cost_m = STEP_M * given.sideways_cost
-        # The propulsion margin.
-        parameters.unused_tail_m = given.unused_tail_m
-        parameters.unused_head_m = given.unused_head_m
-        parameters.wanted_margin_n = given.wanted_margin_n
-        parameters.max_contact_force_n = margin.MAX_CONTACT_FORCE_N
-        parameters.min_determinant = margin.MIN_DETERMINANT
-        parameters.moment_scale = margin.WRENCH_SCALE[2]
-        parameters.min_force_per_n = margin.MIN_FORCE_PER_N
-        # Nodes that are kept.
-        parameters.cell_m = search_parameters.CELL_M
-        parameters.cell_rad = search_parameters.CELL_RAD
-        parameters.wide_cell_m = search_parameters.WIDE_CELL_M
-        parameters.wide_cell_rad = search_parameters.WIDE_CELL_RAD
-        parameters.max_candidates = search_parameters.CANDIDATES_PER_KEPT_NODE * given.kept_nodes
-        parameters.kept_nodes = given.kept_nodes
-        parameters.kept_per_wide_cell = given.kept_per_wide_cell
+    def _fill_parameters(self, parameters: SearchParameters) -> None:
+        """Copy the robot, the cost weights and the constants of the search into the structure that C reads.
 
-    def _fill_task(self, given: SearchTask, parameters: SearchParameters) -> None:
-        task = self._search.task
-        task.origin_x_m, task.origin_y_m = given.origin_w
-        task.goal_rad = given.goal_rad
-        task.goal_x, task.goal_y = given.goal_w
+        Args:
+            parameters: parameters of the search.
+        """
+        native = self._search.parameters
+        # The robot.
+        native.step_m = STEP_M
+        native.body_length_m = parameters.body_length_m
+        native.body_arcs = count_body_arcs(parameters)
+        native.radius_m = parameters.radius_m
+        native.contact_distance_m = parameters.contact_distance_m
+        native.max_frontal = search_parameters.MAX_FRONTAL
+        native.min_push = search_parameters.MIN_PUSH
+        native.obstacle_friction = parameters.assumed_obstacle_friction
+        native.max_heading_error_rad = search_parameters.MAX_HEADING_ERROR_RAD
+        # Costs; the products are those that `specified_growth` computes first.
+        native.push_reward = parameters.push_reward
+        native.push_reward_of_body = parameters.push_reward_of_body
+        native.brake_cost = parameters.brake_cost
+        native.progress_reward = parameters.progress_reward
+        native.curvature_change_cost_m2 = parameters.curvature_change_cost_m * STEP_M
+        native.weak_margin_cost_m = STEP_M * parameters.weak_margin_cost
+        native.weak_margin_cost_near_m = STEP_M * parameters.weak_margin_cost_near
+        native.near_m = parameters.near_m
+        native.failed_path_cost_m = STEP_M * parameters.failed_path_cost
+        native.failed_path_m = search_parameters.FAILED_PATH_M
+        native.sideways_cost_m = STEP_M * parameters.sideways_cost
+        # The propulsion margin.
+        native.unused_tail_m = parameters.unused_tail_m
+        native.unused_head_m = parameters.unused_head_m
+        native.wanted_margin_n = parameters.wanted_margin_n
+        native.max_contact_force_n = margin.MAX_CONTACT_FORCE_N
+        native.min_determinant = margin.MIN_DETERMINANT
+        native.moment_scale = margin.WRENCH_SCALE[2]
+        native.min_force_per_n = margin.MIN_FORCE_PER_N
+        # Nodes that are kept.
+        native.cell_m = search_parameters.CELL_M
+        native.cell_rad = search_parameters.CELL_RAD
+        native.wide_cell_m = search_parameters.WIDE_CELL_M
+        native.wide_cell_rad = search_parameters.WIDE_CELL_RAD
+        native.max_candidates = search_parameters.CANDIDATES_PER_KEPT_NODE * parameters.kept_nodes
+        native.kept_nodes = parameters.kept_nodes
+        native.kept_per_wide_cell = parameters.kept_per_wide_cell
+
+    def _fill_task(self, task: SearchTask, parameters: SearchParameters) -> None:
+        """Copy the goal of the search and the body from which it starts into the structure that C reads.
+
+        Args:
+            task: the task of the search.
+            parameters: the robot, whose length gives the number of arcs of the body.
+        """
+        native = self._search.task
+        native.origin_x_m, native.origin_y_m = task.origin_w
+        native.goal_rad = task.goal_rad
+        native.goal_x, native.goal_y = task.goal_w
         body_arcs = count_body_arcs(parameters)
-        task.lying_drag_m = self._memory.pass_array("the drag of the lying body", given.lying_drag_m, (body_arcs, 3))
-        task.is_relaid = given.lying_w is not None
-        if given.lying_w is not None:
-            task.lying_count = len(given.lying_w)
-            task.lying_m = self._memory.pass_array("the lying body", given.lying_w, (body_arcs + 1, 2))
-        task.max_sideways_m = given.max_sideways_m
-        if given.failed_w is not None:
-            task.failed_count = len(given.failed_w)
-            task.failed_m = self._memory.pass_array("the failed paths", given.failed_w, (len(given.failed_w), 2))
+        native.lying_drag_m = self._memory.pass_array("the drag of the lying body", task.initial_drag_m, (body_arcs, 3))
+        native.is_relaid = task.initial_body_w is not None
+        if task.initial_body_w is not None:
+            native.lying_count = len(task.initial_body_w)
+            native.lying_m = self._memory.pass_array("the lying body", task.initial_body_w, (body_arcs + 1, 2))
+        native.max_sideways_m = task.max_sideways_m
+        if task.failed_w is not None:
+            native.failed_count = len(task.failed_w)
+            native.failed_m = self._memory.pass_array("the failed paths", task.failed_w, (len(task.failed_w), 2))
 
     def _fill_layers(self, start: NodeLayer) -> None:
+        """Allocate the layers of the search for C, and copy the nodes of the first layer into them.
+
+        Of all layers, parents, positions, margins and drag are kept, so that a path can be traced back. Complete nodes
+        are kept for two layers, which C reads and writes by turns.
+
+        Args:
+            start: nodes of the first layer.
+        """
         count = len(start.x_m)
         history = (self._layer_room, self._node_room)
         self._parent = np.empty(history, dtype=INTEGER)

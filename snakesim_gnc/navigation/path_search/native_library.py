@@ -190,7 +190,10 @@ class PlannerLibrary:
 
 @cache
 def load_library() -> PlannerLibrary | None:
-    """Return the C library; None if it is not installed here.
+    """Load the planner's C library, and check that it was compiled for the structures of this version.
+
+    Returns:
+        Its functions, or None if the library is not installed here.
 
     Raises:
         NativeGrowthError: its structures have other sizes than those of this module.
@@ -202,10 +205,12 @@ def load_library() -> PlannerLibrary | None:
     handle.snakesim_planner_layout.restype = None
     handle.snakesim_planner_layout.argtypes = [ctypes.POINTER(NativeLayout)]
     handle.snakesim_planner_layout(ctypes.byref(layout))
-    here = (ctypes.sizeof(NativeSearch), NODE.itemsize, CONTACT.itemsize)
-    there = (layout.search, layout.node, layout.contact)
-    if here != there:
-        raise NativeGrowthError(f"search, node and contact have {there} bytes in the C library, and {here} in Python")
+    python_sizes = (ctypes.sizeof(NativeSearch), NODE.itemsize, CONTACT.itemsize)
+    library_sizes = (layout.search, layout.node, layout.contact)
+    if python_sizes != library_sizes:
+        raise NativeGrowthError(
+            f"search, node and contact have {library_sizes} bytes in the C library, and {python_sizes} in Python"
+        )
     expand = handle.snakesim_planner_expand
     expand.restype = ctypes.c_int64
     expand.argtypes = [ctypes.POINTER(NativeSearch)]

@@ -34,6 +34,11 @@ class ArcTable:
     """The arcs of all curvatures, computed once."""
 
     def __init__(self, parameters: SearchParameters) -> None:
+        """Precompute what all arcs of a search have in common: their ends, their middles, and the distances they need.
+
+        Args:
+            parameters: the robot's size and clearance, and the c curvatures among which each step of a path chooses.
+        """
         self.curvatures_per_m = np.array(parameters.curvatures_per_m)  # (c,)
 
         # The distance from obstacles that the body needs. Straight links cut the corners of the path, so the inner side

@@ -54,8 +54,8 @@ class NodeLayer:
         Args:
             touches: (n,) which nodes touch an obstacle there; the other rows are ignored.
             obstacle: (n,) index of the obstacle.
-            gap_m: (n,) between skin and obstacle.
-            wrench: (n, 3) of a unit push.
+            gap_m: (n,) gap between skin and obstacle.
+            wrench: (n, 3) wrench of a unit push.
             s_m: arc length of the contact.
         """
         is_same = touches & (self.obstacle[:, -1] == obstacle)
@@ -71,7 +71,12 @@ class NodeLayer:
 
 
 def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
-    """Return nodes without contacts and drag, from which a search starts. points_w: (n, 2), headings_rad: (n,)."""
+    """Return nodes without contacts and drag, from which a search starts.
+
+    Args:
+        points_w: (n, 2) positions in the world, m.
+        headings_rad: (n,) directions in which the paths begin.
+    """
     count = len(points_w)
     return NodeLayer(
         x_m=points_w[:, 0].copy(),

@@ -26,8 +26,8 @@ class SearchTask:
     origin_w: Floats  # (2,) the head of the measured body; moments are about it
     goal_rad: float
     goal_w: Floats  # (2,) unit vector
-    lying_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
+    initial_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
     # For a search of the whole body.
-    lying_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
+    initial_body_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
     max_sideways_m: float = np.inf  # how far the path may be from where the body lies
     failed_w: Floats | None = None  # (k, 2) points of paths on which the body got stuck here

@@ -56,7 +56,7 @@ class SpecifiedGrowth(PathGrowth):
     def grow(self) -> bool:
         parents = self._layers[-1]
         arcs = self._arc_table.steer(parents)
-        sideways_m = self._distance_from_lying(arcs, parents.s_m)
+        sideways_m = self._distance_from_initial_body(arcs, parents.s_m)
         is_allowed = self._find_allowed(arcs, sideways_m)
         if not is_allowed.any():
             return False
@@ -81,18 +81,18 @@ class SpecifiedGrowth(PathGrowth):
             row = int(layer.parent[row])
         return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
 
-    def _distance_from_lying(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
+    def _distance_from_initial_body(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
         """Return how far the ends of the arcs are from where the body lies at the same arc length, (n, c).
 
         None if the body is not laid again, or if the arcs are ahead of its head.
         """
-        lying_w = self._task.lying_w
-        if lying_w is None:
+        initial_body_w = self._task.initial_body_w
+        if initial_body_w is None:
             return None
         end = round(parent_s_m / STEP_M) + 1
-        if end >= len(lying_w):
+        if end >= len(initial_body_w):
             return None
-        return np.hypot(arcs.x_m - lying_w[end, 0], arcs.y_m - lying_w[end, 1])
+        return np.hypot(arcs.x_m - initial_body_w[end, 0], arcs.y_m - initial_body_w[end, 1])
 
     def _find_allowed(self, arcs: SearchArcs, sideways_m: Floats | None) -> Bools:
         """Return which arcs clear all obstacles and lead about the right way, (n, c)."""
@@ -108,7 +108,19 @@ class SpecifiedGrowth(PathGrowth):
         return is_allowed
 
     def _path_cost_m(self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None) -> Floats:
-        """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts, (n, c)."""
+        """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts.
+
+        It is the cost of the parent, plus length and change of curvature, minus progress towards the goal. A search of
+        the whole body also adds the distance from the present body and the closeness to paths that have failed.
+
+        Args:
+            parents: (n) nodes at which the arcs begin.
+            arcs: (n, c) arcs, one for each node and curvature.
+            sideways_m: (n, c) distance of the ends from the present body; None if this does not count.
+
+        Returns:
+            (n, c) costs in m.
+        """
         parameters = self._parameters
         task = self._task
         curvature_change = np.abs(self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None])
@@ -161,7 +173,13 @@ class SpecifiedGrowth(PathGrowth):
         return nodes
 
     def _add_contact_terms(self, nodes: NodeLayer, arcs: SearchArcs, candidates: Ints) -> None:
-        """Add the contacts and the drag of the newest arc to nodes, and what they cost."""
+        """Add the contacts and the drag of the newest arc to nodes, and the costs of contacts and propulsion margin.
+
+        Args:
+            nodes: the new nodes, which are changed.
+            arcs: all arcs from the parents of these nodes.
+            candidates: (n,) index of each node's arc among the flattened arcs.
+        """
         parameters = self._parameters
         task = self._task
         middles_w = np.stack([arcs.middle_x_m.ravel()[candidates], arcs.middle_y_m.ravel()[candidates]], axis=-1)
@@ -169,7 +187,7 @@ class SpecifiedGrowth(PathGrowth):
         tangents = np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=-1)
 
         # While the search is still within the body, the margin has no meaning yet.
-        is_relaid = task.lying_w is not None
+        is_relaid = task.initial_body_w is not None
         is_within_body = is_relaid and nodes.s_m < parameters.body_length_m - 0.5 * STEP_M
         push_reward = parameters.push_reward_of_body if is_within_body else parameters.push_reward
         touched = find_touched(self._obstacles, middles_w, tangents, parameters, task)
@@ -194,7 +212,7 @@ class SpecifiedGrowth(PathGrowth):
         """
         layers = self._layers
         if len(layers) <= self._body_arcs:
-            return self._task.lying_drag_m[len(layers) - 1]
+            return self._task.initial_drag_m[len(layers) - 1]
         rows = parent_rows
         for older in reversed(layers[len(layers) - self._body_arcs + 1 :]):
             rows = older.parent[rows]

@@ -204,7 +204,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
                 return f"{POLICY}{model}"
         return self.controller
 
-    def dead_reckons(self, robot: Description) -> bool:
+    def uses_dead_reckoning(self, robot: Description) -> bool:
         """Return whether guidance estimates the pose by dead reckoning.
 
         It does if the mission demands it, and also if neither the robot nor a service measures the pose.

@@ -136,6 +136,8 @@ def _front_server(port: int | None, link: Link | None, stop: threading.Event) ->
             end = front.describe_end()
         finally:
             children.stop_all([front])
+            if front.was_killed:
+                print_line(f"warning: {front.describe_end()}")
     if end is not None:
         raise NotConnectedError(f"no browser can connect any more: {end}")
 

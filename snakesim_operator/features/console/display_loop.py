@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import Link
+from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.features.console.operations import Operations, PageLog
@@ -49,7 +50,7 @@ def show_live(
         commission: The robot file that pages may write into; None: none.
 
     Raises:
-        NotConnectedError: There is no network.
+        NotConnectedError: There is no network, or `stop` was set before there was one.
     """
     log = PageLog()
     operations = Operations(link, log)
@@ -66,7 +67,12 @@ def show_live(
         page = Page(server, surroundings, operations, log, commission=commission)
         page.show_snapshot(expected)
         link_with_images = replace(link, max_bytes=MAX_IMAGE_BYTES)
-        with open_session(link_with_images, SERVICE_START_LIMIT_S) as session:
+        give_up_s = time.monotonic() + SERVICE_START_LIMIT_S
+
+        def keeps_waiting() -> bool:
+            return not stop.is_set() and time.monotonic() < give_up_s
+
+        with open_session_when_ready(link_with_images, keeps_waiting) as session:
             operations.connect(session)
             robot = LiveRobot(session)
             changes = StateChangeLog(log.write)

@@ -52,7 +52,7 @@ def _add_sweep(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_optimize(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim study optimize`."""
+    """Add the options of `snakesim study optimize`, which searches the values of keys for the best result."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",

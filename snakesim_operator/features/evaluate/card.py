@@ -39,6 +39,12 @@ METRICS = {
     "energy_j_per_m": Metric("energy, J/m", 1, of_crossed=True),
     "cost_of_transport": Metric("cost of transport", 3, of_crossed=True),
     "propulsive_efficiency": Metric("propulsive efficiency", 3, of_crossed=True),
+    "displacement_m_s": Metric("net displacement: speed, m/s", 3),
+    "displacement_energy_j_per_m": Metric("net displacement: energy, J/m", 1),
+    "displacement_cost_of_transport": Metric("net displacement: cost of transport", 3),
+    "displacement_efficiency": Metric("net displacement: efficiency", 3),
+    "displacement_slip": Metric("slip along the path", 3),
+    "lateral_slip": Metric("lateral slip", 3),
     "jam_ratio": Metric("jam ratio", 3),
     "impulse_n_s_per_m": Metric("contact impulse, N·s/m", 1, of_crossed=True),
     "torque_headroom": Metric("torque headroom", 2),
@@ -243,11 +249,14 @@ def _compare_pair(card: Card, controller: str, other: Card, other_controller: st
     p-values are not corrected for multiple comparisons yet.
 
     Args:
-        card: The card of the first controller.
-        controller: Its name.
-        other: The card of the second controller.
-        other_controller: Its name.
-        label: How the second controller is shown.
+        card: The score card with the first controller.
+        controller: Name of the first controller.
+        other: The score card with the second controller.
+        other_controller: Name of the second controller.
+        label: Name under which the second controller is shown.
+
+    Returns:
+        One comparison for each row, in the order of the first card.
     """
     other_outcomes: dict[str, bool] = {}  # configuration without its controller -> whether it reached the goal
     for crossing in other.crossings:

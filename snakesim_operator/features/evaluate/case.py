@@ -67,16 +67,19 @@ def case_id(config: RunConfig, give_up_s: float) -> str:
 
 
 def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> CaseOutcome:
-    """Run a case in this process, and return its numbers.
+    """Run one case of an evaluation in this process, and return its numbers or its error.
 
     Args:
         config: the whole configuration as JSON.
-        code: digest of the code that the case is for.
+        code: digest of the code of SnakeSIM that the case is for.
         give_up_s: robot time without an advance after which the run is ended.
         limit_s: wall time after which it is stopped.
 
+    Returns:
+        The outcome; a case that cannot run, or takes too long, has an error instead of numbers.
+
     Raises:
-        Exception: whatever is no SnakesimError, such as a fault of this worker or of a controller.
+        Exception: any error other than SnakesimError, such as a fault of this worker or of a controller.
     """
     if code != code_digest():
         return CaseOutcome(

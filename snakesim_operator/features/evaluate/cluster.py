@@ -32,11 +32,11 @@ class Workers(Protocol):
 
 @contextmanager
 def workers(cluster: str | None, count: int | None = None) -> Iterator[Workers]:
-    """Connect to a cluster, or start processes here. Ends what it has started.
+    """Provide processes that run cases: those of a Dask cluster, or new ones here that end with the context.
 
     Args:
         cluster: address of a Dask scheduler; None: processes on this computer, to which nothing can connect.
-        count: how many processes here; None: one a core.
+        count: number of processes on this computer; None: one for each core.
 
     Raises:
         ConfigError: the address is invalid.

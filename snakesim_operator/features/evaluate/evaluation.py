@@ -57,14 +57,14 @@ class EvaluationRequest:
 
 
 def evaluate(request: EvaluationRequest, pulse: Pulse | None = None) -> int:
-    """Run all cases that are not done yet, or one case as a run with its own folder.
+    """Run all cases of an evaluation that have no result yet, or one case as a run with its own folder.
 
     Args:
-        request: the cases, and what to do with them.
-        pulse: of the one case, as in `run_in_process`.
+        request: the cases, the output folder, and the options of the command.
+        pulse: shows another process that a single run makes progress; None if no process watches.
 
     Returns:
-        0; 1 if a case could not run; 130 if it was stopped, which loses no case that is done.
+        The exit code: 0; 1 if a case could not run; 130 if the operator stopped it. Finished cases are never lost.
     """
     if request.only is not None:
         return _run_one_case(request, request.only, pulse)
@@ -114,7 +114,12 @@ def _run_all_cases(request: EvaluationRequest) -> int:
 
 
 def choose_first_field(request: EvaluationRequest) -> int:
-    """Return the number of the first field: as requested, or drawn now if the suite draws its fields, or 1.
+    """Return the number of the first field, that is the seed of the first random scene.
+
+    It is the requested number, a random number now if the suite asks for new fields, or 1.
+
+    Args:
+        request: the options of the evaluation, with the suite.
 
     Raises:
         ConfigError: an evaluation is resumed, and it is not known which fields were drawn.

@@ -62,10 +62,15 @@ class SearchRequest:
 
 
 def optimize(request: SearchRequest) -> int:
-    """Search until the requested number of trials have a result, or have been tried.
+    """Search the values of keys that give the best number, until enough trials have a result or have been tried.
+
+    All trials are stored in a file, from which a later search with the same options continues.
+
+    Args:
+        request: the keys with their ranges, the number to optimize, and the options of the command.
 
     Returns:
-        0; 1 if no trial has a result.
+        The exit code: 0; 1 if no trial has a result.
 
     Raises:
         ConfigError: the request is invalid, or the file is of another search.
@@ -83,8 +88,8 @@ def optimize(request: SearchRequest) -> int:
     study = open_study(request.storage, _search_command(request, space, cases_at_ends))
     study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
     completed = len(study.get_trials(states=(TrialState.COMPLETE,)))
-    already = f"holds {completed} trials already" if completed else "keeps all trials"
-    print_line(f"{request.storage} {already}; --storage {shlex.quote(str(request.storage))} continues with them")
+    storage_state = f"holds {completed} trials already" if completed else "keeps all trials"
+    print_line(f"{request.storage} {storage_state}; --storage {shlex.quote(str(request.storage))} continues with them")
     if request.trials > completed:
         _search(request, study, space, request.trials - completed)
     return _report_best(request, study)
@@ -111,11 +116,11 @@ def _search(request: SearchRequest, study: Study, space: Mapping[str, Span], tri
                 batch.append(trial)
             _run_trials(request, study, batch, pool)
             remaining -= len(batch)
-            done = trials - remaining
+            done_count = trials - remaining
             passed_s = time.monotonic() - start_s
-            remaining_s = passed_s / done * remaining
+            remaining_s = passed_s / done_count * remaining
             passed = format_duration(passed_s)
-            print_line(f"{done} of {trials} trials, {passed} passed, about {format_duration(remaining_s)} left")
+            print_line(f"{done_count} of {trials} trials, {passed} passed, about {format_duration(remaining_s)} left")
 
 
 def _search_command(request: SearchRequest, space: Mapping[str, Span], cases_at_ends: Sequence[Case]) -> SearchCommand:
@@ -164,7 +169,15 @@ def _store_result(request: SearchRequest, study: Study, trial: Trial, outcomes: 
 
 
 def _report_best(request: SearchRequest, study: Study) -> int:
-    """Print the best trial, and the command that repeats it. Return the exit code."""
+    """Print the best trial of a search, and the command that repeats it.
+
+    Args:
+        request: the options of the search.
+        study: the trials with their results.
+
+    Returns:
+        The exit code: 0; 1 if no trial has a result.
+    """
     if not study.get_trials(states=(TrialState.COMPLETE,)):
         print_line(f"no trial had a {request.goal}")
         return 1
@@ -172,8 +185,8 @@ def _report_best(request: SearchRequest, study: Study) -> int:
     print_line(f"best {request.goal}: {best.value:.4g}, trial {best.user_attrs[NUMBER]}")
     if request.rows:
         rows = ",".join(map(str, request.rows))
-        words = ["snakesim", "study", "evaluate", request.scenario, "--rows", rows]
-        print_line(f"  {_command_line(words, request.set, best.params)}")
+        command = ["snakesim", "study", "evaluate", request.scenario, "--rows", rows]
+        print_line(f"  {_command_line(command, request.set, best.params)}")
         return 0
     results = best.user_attrs[RESULTS]
     if len(results) > 1:
@@ -184,10 +197,10 @@ def _report_best(request: SearchRequest, study: Study) -> int:
         )
     table = compose_table(request.scenario, list(map(parse_set, request.set)))
     values = {**best.params, **dict.fromkeys(seed_keys(table), request.seed)}
-    words = ["snakesim", "run", request.scenario, "--clock-mode", "lockstep"]
+    command = ["snakesim", "run", request.scenario, "--clock-mode", "lockstep"]
     if table.values.get("mission", {}).get("goal"):
-        words.append("--until-goal")  # without a goal it would be refused
-    print_line(f"  {_command_line(words, request.set, values)}")
+        command.append("--until-goal")  # without a goal it would be refused
+    print_line(f"  {_command_line(command, request.set, values)}")
     return 0
 
 

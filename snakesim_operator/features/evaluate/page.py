@@ -16,12 +16,12 @@ PointOf = Callable[[ResultRow], Point | None]
 
 
 def render_page(title: str, source: str, rows: Sequence[ResultRow], failures: Sequence[tuple[str, str, str]]) -> str:
-    """Return the whole page as HTML.
+    """Return the page about an evaluation as HTML: its figures, the table of results, and the worst failures.
 
     Args:
         title: heading of the page.
         source: the suite file, or the command that stands for one.
-        rows: of the table.
+        rows: rows of the table of results.
         failures: of the worst cases, each with its name, how it ended, and the command that runs it again.
     """
     controllers = list(dict.fromkeys(row.controller for row in rows))
@@ -37,6 +37,8 @@ def render_page(title: str, source: str, rows: Sequence[ResultRow], failures: Se
             _draw_figure("Speed, m/s", rows, controllers, _quartiles_of("advance_m_s", of_crossed=True)),
             _draw_figure("Energy, J/m", rows, controllers, _quartiles_of("energy_j_per_m", of_crossed=True)),
             _draw_figure("Advance, m", rows, controllers, _quartiles_of("advance_m")),
+            _draw_figure("Net speed, m/s", rows, controllers, _quartiles_of("displacement_m_s")),
+            _draw_figure("Net energy, J/m", rows, controllers, _quartiles_of("displacement_energy_j_per_m")),
             _draw_figure("Stalled time, s", rows, controllers, _quartiles_of("stalled_s")),
         ],
         goals=any(row.crossed is not None for row in rows),
@@ -119,7 +121,7 @@ def _draw_trace(
         controller: Name of the controller.
         index: Index of its color.
         points: Rows with their values: middle, lower end and upper end of the interval.
-        over_number: Whether x is the number that is varied. Otherwise it is the number of the row.
+        over_number: Whether the horizontal axis is the number that is varied. Otherwise it is the number of the row.
         offset: Added to the number of the row, so that controllers do not hide each other.
     """
     x: list[float | None] = []

@@ -74,9 +74,14 @@ def hash_configurations(cases: Sequence[Case]) -> str:
 def open_study(path: Path, command: SearchCommand) -> Study:
     """Open the search that a file holds, or begin a search in an empty or new file.
 
+    Trials that another process began and did not finish are queued again.
+
     Args:
         path: The SQLite file; its folder is made if it does not exist.
         command: The search; it must be the same as the search in the file.
+
+    Returns:
+        The study of Optuna, with the trials so far.
 
     Raises:
         ConfigError: The file holds another search, or is not usable.
@@ -137,55 +142,65 @@ def _repeat_trials_without_result(study: Study) -> None:
 
 
 def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
-    """Raise a ConfigError that names each difference between the command in the file and this one."""
+    """Check that the search in a file is the one that this command asks for, because their trials would be mixed.
+
+    Args:
+        path: The file, for the message.
+        stored: The command in the file, as JSON values; it may be of any form.
+        command: The present command.
+
+    Raises:
+        ConfigError: The searches differ; the error names each difference.
+    """
     try:
-        there = msgspec.convert(stored, SearchCommand)
+        stored_command = msgspec.convert(stored, SearchCommand)
     except msgspec.ValidationError:
         raise ConfigError(
             f"--storage {path}: the file holds trials and does not contain the command that made them: an older "
             f"version or another program wrote it. Trials of two searches are not comparable; choose another file",
             code="evaluation/other-search",
         ) from None
-    here = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
-    differences = list(_differences(there, here))
+    this_command = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
+    differences = list(_differences(stored_command, this_command))
     if not differences:
         return
     raise ConfigError(
         f"--storage {path}: the file holds another search, whose trials are not comparable with this one's. "
-        f"{'; '.join(differences)}. Go on with that search by `{there.command_line(path)}`, or choose another file",
+        f"{'; '.join(differences)}. Go on with that search by "
+        f"`{stored_command.command_line(path)}`, or choose another file",
         code="evaluation/other-search",
     )
 
 
-def _differences(there: SearchCommand, here: SearchCommand) -> Iterator[str]:
+def _differences(stored: SearchCommand, requested: SearchCommand) -> Iterator[str]:
     """Yield each difference between two searches, in words of the command line.
 
     Args:
-        there: The search whose trials the file holds.
-        here: The search that this command asks for.
+        stored: The search whose trials the file holds.
+        requested: The search that the present command asks for.
     """
-    if there.scenario != here.scenario:
-        yield f"scenario: {there.scenario} there, {here.scenario} here"
-    if there.rows != here.rows:
-        yield f"--rows: {_format_rows(there)} there, {_format_rows(here)} here"
-    yield from _differing_keys("--vary", there.vary, here.vary)
-    yield from _differing_keys("--set", there.set, here.set)
-    if there.goal != here.goal:
-        yield f"--goal: {there.goal} there, {here.goal} here"
-    if there.direction != here.direction:
+    if stored.scenario != requested.scenario:
+        yield f"scenario: {stored.scenario} there, {requested.scenario} here"
+    if stored.rows != requested.rows:
+        yield f"--rows: {_format_rows(stored)} there, {_format_rows(requested)} here"
+    yield from _differing_keys("--vary", stored.vary, requested.vary)
+    yield from _differing_keys("--set", stored.set, requested.set)
+    if stored.goal != requested.goal:
+        yield f"--goal: {stored.goal} there, {requested.goal} here"
+    if stored.direction != requested.direction:
         set_or_not = {"minimize": "set", "maximize": "not set"}
-        yield f"--minimize: {set_or_not[there.direction]} there, {set_or_not[here.direction]} here"
-    if there.seeds != here.seeds:
-        yield f"--seeds: {there.seeds} there, {here.seeds} here"
-    if there.seed != here.seed:
-        yield f"--seed: {there.seed} there, {here.seed} here"
-    if there.code != here.code:
+        yield f"--minimize: {set_or_not[stored.direction]} there, {set_or_not[requested.direction]} here"
+    if stored.seeds != requested.seeds:
+        yield f"--seeds: {stored.seeds} there, {requested.seeds} here"
+    if stored.seed != requested.seed:
+        yield f"--seed: {stored.seed} there, {requested.seed} here"
+    if stored.code != requested.code:
         yield "the installed SnakeSIM has changed since then"
     # Other configurations follow from another command. They are a difference only if the command is the same.
     command_with_same_files = msgspec.structs.replace(
-        there, configurations=here.configurations, code=here.code, set_words=here.set_words
+        stored, configurations=requested.configurations, code=requested.code, set_words=requested.set_words
     )
-    if command_with_same_files == here and there.configurations != here.configurations:
+    if command_with_same_files == requested and stored.configurations != requested.configurations:
         yield "the same command gives another configuration: the files of scenario, robot, scene or suite have changed"
 
 

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import exported
 from snakesim_operator.features.evaluate.case import GAVE_UP, WALL_CLOCK_NUMBERS, Case, CaseOutcome, Number
+from snakesim_operator.results.signals import PARQUET_UNIT
 from snakesim_operator.results.summary import RunSummary
 
 CASES = "cases.jsonl"
@@ -51,10 +52,10 @@ class ResultStore:
 
 @contextmanager
 def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
-    """Open a folder's results for this process alone.
+    """Open the results in an evaluation's folder, and lock them for this process alone.
 
     Args:
-        folder: of the evaluation; it is made if it is missing.
+        folder: folder of the evaluation; it is made if it is missing.
         resume: whether the folder may hold results already.
 
     Raises:
@@ -102,9 +103,17 @@ def _read_results(path: Path, handle: int) -> Results:
 
 
 def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Path]:
-    """Write the results in the order of the cases, as Parquet and CSV, and return the paths.
+    """Write the results in the order of the cases, as Parquet and as CSV.
 
     No value depends on the wall clock, so two evaluations of the same cases give the same files.
+
+    Args:
+        folder: folder of the evaluation.
+        cases: all cases; those without a result are left out.
+        done: outcome of each finished case by its id.
+
+    Returns:
+        The paths of the two files.
     """
     columns = _column_types()
     rows: list[dict[str, Number]] = []
@@ -114,7 +123,9 @@ def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Pat
             rows.append({**outcome.numbers, **case.columns, "error": outcome.error})
     parquet_path = folder / PARQUET
     csv_path = folder / CSV
-    schema = pa.schema(list(columns.items()))
+    units = _find_units()
+    fields = [pa.field(name, type_, metadata=_describe_unit(units.get(name))) for name, type_ in columns.items()]
+    schema = pa.schema(fields)
     with exported(parquet_path) as partial:
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), partial)
     with exported(csv_path) as partial, partial.open("x", newline="", encoding="utf-8") as file:
@@ -147,3 +158,19 @@ def _column_types() -> dict[str, Any]:
     columns[GAVE_UP] = ARROW_TYPES[bool]
     columns["error"] = ARROW_TYPES[str]
     return columns
+
+
+def _find_units() -> dict[str, str]:
+    """Return the unit of each number of a run's summary that has one."""
+    units: dict[str, str] = {}
+    for name, hint in typing.get_type_hints(RunSummary, include_extras=True).items():
+        for note in getattr(hint, "__metadata__", ()):
+            unit = (note.extra_json_schema or {}).get("unit")
+            if unit is not None:
+                units[name] = unit
+    return units
+
+
+def _describe_unit(unit: str | None) -> dict[bytes, bytes] | None:
+    """Return the metadata of a column of Parquet."""
+    return None if unit is None else {PARQUET_UNIT: unit.encode()}

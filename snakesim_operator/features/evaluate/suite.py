@@ -190,15 +190,15 @@ def _check_names_differ(settings: Sequence[SuiteSetting], source: str) -> None:
 
 
 def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: int, seed: int) -> list[Case]:
-    """Return every case in the order of the table, with its whole configuration.
+    """Return every case of a suite in the order of the table, with its whole configuration.
 
     The values that the suite sets are checked here on the first field of each row. A later field that cannot be laid
     out is named in its result.
 
     Args:
         suite: the suite.
-        source: where it came from, for messages.
-        controllers: to try; none: that of the scenario.
+        source: the suite's file, for messages.
+        controllers: controllers to try; none: that of the scenario.
         fields: number of fields for each row and controller.
         seed: number of the first field.
 
@@ -289,6 +289,11 @@ def _configure_field(table: Table, field: int, randomizations: Sequence[Randomiz
 
 def _find_randomizations(suite: Suite, without: Sequence[str], where: str) -> list[Randomization]:
     """Return the suite's randomizations without the keys that a row leaves out.
+
+    Args:
+        suite: the suite, with its randomizations.
+        without: keys that the row does not randomize.
+        where: the row, for the message.
 
     Raises:
         ConfigError: The row leaves out a key that is not randomized.

@@ -9,11 +9,26 @@ import numpy as np
 
 from snakesim_operator.features.evaluate.case import GAVE_UP, Case, CaseOutcome
 from snakesim_operator.features.evaluate.store import Results
+from snakesim_operator.results.metrics.intervals import Z95, mean_interval
 
-Z95 = 1.959964  # two-sided 95 % quantile of the normal distribution
-T95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)  # of Student's t, for 1 to 8 degrees of freedom
 UNKNOWN = "–"
-HEAD = ("setting", "controller", "crossed", "95 %", "m", "95 % of m", "m/s", "J/m", "stood s", "time s", "errors")
+HEAD = (
+    "setting",
+    "controller",
+    "crossed",
+    "95 %",
+    "m",
+    "95 % of m",
+    "m/s",
+    "J/m",
+    "net m",
+    "95 % of net m",
+    "net m/s",
+    "net J/m",
+    "stood s",
+    "time s",
+    "errors",
+)
 TEXT_COLUMNS = 2  # setting and controller: always shown, and aligned to the left
 MAX_FAILURES = 5  # that are listed
 
@@ -72,9 +87,10 @@ class ResultRow:
             self._crossed_of_runs(),
             self._crossed_interval(),
             _format_median(self.values("advance_m"), 2),
-            self._advance_interval(),
+            self._mean_interval("advance_m"),
             _format_median(self.values("advance_m_s", of_crossed=True), 3),
             _format_median(self.values("energy_j_per_m", of_crossed=True), 1),
+            *self._net_displacement_cells(),
             _format_median(self.values("stalled_s"), 1),
             _format_median(self.values(duration, of_crossed=True), 1),
             str(self.errors or ""),
@@ -91,12 +107,23 @@ class ResultRow:
         low, high = wilson_interval(self.crossed, self.runs)
         return f"{100 * low:.0f}-{100 * high:.0f}"
 
-    def _advance_interval(self) -> str:
-        """Return the interval of the mean advance; with a goal, the success rate has an interval instead."""
-        advances_m = self.values("advance_m")
-        if self.crossed is not None or len(advances_m) < 2:
+    def _net_displacement_cells(self) -> list[str]:
+        """Return what the runs did along their net displacement; with a goal, the advance towards it counts instead."""
+        if self.crossed is not None:
+            return [UNKNOWN] * 4
+        return [
+            _format_median(self.values("net_displacement_m"), 2),
+            self._mean_interval("net_displacement_m"),
+            _format_median(self.values("displacement_m_s"), 3),
+            _format_median(self.values("displacement_energy_j_per_m"), 1),
+        ]
+
+    def _mean_interval(self, name: str) -> str:
+        """Return the interval of a mean; with a goal, the success rate has an interval instead."""
+        values = self.values(name)
+        if self.crossed is not None or len(values) < 2:
             return UNKNOWN
-        low, high = mean_interval(advances_m)
+        low, high = mean_interval(values)
         return f"{low:.2f} to {high:.2f}"
 
 
@@ -169,30 +196,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(center - half_width, 0.0), min(center + half_width, 1.0)
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the mean of two or more values: mean -+ t s / sqrt(n), by Student's t."""
-    mean = float(np.mean(values))
-    standard_error = float(np.std(values, ddof=1)) / math.sqrt(len(values))
-    half_width = _student_t95(len(values) - 1) * standard_error
-    return mean - half_width, mean + half_width
-
-
-def _student_t95(degrees_of_freedom: int) -> float:
-    """Return the two-sided 95 % quantile of Student's t: from a table, or by its expansion in 1 / n.
-
-        t = z + (z^3 + z) / (4 n) + (5 z^5 + 16 z^3 + 3 z) / (96 n^2)
-
-    Source: Abramowitz and Stegun, table 26.10 and equation 26.7.5.
-    """
-    n = degrees_of_freedom
-    if n <= len(T95):
-        return T95[n - 1]
-    z = Z95
-    first = (z**3 + z) / 4
-    second = (5 * z**5 + 16 * z**3 + 3 * z) / 96
-    return z + first / n + second / n**2
-
-
 def _format_median(values: list[float], digits: int) -> str:
     if not values:
         return UNKNOWN
@@ -221,7 +224,11 @@ def _advance_fraction(outcome: CaseOutcome) -> float:
 
 
 def _describe_end(outcome: CaseOutcome) -> str:
-    """Return how far a run came, what its controller reported last, and how it ended."""
+    """Describe the end of one run: its advance, the last state that its controller reported, and how it ended.
+
+    Args:
+        outcome: the numbers of the run's summary, or the error of a case that could not run.
+    """
     if outcome.error is not None:
         return outcome.error
     numbers = outcome.numbers

@@ -4,14 +4,22 @@ import argparse
 
 from snakesim_hal.programs.arguments import add_out, number_type
 from snakesim_hal.programs.commands import Command, Commands
-from snakesim_operator.playback.arguments import add_recording, add_span
+from snakesim_operator.playback.arguments import add_span
 
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim recording plot`."""
-    add_recording(parser)
     parser.add_argument(
-        "signals", nargs="*", metavar="SIGNAL", help="a pair of axes each (default: angle_rad torque_nm)"
+        "arguments",
+        nargs="+",
+        metavar="RUN [RUN ...] [SIGNAL ...]",
+        help="folders of runs or MCAP files, which are overlaid; then signals, a pair of axes each (default: angle_rad "
+        "torque_nm)",
+    )
+    parser.add_argument(
+        "--mean",
+        action="store_true",
+        help="draw runs that differ in their seeds alone as their mean, with its 95 %% interval by Student's t",
     )
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument("--path", action="store_true", help="instead: the paths of head and tail, from above")
@@ -41,9 +49,9 @@ def _plot(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.figures.drawn import plot
 
     return plot(
-        arguments.recording,
-        arguments.signals,
+        arguments.arguments,
         arguments.out,
+        mean=arguments.mean,
         paper=arguments.paper,
         path=arguments.path,
         width_in=arguments.width_in,
@@ -55,15 +63,15 @@ def _plot(arguments: argparse.Namespace) -> int:
 COMMANDS: Commands = (
     Command(
         name="recording plot",
-        help="Draw figures of a run for a paper: signals over time, the path, or those of the SnakeSIM paper.",
+        help="Draw figures of runs for a paper: signals over time, the path, or those of the SnakeSIM paper.",
         add=_add_plot,
         run=_plot,
         details="Signals are named as in `snakesim recording export`. A comma puts several of one unit on one pair of "
-        "axes: angle_rad.joint_7,target.joint_7. Exit code: 0; 2 wrong input; 3 made, but something is missing in the "
-        "recording.",
+        "axes: angle_rad.joint_7,target.joint_7. Several runs are overlaid, each in its color. Exit code: 0; 2 wrong "
+        "input; 3 made, but something is missing in a recording.",
         examples=(
-            "recording plot runs/demo --path --out demo.png",
             "recording plot runs/demo angle_rad.joint_7,target.joint_7 torque_nm --from 2 --to 6",
+            "recording plot runs/a runs/b runs/c velocity_b_m_s.x --mean --out speed.png",
         ),
     ),
 )

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.from_above import OBSTACLE, plot_body, plot_obstacles
+from snakesim_operator.features.figures.legends import place_legend_beside_title
 from snakesim_operator.features.figures.lines import Floats, plot_over_time
 from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
 from snakesim_operator.results.report.snapshots import Balance, Snapshot, balanced_snapshots
@@ -168,7 +169,7 @@ def _draw_joints(
             )
         name = record.description.joints[joint].name
         axes.set_title(f"({letter}) {name}", loc="left", fontsize=TITLE_FONT_SIZE)
-    all_axes[0].legend(loc="best")
+    place_legend_beside_title(all_axes[0])
     all_axes[-1].set_xlim(*span_s)
     all_axes[-1].set_xlabel("time [s]")
     return figure

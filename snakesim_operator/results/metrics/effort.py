@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, Advance, energy_j, energy_j_per_m
+from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, Advance, energy_j_per_m
 from snakesim_operator.results.metrics.form_closure import contacts_beside, form_closure_margin
 from snakesim_operator.results.run_log import RunRecord
 
@@ -45,16 +45,10 @@ class Effort:
         cost_of_transport = None
         if has_power:
             cost_of_transport = _cost_of_transport(record, advance)
-        # Dragging the robot over flat ground costs its weight times the friction: compare with that.
-        propulsive_efficiency = None
-        ground = record.config.scene.ground
-        is_flat = ground.heightfield is None
-        if cost_of_transport is not None and cost_of_transport > 0 and is_flat:
-            propulsive_efficiency = ground.friction / cost_of_transport
         return Effort(
-            body_lengths_s=advance.reached_m / advance.until_s / _body_length_m(record),
+            body_lengths_s=advance.reached_m / advance.until_s / body_length_m(record),
             cost_of_transport=cost_of_transport,
-            propulsive_efficiency=propulsive_efficiency,
+            propulsive_efficiency=propulsive_efficiency(record, cost_of_transport),
             jam_ratio=min(advance.stalled_s / advance.until_s, 1.0),
             impulse_n_s_per_m=_impulse_n_s_per_m(record, advance),
             torque_headroom=_torque_headroom(record, advance),
@@ -63,72 +57,26 @@ class Effort:
         )
 
 
-@dataclass(frozen=True)
-class Directions:
-    """The effort of a whole run along two directions: the first heading of the body, and its net displacement.
-
-    A body that travels sideways goes far, but hardly along its heading. None: unknown, or the distance is too short
-    to tell.
-    """
-
-    heading_advance_m: float | None = None
-    heading_energy_j_per_m: float | None = None
-    heading_body_lengths_s: float | None = None
-    heading_cost_of_transport: float | None = None
-    displacement_energy_j_per_m: float | None = None
-    displacement_body_lengths_s: float | None = None
-    displacement_cost_of_transport: float | None = None
-
-    @staticmethod
-    def from_run(
-        record: RunRecord, advance: Advance | None, net_m: float | None, known_s: float, *, has_power: bool
-    ) -> "Directions":
-        """Compute speed and energy use along the heading, and along the net displacement of the center of mass.
-
-        Args:
-            record: The recorded run.
-            advance: How the run advanced; None: the pose is unknown.
-            net_m: Length of the net displacement of the center of mass, in m; None: unknown.
-            known_s: Time within which that displacement was measured, in s.
-            has_power: Whether torques and speeds are known, so that the energy can be computed.
-
-        Returns:
-            The values. All are None if the displacement is unknown; those of energy are None without power.
-        """
-        if advance is None or net_m is None or known_s <= 0:
-            return Directions()
-        body_length_m = _body_length_m(record)
-        weight_n = _weight_n(record)
-        used_j = energy_j(record) if has_power else None
-
-        heading_m = float(advance.along_heading_m[-1])
-        heading_j_per_m = _energy_per_distance(used_j, heading_m)
-        heading_cost_of_transport = None
-        if heading_j_per_m is not None:
-            heading_cost_of_transport = heading_j_per_m / weight_n
-
-        displacement_j_per_m = _energy_per_distance(used_j, net_m)
-        displacement_cost_of_transport = None
-        if displacement_j_per_m is not None:
-            displacement_cost_of_transport = displacement_j_per_m / weight_n
-
-        return Directions(
-            heading_advance_m=heading_m,
-            heading_energy_j_per_m=heading_j_per_m,
-            heading_body_lengths_s=heading_m / known_s / body_length_m,
-            heading_cost_of_transport=heading_cost_of_transport,
-            displacement_energy_j_per_m=displacement_j_per_m,
-            displacement_body_lengths_s=net_m / known_s / body_length_m,
-            displacement_cost_of_transport=displacement_cost_of_transport,
-        )
-
-
-def _body_length_m(record: RunRecord) -> float:
+def body_length_m(record: RunRecord) -> float:
+    """Return the length of the straight body in m."""
     return sum(link.length_m for link in record.description.links)
 
 
-def _weight_n(record: RunRecord) -> float:
+def weight_n(record: RunRecord) -> float:
+    """Return the weight of the body in N."""
     return GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)
+
+
+def propulsive_efficiency(record: RunRecord, cost_of_transport: float | None) -> float | None:
+    """Return the energy that dragging the robot over flat ground costs, over the energy that its joints used.
+
+    Dragging costs the weight times the friction. None: the cost of transport is unknown, or the ground is not flat.
+    """
+    ground = record.config.scene.ground
+    is_flat = ground.heightfield is None
+    if cost_of_transport is None or cost_of_transport <= 0 or not is_flat:
+        return None
+    return ground.friction / cost_of_transport
 
 
 def _cost_of_transport(record: RunRecord, advance: Advance) -> float | None:
@@ -136,14 +84,7 @@ def _cost_of_transport(record: RunRecord, advance: Advance) -> float | None:
     per_m = energy_j_per_m(record, advance)
     if per_m is None:
         return None
-    return per_m / _weight_n(record)
-
-
-def _energy_per_distance(used_j: float | None, distance_m: float) -> float | None:
-    """Return energy per meter, or None if the energy is unknown or the distance too short."""
-    if used_j is None or distance_m < MIN_DISTANCE_M:
-        return None
-    return used_j / distance_m
+    return per_m / weight_n(record)
 
 
 def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
@@ -178,7 +119,7 @@ def _form_closure_fraction(record: RunRecord, advance: Advance) -> float | None:
     if not len(outlines):
         return 0.0
     radius_m = record.description.links[0].radius_m
-    half_length_m = 0.5 * _body_length_m(record)
+    half_length_m = 0.5 * body_length_m(record)
     end_time_s = record.time_s[0] + advance.until_s
     end_row = int(np.searchsorted(record.time_s, end_time_s))
     row_step = max(round(FORM_CLOSURE_PERIOD_NS / record.description.period_ns), 1)

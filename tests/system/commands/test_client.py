@@ -23,6 +23,7 @@ pytestmark = pytest.mark.e2e
 
 CLIENT, STEER, STOP = (REPOSITORY / "examples" / name for name in ("client.py", "steer.py", "stop.py"))
 DEPTH = 8192
+LATENCY_TICKS = 2  # of control in this scenario: so many commands may be on their way
 ROBOT = ("triplet", "--set", "rate_hz=50", "--duration", "600", "--stay", "--clock-mode")
 EXTERNAL = ("--set", "services.control.external=true")
 
@@ -82,7 +83,9 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: Running) -> None:
         assert max(furthest[:2] + furthest[3:]) < 0.03, furthest
         now = status(session)
         assert now.lifecycle == "disarmed"
-        assert now.commands_rejected in ({}, {"no_lease": 1})  # its last, if that arrives after it has left
+        assert set(now.commands_rejected) <= {"no_lease"}
+        # The last ones, if the host notices first that the client has left.
+        assert now.commands_rejected.get("no_lease", 0) <= LATENCY_TICKS
         assert now.commands_accepted > 50
         assert {fault.what for fault in now.faults} <= {"service_lost"}
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.run_log.host_record import HOST_RECORD
 from snakesim_operator.results.run_reader import REPORT
-from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import SNAKESIM, Ended, background, environment, run_to_summary, snakesim
 
@@ -207,7 +207,7 @@ def test_evaluate_interrupted_stops_at_once_and_keeps_only_results(command: str,
 
 def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Where a scheduler of our own will listen, and what Dask is told to be it and a worker."""
-    port = free_endpoint().rpartition(":")[2]
+    port = str(find_free_port())
     address = f"tcp://127.0.0.1:{port}"
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
     worker = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.playback.export import arrays
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.signals import arrays
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -36,7 +36,7 @@ def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     assert ended.code == 0, ended.err
     written = words(out)
     assert {"[rad]", "torque_nm [N·m]", "contact_count", "time [s]"} <= set(written)
-    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.00", "2.50"} <= set(written)
+    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.0", "2.5"} <= set(written)
     light = out.read_text()
     assert snakesim("recording", "plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
     white = "fill: #ffffff"  # the ground, or all that is written on it
@@ -55,13 +55,49 @@ def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Pa
 
 @pytest.mark.slow
 def test_every_signal_of_a_run_is_drawn(run: Path) -> None:
-    from snakesim_operator.features.figures.drawn import draw_signals
+    from snakesim_operator.features.figures.run_groups import make_single_groups
+    from snakesim_operator.features.figures.signal_axes import draw_signals
 
     record = RunRecord.load(run)
     signals = [name for name in arrays(record) if name != "time_s"]
-    axes = draw_signals(record, signals, 3.5, (0.0, 3.0)).axes
+    axes = draw_signals(make_single_groups([record]), signals, 3.5, (0.0, 3.0)).axes
     empty = [name for name, ax in zip(signals, axes, strict=True) if not ax.lines]
     assert empty == []
+
+
+@pytest.mark.slow
+def test_runs_are_overlaid_and_their_mean_has_an_interval(run: Path, tmp_path: Path) -> None:
+    other, _ = run_to_summary(tmp_path / "other", "triplet", "--duration", "2", "--seed", "7")
+    longer, _ = run_to_summary(tmp_path / "longer", "triplet", "--duration", "3", "--seed", "7")
+    assert other.code == longer.code == 0
+    signals = ["velocity_b_m_s.x,velocity_b_m_s.y", "link_force_n"]
+    runs = [str(run), str(tmp_path / "other"), str(tmp_path / "longer")]
+
+    overlaid = snakesim("recording", "plot", *runs, *signals, "--out", "overlaid.svg", cwd=tmp_path)
+    assert overlaid.code == 0, overlaid.err
+    written = words(tmp_path / "overlaid.svg")
+    assert {"run", "other", "longer", "other: velocity_b_m_s.y", "[m/s]", "link_force_n [N]"} <= set(written)
+
+    meant = snakesim("recording", "plot", *runs, *signals, "--mean", "--out", "mean.svg", cwd=tmp_path)
+    assert meant.code == 0, meant.err
+    assert "duration_s 3 (mean of 2 runs), with its 95 % interval by Student's t; until 2.99 s" in meant.out
+    assert {"duration_s 3 (mean of 2 runs)", "duration_s 2 (1 run)"} <= set(words(tmp_path / "mean.svg"))
+    assert (tmp_path / "mean.svg").read_text().count("FillBetweenPolyCollection") == 2 + 14
+
+
+@pytest.mark.slow
+def test_no_legend_covers_the_axes(run: Path) -> None:
+    from snakesim_operator.features.figures.run_groups import make_single_groups
+    from snakesim_operator.features.figures.signal_axes import draw_signals
+
+    groups = make_single_groups([RunRecord.load(run)])
+    figure = draw_signals(groups, ["angle_rad", "angle_rad.joint_1,target.joint_1"], 3.5, (0.0, 3.0))
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        legend = axes.get_legend()
+        assert legend is not None
+        assert legend.get_window_extent().y0 >= axes.get_window_extent().y1
+        assert legend.get_window_extent().x1 <= figure.bbox.x1
 
 
 @pytest.mark.slow
@@ -90,6 +126,8 @@ def test_the_papers_figures_come_from_one_command(run: Path) -> None:
         (["--out", "plot.docx"], "give a file that ends in .pdf, .svg, .png"),
         (["--paper", "--out", "one.pdf"], "several files; give a folder"),
         (["--paper", "--from", "2.98"], "at no time within it"),
+        (["angle_rad", "--mean"], "one run has no mean"),
+        (["angle_rad", "--path"], "draw one run, without signals"),
         (["--path", "--from", "9"], "the pose is unknown in this part of the run"),
     ],
 )

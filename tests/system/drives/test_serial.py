@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_hal.network.free_ports import find_free_port
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snakesim
 from snakesim_testing.harness.endpoint import free_endpoint
@@ -30,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pose(folder: Path) -> Iterator[str]:
     """Servos on `./servos`; where they send the pose."""
-    address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
+    address = f"127.0.0.1:{find_free_port()}"
     said, first = folder / "servos.said", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
     with said.open("wb") as file:
         servos = subprocess.Popen(

@@ -16,10 +16,10 @@ import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.certificates import Issuer, issue, make_authority
 from snakesim_operator.features.lab.identities import Identity
-from snakesim_testing.harness.endpoint import free_port
 from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER, OWN, SmallLab, opened
 
@@ -131,7 +131,7 @@ def test_bytes_that_are_sent_again_command_nothing(lab: SmallLab) -> None:
 def test_a_role_cannot_pose_as_the_router(lab: SmallLab) -> None:
     """A viewer's certificate at the router's address: nobody gives it a command."""
     viewer, gnc = lab.who(Role.VIEWER, OWN), lab.who(Role.GNC, OWN)
-    endpoint = f"tls/127.0.0.1:{free_port()}"
+    endpoint = f"tls/127.0.0.1:{find_free_port()}"
     settings = lab.settings(viewer, mode="router", listen={"endpoints": [endpoint]}, connect={"endpoints": []})
     tls = settings["transport"]["link"]["tls"]
     tls.update(listen_certificate=tls["connect_certificate"], listen_private_key=tls["connect_private_key"])

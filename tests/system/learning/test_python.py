@@ -18,7 +18,7 @@ import pytest
 import snakesim
 from snakesim.environments import SnakeEnv
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.playback.export import UNITS
+from snakesim_operator.results.signals import UNITS
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.command import call
 from snakesim_testing.messages import raises_error

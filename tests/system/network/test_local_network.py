@@ -1,10 +1,16 @@
 """Sessions within one process do what those on a network do."""
 
+import math
+from unittest import mock
+
 from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.host.inbox import Inbox
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.streams import Query
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Done, LeaseRequest
+from snakesim_hal.wire.codec import encode
+from snakesim_hal.wire.messages import Answer, Done, JointCommand, LeaseRequest
+from snakesim_testing.hal.small_robots import command, description
 from snakesim_testing.messages import raises_error
 
 REQUEST = LeaseRequest(action="acquire", holder="control")
@@ -51,3 +57,41 @@ def test_who_is_asked_answers_before_the_question_returns() -> None:
         client.request(keys.LEASE, REQUEST, timeout_s=0.01, host="b")
     with raises_error(NotConnectedError, code="network/no-answer"):
         client.request(keys.ESTOP, REQUEST)
+
+
+def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -> None:
+    network = LocalNetwork()
+    sender, one, other = network.session(), network.session(), network.session()
+    readers = [session.reader(keys.done_key("control"), Done) for session in (one, other)]
+    sent = Done(tick=4)
+    sender.publisher(keys.done_key("control"), Done).put(sent)
+    (first,), (second,) = (reader.drain() for reader in readers)
+    assert first is second
+    assert first == sent
+    assert first is not sent  # the sender's own message is encoded, and never handed to a reader
+
+
+def test_each_reader_checks_what_no_reader_could_decode() -> None:
+    network = LocalNetwork()
+    sender, one, other = network.session(), network.session(), network.session()
+    key = keys.done_key("control")
+    readers = [one.reader(key, Done), other.reader(key, Done), other.reader(key, Answer)]
+    publisher = sender.publisher(key, Done)
+    publisher.put(Done(tick=4), encode(Done(tick=-4)))
+    assert [reader.drain() for reader in readers] == [[], [], []]
+    assert one.rejected == {"malformed": 1}
+    assert other.rejected == {"malformed": 1, "unknown_message": 1}
+
+
+def test_host_shares_no_command_with_the_readers_of_its_process() -> None:
+    network = LocalNetwork()
+    sender, reading, host = network.session(), network.session(), network.session()
+    reader = reading.reader(keys.JOINT_COMMAND, JointCommand)
+    receiver = mock.Mock()
+    inbox = Inbox(host, receiver, [], lambda _query, _answer: None)
+    sender.publisher(keys.JOINT_COMMAND, JointCommand).put(command(description(), 0.1))
+    (read,) = reader.drain()
+    read.target[0] = 3.0  # as a careless service might
+    inbox.handle_queued(math.inf)
+    received = receiver.on_command.call_args.args[0]
+    assert set(received.target) == {0.1}

@@ -79,11 +79,16 @@ def test_process_entry_with_other_version_is_reported_while_alive(
         5.0,
     )
     newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
-    there.latched_publisher(key, Process).put(newer)
+    shown = there.latched_publisher(key, Process)
+    shown.put(newer)
     wait_until(
         lambda: "message JointCommand version 2 (here " in "".join(entries.find_problems(own, ["control"])),
-        "told",
+        "the difference",
         5.0,
     )
+    shown.put(msgspec.structs.replace(own, name="control"))
+    wait_until(lambda: entries.find_problems(own, ["control"]) == [], "no difference any more", 5.0)
+    shown.put(newer)
+    wait_until(lambda: entries.find_problems(own, ["control"]) != [], "the difference again", 5.0)
     there.close()
     wait_until(lambda: entries.find_problems(own, ["control"]) == [], "gone", 5.0)

@@ -24,7 +24,7 @@ class Pressed:
         config = make_config(scene={"ground": {"friction": 0.0}, "box": [wall]})
         self.sim, self.data, self.physics = lie_down(config, SimSettings(timestep_s=step_s))
         self.model = self.sim.model
-        self._touches = TouchReader(self.sim, self.data, self.physics)
+        self._touches = TouchReader(self.sim, self.data, self.physics.contacts)
         self.links = len(self.sim.link_geoms)
         first = self.sim.first_link_body
         self.forces_w = self.data.xfrc_applied[first : first + self.links]

@@ -1,11 +1,37 @@
 """Processes of a run, from the outside."""
 
 import signal
+import socket
 import time
+from pathlib import Path
 
 import pytest
 
-from snakesim_operator.run.children import start_child
+from snakesim_hal.base.errors import NotConnectedError
+from snakesim_hal.network.session import Link
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.recorder_process import record_to_file
+from snakesim_operator.run import children
+from snakesim_operator.run.children import start_child, stop_all
+from snakesim_operator.run.ending import Ending
+from snakesim_operator.run.run_files import RunFiles
+from snakesim_operator.run.supervisor import Supervisor
+from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.wait import wait_until
+from snakesim_testing.messages import raises_error
+
+DEAF = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def recorder_arguments(out: Path) -> list[str]:
+    """The command line of a recorder whose network is never opened."""
+    endpoint = free_endpoint()
+    return ["snakesim_operator.recording.recorder_process", "triplet", "--endpoint", endpoint, "--out", str(out)]
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
@@ -17,3 +43,41 @@ def test_an_interrupt_while_a_child_starts_leaves_no_traceback(after_s: float) -
     assert child.process.wait(30) == 0, child.output.last_lines()
     assert child.output.last_lines()
     assert b"Traceback" not in said
+
+
+def test_recorder_that_waits_for_a_network_ends_at_once(tmp_path: Path) -> None:
+    """The network of a run that ends at once is gone before a slow recorder has started."""
+    recorder = start_child("recorder", recorder_arguments(tmp_path), lambda _output: None)
+    time.sleep(3.0)  # it has started, and waits; if the computer is slow, it still starts
+    stop_all([recorder])
+    assert recorder.process.returncode == -signal.SIGTERM
+    assert not recorder.was_killed
+    assert not (tmp_path / RECORDING).exists(), "a file that nobody has closed"
+
+
+def test_recording_that_is_stopped_before_there_is_a_network_says_so(tmp_path: Path) -> None:
+    with raises_error(NotConnectedError, code="network/nothing-listens"):
+        record_to_file(Link(free_endpoint(), "worm"), tmp_path / RECORDING, lambda: False)
+    assert not (tmp_path / RECORDING).exists()
+
+
+def test_child_that_is_ended_while_it_starts_is_reported_as_such(tmp_path: Path) -> None:
+    printed: list[str] = []
+    files = RunFiles(tmp_path, printed.append)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stop_port:
+        supervisor = Supervisor(files, Ending(), printed.append, stop_port)
+        supervisor.start("recorder", recorder_arguments(tmp_path), vital=False)
+        supervisor.end()
+    files.close()
+    assert supervisor.lost == {"recorder": "recorder had not started when the run ended"}
+    assert printed == ["warning: recorder had not started when the run ended: there is nothing of it"]
+
+
+def test_child_that_does_not_end_is_killed_and_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "deaf.py").write_text(DEAF)
+    monkeypatch.setattr(children, "STOP_LIMIT_S", 0.2)
+    said = bytearray()
+    child = start_child("control", ["deaf"], said.extend, more={"PYTHONPATH": str(tmp_path)})
+    wait_until(lambda: b"ready" in said, "a child that ignores SIGTERM")
+    stop_all([child])
+    assert child.describe_end() == "control was killed: it had not ended 0.2 s after the request to end"

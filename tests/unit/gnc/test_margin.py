@@ -114,6 +114,6 @@ def test_margin_contacts_with_extra_cost_leave_push_to_others(tail_s_m: float) -
     dearer[three] = 0.0
     push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005, extra_cost=dearer)
     usual = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
-    assert push.rest < 0.1
+    assert push.residual < 0.1
     assert np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
     assert len(touches) == 3 or np.delete(usual.lambdas, three).sum() > np.delete(push.lambdas, three).sum()

@@ -140,8 +140,8 @@ def test_the_random_scenes_reach_what_they_are_to_compare() -> None:
     assert ((margins_n > 0.0) & (margins_n < SEARCH.wanted_margin_n)).any()
 
 
-def make_task(lying_drag_m: Floats) -> SearchTask:
-    return SearchTask(origin_w=np.zeros(2), goal_rad=0.0, goal_w=np.array([1.0, 0.0]), lying_drag_m=lying_drag_m)
+def make_task(initial_drag_m: Floats) -> SearchTask:
+    return SearchTask(origin_w=np.zeros(2), goal_rad=0.0, goal_w=np.array([1.0, 0.0]), initial_drag_m=initial_drag_m)
 
 
 def start_layer() -> NodeLayer:
@@ -150,7 +150,7 @@ def start_layer() -> NodeLayer:
 
 @needs_library
 def test_an_array_of_a_wrong_size_is_named() -> None:
-    task = make_task(lying_drag_m=np.zeros((BODY_ARCS - 1, 3)))
+    task = make_task(initial_drag_m=np.zeros((BODY_ARCS - 1, 3)))
     message = r"the drag of the lying body has the shape \(19, 3\), the C library of the planner expects \(20, 3\)"
     with pytest.raises(NativeGrowthError, match=message):
         NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=5)
@@ -158,7 +158,7 @@ def test_an_array_of_a_wrong_size_is_named() -> None:
 
 @needs_library
 def test_no_more_layers_than_there_is_room_for() -> None:
-    task = make_task(lying_drag_m=np.zeros((BODY_ARCS, 3)))
+    task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
     paths = NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)
     assert paths.trace_cheapest() is None
     assert paths.grow()
@@ -198,6 +198,6 @@ def test_without_the_library_the_specification_plans() -> None:
     nodes, path = finish(BeamSearch(ObstacleGrid([]), SEARCH).search_ahead(body_w, 0.0, 3))
     assert nodes[0] == 1
     assert path is not None
-    task = make_task(lying_drag_m=np.zeros((BODY_ARCS, 3)))
+    task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
     with pytest.raises(NativeGrowthError, match="SNAKESIM_NATIVE"):
         NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)

@@ -13,27 +13,27 @@ def watch() -> StallWatch:
     return StallWatch(stall_m=0.005, stall_s=1.0, propulsion_n=35.0)
 
 
-def stands_after(stall_watch, seconds, *, speed_m_s=0.0, force_n=35.0) -> float | None:
+def stalled_after(stall_watch, seconds, *, speed_m_s=0.0, force_n=35.0) -> float | None:
     for tick in range(round(seconds * 100) + 1):
-        if stall_watch.stands(tick * 0.01, speed_m_s * tick * 0.01, force_n):
+        if stall_watch.has_stalled(tick * 0.01, speed_m_s * tick * 0.01, force_n):
             return tick * 0.01
     return None
 
 
 def test_standing_is_noticed_after_the_window():
-    assert stands_after(watch(), 2.0) == pytest.approx(1.0)
+    assert stalled_after(watch(), 2.0) == pytest.approx(1.0)
 
 
 def test_moving_or_not_pushing_is_no_stall():
-    assert stands_after(watch(), 5.0, speed_m_s=0.006) is None
-    assert stands_after(watch(), 5.0, force_n=17.0) is None
+    assert stalled_after(watch(), 5.0, speed_m_s=0.006) is None
+    assert stalled_after(watch(), 5.0, force_n=17.0) is None
 
 
 def test_forgetting_starts_a_new_window():
     stall_watch = watch()
-    stands_after(stall_watch, 0.9)
-    stall_watch.forget()
-    assert stands_after(stall_watch, 0.9) is None
+    stalled_after(stall_watch, 0.9)
+    stall_watch.reset()
+    assert stalled_after(stall_watch, 0.9) is None
 
 
 def world_with(*forces: tuple[str, float, float], timestamp_ns: int = 1) -> World:

@@ -56,10 +56,11 @@ class Simulation:
     """One version of the laws in a scene."""
 
     def __init__(self, config: RunConfig, laws: LawsVersion) -> None:
-        self.sim: SimModel = build(config, SimSettings(), laws=laws)
+        self.sim: SimModel = build(config, SimSettings(), laws=laws, measures_force=True)
         self.model = self.sim.model
         self.data = mujoco.MjData(self.model)
         self.physics = Physics(self.sim, self.data)
+        self.measured_force = self.physics.measure_force()
 
     def go(self, state: "State", min_friction: float) -> list[Floats]:
         """Begin at a state, and step. Returns everything that the laws compute."""
@@ -68,6 +69,7 @@ class Simulation:
         self.data.qvel[:] = state.velocities
         self.physics.set_min_friction(min_friction)
         self.physics.begin()
+        self.measured_force = self.physics.measure_force()
         results = self._list_results()
         for _ in range(STEPS_PER_STATE):
             self.data.qfrc_applied[:] = state.forces
@@ -86,6 +88,7 @@ class Simulation:
             np.array(contacts.normal_force_n),
             np.array([[number, *forces_w[number]] for number in sorted(forces_w)]),
             np.zeros(0) if feet is None else feet.copy(),
+            np.array([self.measured_force.max_n]),
         ]
 
 
@@ -141,16 +144,20 @@ def compare(scene: str, states: int) -> None:
     plugin = Simulation(config, "c")
     random = np.random.default_rng(7)
     rubbing = 0
+    pushed = 0
     for number in range(states):
         state = State(specification.model, random)
         min_friction = float(random.choice([0.0, 0.0, 2.0]))
         expected = specification.go(state, min_friction)
         computed = plugin.go(state, min_friction)
         rubbing += len(specification.physics.contacts.friction_force_w)
+        pushed += specification.measured_force.max_n > 0.0
         for wanted, got in zip(expected, computed, strict=True):
             assert wanted.tobytes() == got.tobytes(), f"state {number}: {wanted - got}"
     if scene != "flat ground":
         assert rubbing > states / 10, "too few states have contacts with friction"
+    if "pegs" in scene or "obstacle" in scene:
+        assert pushed > states / 10, "too few states have contacts with obstacles"
 
 
 def test_forces_may_be_computed_any_number_of_times_without_changing_the_next_step() -> None:

@@ -1,13 +1,19 @@
-"""Forces between links and obstacles that the C laws write into the state, against those that Python reads."""
+"""Forces between links and obstacles: those that the C library writes into the state, and those that Python reads."""
 
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
+from snakesim_hal.backend import SafeSetpoints
+from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.batch.placed import place
-from snakesim_sim_backend.laws.version import choose_laws
+from snakesim_sim_backend.laws.version import LawsVersion, choose_laws
+from snakesim_sim_backend.settings import SimSettings
+from snakesim_sim_backend.state.contacts import TouchReader
 from snakesim_testing.sim.simulator_rig import make_config
 
 STEPS = 300
@@ -22,7 +28,10 @@ SCENES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.skipif(choose_laws() == "python", reason="there is no C version of the laws here")
+needs_c = pytest.mark.skipif(choose_laws() == "python", reason="there is no C version of the laws here")
+
+
+@needs_c
 @pytest.mark.parametrize("name", SCENES)
 def test_the_state_has_the_forces_that_python_reads(name: str) -> None:
     placed = place(make_config(scene={"name": "test", **SCENES[name]}))
@@ -38,3 +47,75 @@ def test_the_state_has_the_forces_that_python_reads(name: str) -> None:
         assert placed.read_touches() == expected
         touched += len(expected)
     assert touched > 20
+
+
+class MeasuringRobot:
+    """A simulated robot whose joints move at random among obstacles."""
+
+    def __init__(self, scene: dict[str, Any], step_s: float, laws: LawsVersion) -> None:
+        config = make_config(scene={"name": "test", **scene})
+        self.backend = SimBackend(config, SimSettings(timestep_s=step_s), laws=laws)
+        self.step_s: float = self.backend.sim.model.opt.timestep
+        self.touches = TouchReader(self.backend.sim, self.backend.data, self.backend.physics.contacts)
+        self.measured_force = self.backend.physics.measure_force()
+        self._modes = [Mode.POSITION] * config.robot.chain.modules
+        self._limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
+        self._random = np.random.default_rng(1)
+
+    def step(self, number: int) -> None:
+        """Make a physics step. Every thirtieth begins with other setpoints."""
+        if number % 30 == 0:
+            targets_rad = self._random.uniform(-1.2, 1.2, len(self._modes)).tolist()
+            self.backend.enact(SafeSetpoints(self._modes, targets_rad, self._limits_nm), "armed")
+        self.backend.physics.step(1)
+
+
+@needs_c
+@pytest.mark.parametrize("step_s", [0.002, 0.001])
+@pytest.mark.parametrize("name", SCENES)
+def test_measured_force_in_c_equals_that_in_python(name: str, step_s: float) -> None:
+    robot = MeasuringRobot(SCENES[name], step_s, "c")
+    specification = MeasuredForce(robot.step_s)
+    pair_counts: set[int] = set()
+    for number in range(3 * STEPS):
+        robot.step(number)
+        forces_n = robot.touches.sum_forces_n()
+        specification.add(forces_n)
+        assert robot.measured_force.max_n == specification.max_n, f"step {number}"
+        pair_counts.add(len(forces_n))
+    assert {0, 1, 2} <= pair_counts
+
+
+@needs_c
+def test_both_versions_of_the_laws_measure_the_same_force() -> None:
+    scene = SCENES["rough and smooth pegs"]
+    native = MeasuringRobot(scene, 0.002, "c")
+    python = MeasuringRobot(scene, 0.002, "python")
+    max_force_n = 0.0
+    for number in range(STEPS):
+        for robot in (native, python):
+            robot.step(number)
+        assert native.measured_force.max_n == python.measured_force.max_n
+        max_force_n = max(max_force_n, native.measured_force.max_n)
+    assert max_force_n > 1.0
+
+
+@pytest.mark.parametrize("laws", ["python", pytest.param("c", marks=needs_c)])
+def test_computing_forces_again_adds_nothing_to_the_measured_force(laws: LawsVersion) -> None:
+    robot = MeasuringRobot(SCENES["rough and smooth pegs"], 0.002, laws)
+    number = 0
+    while robot.measured_force.max_n == 0.0:
+        robot.step(number)
+        number += 1
+        assert number < STEPS
+    before_n = robot.measured_force.max_n
+    robot.backend.physics.forward()
+    mujoco.mj_forward(robot.backend.sim.model, robot.backend.data)
+    assert robot.measured_force.max_n == before_n
+
+
+@needs_c
+def test_force_cannot_be_measured_in_a_model_without_its_plugin() -> None:
+    placed = place(make_config(scene={"name": "test", **SCENES["rough and smooth pegs"]}))
+    with pytest.raises(ValueError, match="measured_force"):
+        placed.physics.measure_force()

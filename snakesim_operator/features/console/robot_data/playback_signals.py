@@ -12,7 +12,7 @@ from snakesim_operator.features.console.robot_data.signals import (
     find_signal_unit,
     list_message_numbers,
 )
-from snakesim_operator.playback.export import table, unit_of
+from snakesim_operator.results.signals import table, unit_of
 
 TimedNumbers = list[tuple[float, dict[str, float]]]  # robot time in s, and numbers by signal
 

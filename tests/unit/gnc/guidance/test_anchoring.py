@@ -55,7 +55,7 @@ def held(off_w, obstacles, contacts, trust=ESTIMATED, turns: int = 20) -> Locali
     localizer.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
     anchors = Anchors(ROBOT, obstacles)
     for _ in range(turns):
-        anchors.hold(localizer, SHAPE, contacts, trust)
+        anchors.correct_pose(localizer, SHAPE, contacts, trust)
     return localizer
 
 

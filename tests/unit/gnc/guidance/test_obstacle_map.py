@@ -130,11 +130,11 @@ def test_the_newest_look_counts_most_after_drift():
 def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
     monkeypatch.setattr(obstacle_map, "MAX_TRACKS", 64)
     map_ = mapped(cylinder("a", 0.8, 0.0))
-    map_.forget(np.array([[FORGET_DISTANCE_M + 0.5, 0.0]]))
+    map_.drop_distant(np.array([[FORGET_DISTANCE_M + 0.5, 0.0]]))
     assert len(map_.tracks) == 1
-    map_.forget(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
+    map_.drop_distant(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
     assert not map_.tracks
     map_.add_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
     assert len(map_.tracks) == 100
-    map_.forget(np.zeros((1, 2)))
+    map_.drop_distant(np.zeros((1, 2)))
     assert len(map_.tracks) == 64

@@ -70,14 +70,16 @@ def test_perceived_samples_without_body_pose_are_counted_and_ignored():
     drive = Drive(random_field(1))
     *_, here = drive.turns(30)
     image, before = drive.image(here, 30 * STEP_NS), reported(drive)
-    drive.world.add_look(msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE)  # older than what is in the map
-    drive.world.add_look(msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE)  # of the future
+    drive.world.add_ranging_sample(
+        msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE
+    )  # older than what is in the map
+    drive.world.add_ranging_sample(msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE)  # of the future
     joints = drive.joints(here, here)
     broken = msgspec.structs.replace(
         joints, timestamp_ns=joints.timestamp_ns + STEP_NS, valid=[False] * len(joints.valid)
     )
     drive.world.add_joints(broken, None, None)
-    drive.world.add_look(image, NOISE)
+    drive.world.add_ranging_sample(image, NOISE)
     assert sum(drive.world.refused.values()) == 3
     assert len(drive.world.refused) == 3
     after = reported(drive)
@@ -123,7 +125,7 @@ def test_a_lidar_maps_as_a_camera_does():
     here = drive.place(0)
     for here in drive.turns(60, images=False):
         beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], timestamp_ns=drive.turn * STEP_NS)
-        drive.world.add_look(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
+        drive.world.add_ranging_sample(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
     total = score(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
     assert len(total.position_m) == 2
     assert max(total.position_m) < 0.005

@@ -9,11 +9,11 @@ from snakesim_operator.features.evaluate.case import Case, CaseOutcome
 from snakesim_operator.features.evaluate.table import (
     UNKNOWN,
     group_results,
-    mean_interval,
     table_lines,
     wilson_interval,
     worst_failures,
 )
+from snakesim_operator.results.metrics.intervals import mean_interval
 
 
 def case(field: int, controller: str = "poal", row: int = 1) -> Case:
@@ -55,6 +55,18 @@ def test_without_a_goal_the_advance_has_an_interval() -> None:
     assert two_runs.endswith("0.15 to 0.28")
     assert one_run.endswith(UNKNOWN)
     assert "95 %" not in table_lines(group_results([cases[2]], done))[0]
+
+
+def test_without_a_goal_the_table_has_the_net_displacement() -> None:
+    """A gait that travels sideways advances 0.05 m along its heading, and 0.8 m in all."""
+    sideways = {"advance_m": 0.05, "net_displacement_m": 0.8, "displacement_m_s": 0.08, "ended": "complete"}
+    cases = [case(1), case(2)]
+    done = {one.id: CaseOutcome(numbers={**sideways, "displacement_energy_j_per_m": 21.5}) for one in cases}
+    head, row = table_lines(group_results(cases, done))
+    assert "net m  95 % of net m  net m/s  net J/m" in head
+    assert row.split()[-6:] == ["0.80", "0.80", "to", "0.80", "0.080", "21.5"]
+    done = {one.id: CaseOutcome(numbers={**sideways, "crossed": False, "goal_m": 3.0}) for one in cases}
+    assert "net m" not in table_lines(group_results(cases, done))[0]
 
 
 @pytest.mark.parametrize(("runs", "quantile"), [(2, 12.706), (4, 3.182), (11, 2.228), (31, 2.042), (1001, 1.962)])

@@ -19,7 +19,6 @@ from snakesim_hal.run_log.black_box import Layout
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
-from snakesim_operator.playback.export import arrays
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.compare import page as compare_page
@@ -28,6 +27,7 @@ from snakesim_operator.results.compare.table import table
 from snakesim_operator.results.report import page
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import CONFIG
+from snakesim_operator.results.signals import recorded_arrays
 from snakesim_operator.results.summary import RunSummary, summarise
 from snakesim_testing.operator.recorded_triplet import Reader, triplet
 
@@ -88,7 +88,7 @@ def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int)
 def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     folder = tmp_path_factory.mktemp("base")
     whole = triplet()
-    kept = {name: value[FIRST:LAST] for name, value in arrays(whole).items()}
+    kept = {name: value[FIRST:LAST] for name, value in recorded_arrays(whole).items()}
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(
         whole,

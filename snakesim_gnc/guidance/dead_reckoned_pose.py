@@ -18,7 +18,7 @@ MAX_POSITION_SD_M = 1e3  # upper limits of what is reported
 MAX_YAW_SD_RAD = 10.0
 
 
-class ReckonedPose:
+class DeadReckonedPose:
     """Computes poses from joint states and contacts."""
 
     def __init__(self, robot: Description, start: Base, known: Sequence[Obstacle]) -> None:
@@ -45,7 +45,7 @@ class ReckonedPose:
             localizer.move(joints, contacts, None)
             contact_list = [] if contacts is None else contacts.contacts
             trust = ESTIMATED if estimated else MEASURED
-            self._anchors.hold(localizer, np.array(joints.angle_rad), contact_list, trust)
+            self._anchors.correct_pose(localizer, np.array(joints.angle_rad), contact_list, trust)
         return Pose(
             tick=joints.tick,
             timestamp_ns=joints.timestamp_ns,
@@ -55,7 +55,7 @@ class ReckonedPose:
             angular_velocity_w=(0.0, 0.0, 0.0),
         )
 
-    def mark_reckoned(self, world: World) -> World:
+    def mark_dead_reckoned(self, world: World) -> World:
         """Return a world made with this pose, marked as dead-reckoned, with the uncertainty of the pose."""
         position_sd_m = min(self._localizer.position_sd_m, MAX_POSITION_SD_M)
         return msgspec.structs.replace(

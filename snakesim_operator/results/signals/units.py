@@ -1,0 +1,53 @@
+"""Names and units of signals."""
+
+from snakesim_hal.model.field_words import find_unit_in_name
+from snakesim_hal.wire.custom_sample import find_custom_messages
+from snakesim_operator.results.recording_contents import CONTROLLER
+from snakesim_operator.results.run_log import RunRecord
+
+PARQUET_UNIT = b"unit"  # metadata of a column of a Parquet file
+OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
+
+MEASURED_UNITS = {
+    "time_s": "s",
+    "age_s": "s",
+    "angle_rad": "rad",
+    "velocity_rad_s": "rad/s",
+    "torque_nm": "N·m",
+    "mode": "1",
+    "target": "rad, rad/s or N·m, by mode",
+    "torque_limit_nm": "N·m",
+    "position_w_m": "m",
+    "orientation_wxyz": "1",
+    "contact_peak_n": "N",
+    "contact_count": "1",
+}
+MOTION_UNITS = {
+    "center_w_m": "m",
+    "velocity_w_m_s": "m/s",
+    "velocity_b_m_s": "m/s",
+    "heading_w_rad": "rad",
+    "turn_rate_rad_s": "rad/s",
+}
+CONTACT_UNITS = {
+    "link_force_n": "N",
+    "link_force_l_n": "N",
+    "obstacle_force_n": "N",
+    "obstacle_force_w_n": "N",
+}
+UNITS = MEASURED_UNITS | MOTION_UNITS | CONTACT_UNITS
+
+
+def unit_of(name: str, record: RunRecord) -> str:
+    """Return the unit of a column, or of a whole signal.
+
+    A number that a controller defined has the unit in which its name ends.
+    """
+    signal = name.partition(".")[0]
+    if name.endswith(f".{CONTROLLER}"):
+        return find_unit_in_name(signal) or "1"
+    units: dict[str, str] = {}
+    for kind in find_custom_messages(record.description).values():
+        units |= kind.units
+    units |= UNITS  # the robot's own signals win
+    return units[signal]

@@ -1,0 +1,58 @@
+"""Runs of one figure: which arguments they are, and which of them are drawn as one mean."""
+
+import dataclasses
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.figures.run_groups import group_by_seed, make_single_groups, split_arguments
+from snakesim_operator.results.metrics.intervals import find_mean_and_half_width
+from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.operator.recorded_triplet import triplet
+
+
+def make_run(folder: str, seed: int, duration_s: float = 10.0) -> RunRecord:
+    config = msgspec.structs.replace(triplet().config, seed=seed, duration_s=duration_s)
+    return dataclasses.replace(triplet(), folder=Path(folder), config=config)
+
+
+def test_arguments_are_runs_and_then_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "b").mkdir()
+    runs, names = split_arguments(["runs/a", "b", "angle_rad", "torque_nm.joint_1"])
+    assert runs == [Path("runs/a"), Path("b")]
+    assert names == ["angle_rad", "torque_nm.joint_1"]
+    assert split_arguments(["missing"]) == ([Path("missing")], [])
+
+
+def test_runs_that_differ_in_the_seed_are_one_group() -> None:
+    runs = [make_run("a", 1), make_run("b", 2), make_run("c", 1, 5.0), make_run("d", 3)]
+    groups = group_by_seed(runs)
+    assert [[run.folder.name for run in group.records] for group in groups] == [["a", "b", "d"], ["c"]]
+    assert [group.label for group in groups] == ["duration_s 10 (mean of 3 runs)", "duration_s 5 (1 run)"]
+
+
+def test_no_mean_of_runs_that_are_not_repetitions() -> None:
+    with pytest.raises(ConfigError, match="differ in their seeds"):
+        group_by_seed([make_run("a", 1), make_run("b", 1, 5.0)])
+
+
+def test_no_mean_of_one_run_given_twice() -> None:
+    with pytest.raises(ConfigError, match="count as one run"):
+        group_by_seed([make_run("a", 1), make_run("b", 1), make_run("c", 2)])
+
+
+def test_equal_folder_names_are_told_apart_by_their_paths() -> None:
+    groups = make_single_groups([make_run("x/run", 1), make_run("y/run", 2)])
+    assert [group.label for group in groups] == ["x/run", "y/run"]
+
+
+def test_interval_of_a_mean_is_pointwise() -> None:
+    """Of two values, Student's t is 12.7 standard errors: 12.706 * sqrt(2) * 0.5 / sqrt(2) * difference."""
+    mean, half_width = find_mean_and_half_width(np.array([[1.0, 2.0, np.nan], [3.0, 2.0, 1.0]]))
+    assert mean[:2].tolist() == [2.0, 2.0]
+    assert half_width[:2].tolist() == pytest.approx([12.706, 0.0])
+    assert np.isnan(mean[2])
