@@ -62,9 +62,8 @@ def check_driver_name(name: str) -> None:
         raise ConfigError(
             f"{name!r} is a word of Python; give another name, such as `{name}_drive`", code="config/invalid-value"
         )
-    installed = list_installed(BACKENDS)
-    if name in installed:
+    if name in list_installed(BACKENDS):
         raise ConfigError(
-            f"a backend {name!r} is installed already; give another name than {', '.join(installed)}",
+            f"a backend {name!r} is installed already; give another name, such as `my_{name}`",
             code="config/duplicate-name",
         )

@@ -166,9 +166,8 @@ class HomingDrives(MinimalDrives):
             abort=lambda i: emulator.handle_extra(i, "stop_homing"),
             moves=True,
         )
-        self.start_up: StartUp = StartUp(
-            self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start
-        )
+        self.homing = StartUp(self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start)
+        self.start_up: StartUp | None = self.homing
 
     def is_homed(self, i: int) -> bool:
         """Return whether a drive knows its position."""
@@ -188,8 +187,8 @@ class HomingDrives(MinimalDrives):
                 continue
             self.switches.note(i, lower=inputs.at_lower, upper=inputs.at_upper)
             self.states.drives[i].safe_torque_off = inputs.safe_torque_off
-            if self.start_up.is_ready(i) and not inputs.homed:
-                self.start_up.lose(i, "position unknown: the drive has restarted")
+            if self.homing.is_ready(i) and not inputs.homed:
+                self.homing.lose(i, "position unknown: the drive has restarted")
 
     def send_setpoints(self, command: BusCommand) -> None:
         enabled = [i for i in self.all_drives if self.states.drives[i].enabled]

@@ -85,6 +85,7 @@ class Bench:
         self._scenario = scenario
         self._sets = sets
         self._rig: Rig | None = None
+        self._looked_at: tuple[Backend, EmulatedDrives] | None = None  # an open backend with its drives
         self.was_opened = False  # since the bench was made
         self._hosted: Hosted | None = None
         self._recordings: dict[str, Any] = {}
@@ -138,6 +139,14 @@ class Bench:
         if self._rig is None or self._rig.spoiled:
             return self.open_rig()
         return self._rig
+
+    def look_at_drives(self, backend: Backend) -> EmulatedDrives | None:
+        """Return the emulated drives of an open backend, the same object each time; None if that is not possible."""
+        if self.drives is None:
+            return None
+        if self._looked_at is None or self._looked_at[0] is not backend:
+            self._looked_at = (backend, self.drives(backend))
+        return self._looked_at[1]
 
     def shared_host(self) -> Hosted:
         """Return the backend behind a real host, which tests share."""

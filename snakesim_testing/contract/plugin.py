@@ -201,9 +201,10 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
 @pytest.fixture
 def drives(bench: "Bench", rig: "Rig") -> "EmulatedDrives":
     """Return the emulated drives of the open backend."""
-    if bench.drives is None:
+    drives = bench.look_at_drives(rig.backend)
+    if drives is None:
         pytest.skip("this bench has no emulated drives to look at; give --snakesim-drives")
-    return bench.drives(rig.backend)
+    return drives
 
 
 @pytest.fixture
