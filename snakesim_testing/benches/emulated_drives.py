@@ -10,6 +10,7 @@ from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
+from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
 from snakesim_testing.can.driver_loop import chain_of
 
 POLL_S = 0.02
@@ -63,5 +64,7 @@ def enabled_drives(emulator: Any) -> list[bool]:
             return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
         case EmulatedDynamixel():
             return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
+        case EmulatedFeetech():
+            return [servo.on for servo in emulator.servos]
         case _:
             raise TypeError(f"drives of an unknown driver type: {emulator}")

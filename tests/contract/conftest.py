@@ -74,6 +74,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("odrive", "odrive", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("feetech", "feetech", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_emulated_drive),
         Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("threads", IN_REAL_TIME, sets=ALL_FAMILIES, mute=cut_drive_off, drives=DrivesOfAnyFamily),
