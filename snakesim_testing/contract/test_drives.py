@@ -24,10 +24,9 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     Once the host goes on, the backend reports each of those stops as a fault of its joint, whatever the operator asks
     for first. No drive is enabled again before the fault is reset and the robot armed.
     """
-    if rig.joints_without_watchdog:
-        pytest.skip(
-            f"described without a watchdog, so these hold while the host is frozen: {rig.joints_without_watchdog}"
-        )
+    unguarded = rig.joints_without_watchdog
+    if unguarded:
+        pytest.skip(f"described without a watchdog, so they hold while the host is frozen: {unguarded}")
     rig.cruise()
     rig.spoiled = True
     assert all(drives.enabled()), f"armed, and enabled are {drives.enabled()}"
