@@ -22,6 +22,7 @@ class Servo(SerialServo[Port]):
     max_per_mille: int = 0  # its own torque limit
 
     # What it reported.
+    firmware: str = ""
     current_a: float = 0.0
     has_restarted: bool = False  # since its torque was switched on: it has forgotten what it was sent
 

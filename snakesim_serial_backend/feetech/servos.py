@@ -58,6 +58,7 @@ class Servos(SerialServos[Servo, Packet]):
             servo = self.servos[i]
             servo.record_switch(follows=False, now_ns=self._clock_ns())
             servo.alone_s = 0.0
+            self._readings.set_identity(i, firmware=servo.firmware)
             self.handle_answer(i, present)
             self._take_over_health(i, state)
 
