@@ -17,6 +17,7 @@ from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.programs.preflight import with_backend_modes
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.feetech import registers as feetech
@@ -107,6 +108,7 @@ class Robot(DriveRig):
     def __init__(self, driver_type: Family, **settings: Any) -> None:
         self.driver_type = driver_type
         config = run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
+        config = with_backend_modes(config, driver_type.backend)
         fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 0.5}
         super().__init__(config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings)))
 

@@ -32,6 +32,7 @@ DRIVE_TYPES: dict[str, DriveType] = {
     "odrive": DriveType("can", "channels"),
     "moteus": DriveType("can", "channels", is_can_fd=True),
     "dynamixel": DriveType("serial", "ports"),
+    "feetech": DriveType("serial", "ports"),
 }
 
 

@@ -20,6 +20,7 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
     *("robot calibrate zero", "robot calibrate direction", "robot calibrate limits", "robot calibrate gear"),
     *("param set", "fault inject", "sim pause", "sim resume", "sim step", "sim speed", "sim reset"),
     *("drive emulate can", "drive emulate odrive", "drive emulate moteus", "drive emulate dynamixel"),
+    "drive emulate feetech",
     *("drive replay can", "drive dbc"),
     *("recording report", "recording export", "recording video", "recording plot"),
     *("study evaluate", "study sweep", "study optimize", "policy train"),
