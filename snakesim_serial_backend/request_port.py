@@ -166,16 +166,21 @@ class RequestPort(ABC, Generic[StatusT]):
         return Answers(statuses, surplus, decoder.garbled)
 
     def _request_each(self, ids: Collection[int], request: bytes, size: int) -> list[StatusT]:
-        """Send a sync read, and return the answers, of which each servo sends one."""
+        """Send a sync read, and return the answers, of which each servo sends one.
+
+        A servo that seems to answer twice is left out: whoever reads it alone then finds why.
+        """
         self._note_request(ids)
+        doubled: set[int] = set()
         statuses: list[StatusT] = []
         for status in self._request(self._make_decoder(), request, self._gap_s, self._gap_s):
-            self._match_answer(status.id)
-            if status.id in ids and len(status.data) == size:
+            if not self._match_answer(status.id):
+                doubled.add(status.id)
+            elif status.id in ids and len(status.data) == size:
                 statuses.append(status)
             if len(statuses) >= len(ids):
                 break
-        return statuses
+        return [status for status in statuses if status.id not in doubled]
 
     def _request(
         self, decoder: StatusDecoder[StatusT], request: bytes, gap_s: float, next_gap_s: float

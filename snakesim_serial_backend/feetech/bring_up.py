@@ -143,7 +143,7 @@ def _check_travel(servo: Servo, eeprom: bytes) -> str:
     if first > needs_first or last < needs_last:
         return (
             f"has position limits of {first} to {last} (registers {at.MIN_POSITION} and {at.MAX_POSITION}), and its "
-            f"joint travels from {needs_first} to {needs_last}: widen the ones, or narrow `lower_rad` and `upper_rad`"
+            f"joint travels from {needs_first} to {needs_last}: widen the ones, or narrow `angle_rad` in [limits]"
         )
     return ""
 
