@@ -11,17 +11,12 @@ from snakesim_serial_backend.feetech.registers import RATE as FEETECH_RATE
 
 def _add_scan(parser: argparse.ArgumentParser) -> None:
     add_channels(parser, "serial port, such as /dev/ttyUSB0")
-    _add_baud(parser, list(RATE))
-
-
-def _add_feetech_scan(parser: argparse.ArgumentParser) -> None:
-    add_channels(parser, "serial port, such as /dev/ttyACM0")
-    _add_baud(parser, list(FEETECH_RATE))
-
-
-def _add_baud(parser: argparse.ArgumentParser, rates: list[int]) -> None:
     parser.add_argument(
-        "--baud", type=int, action="append", choices=rates, help="may be repeated, to try several (default: all)"
+        "--baud",
+        type=int,
+        action="append",
+        choices=sorted({*RATE, *FEETECH_RATE}),
+        help="may be repeated, to try several (default: all that the servos have)",
     )
 
 
@@ -94,7 +89,7 @@ COMMANDS: Commands = (
     Command(
         name="drive scan feetech",
         help="List every Feetech STS servo that answers; reads only, and moves nothing.",
-        add=_add_feetech_scan,
+        add=_add_scan,
         run=_scan_feetech,
         details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
         examples=("drive scan feetech /dev/ttyACM0", "drive scan feetech /dev/ttyACM0 --baud 1000000 --json"),

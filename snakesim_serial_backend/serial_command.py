@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.base.errors import BackendError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.base.terminal import align_columns, print_json, print_line
 from snakesim_serial_backend.wire import SerialWire, is_emulated
 
@@ -22,7 +22,14 @@ class Scan:
 
 
 def scan_ports(arguments: argparse.Namespace, scan: Scan) -> int:
-    """List the servos that answer on some ports. Returns 1 if none answers."""
+    """List the servos that answer on some ports. Returns 1 if none answers. Raises ConfigError for a wrong rate."""
+    missing = [baud for baud in arguments.baud or () if baud not in scan.rates]
+    if missing:
+        possible = ", ".join(map(str, scan.rates))
+        raise ConfigError(
+            f"--baud {missing[0]}: these servos do not have this rate; they have {possible} bit/s",
+            code="drive/unsupported-setting",
+        )
     rows: list[dict[str, str]] = []
     failures: list[str] = []
     for name in arguments.channel:
