@@ -1,4 +1,4 @@
-"""The commands `snakesim drive` for Dynamixel servos. Importable without the extra `serial`."""
+"""The commands `snakesim drive` for servos on serial ports. Importable without the extra `serial`."""
 
 import argparse
 
@@ -6,12 +6,17 @@ from snakesim_drivers.kit.commands import DRIVE_NOUNS, add_channels, add_emulati
 from snakesim_hal.programs.arguments import add_json
 from snakesim_hal.programs.commands import Command, Commands
 from snakesim_serial_backend.dynamixel.registers import RATE
+from snakesim_serial_backend.feetech.registers import RATE as FEETECH_RATE
 
 
 def _add_scan(parser: argparse.ArgumentParser) -> None:
     add_channels(parser, "serial port, such as /dev/ttyUSB0")
     parser.add_argument(
-        "--baud", type=int, action="append", choices=list(RATE), help="may be repeated, to try several (default: all)"
+        "--baud",
+        type=int,
+        action="append",
+        choices=sorted({*RATE, *FEETECH_RATE}),
+        help="may be repeated, to try several (default: all that the servos have)",
     )
 
 
@@ -20,9 +25,17 @@ def _add_emulation(parser: argparse.ArgumentParser) -> None:
 
 
 def _scan(arguments: argparse.Namespace) -> int:
-    from snakesim_serial_backend.serial_command import scan_ports
+    from snakesim_serial_backend.dynamixel.scan import COLUMNS, scan
+    from snakesim_serial_backend.serial_command import Scan, scan_ports
 
-    return scan_ports(arguments)
+    return scan_ports(arguments, Scan(COLUMNS, list(RATE), scan))
+
+
+def _scan_feetech(arguments: argparse.Namespace) -> int:
+    from snakesim_serial_backend.feetech.scan import COLUMNS, scan
+    from snakesim_serial_backend.serial_command import Scan, scan_ports
+
+    return scan_ports(arguments, Scan(COLUMNS, list(FEETECH_RATE), scan))
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
@@ -33,6 +46,18 @@ def _emulate(arguments: argparse.Namespace) -> int:
 
 def _load(arguments: argparse.Namespace) -> int:
     from snakesim_serial_backend.dynamixel.command import print_load
+
+    return print_load(arguments)
+
+
+def _emulate_feetech(arguments: argparse.Namespace) -> int:
+    from snakesim_serial_backend.feetech.command import emulate
+
+    return emulate(arguments)
+
+
+def _load_feetech(arguments: argparse.Namespace) -> int:
+    from snakesim_serial_backend.feetech.command import print_load
 
     return print_load(arguments)
 
@@ -60,5 +85,27 @@ COMMANDS: Commands = (
         add=add_json,
         run=_load,
         examples=("drive load dynamixel", "drive load dynamixel --json"),
+    ),
+    Command(
+        name="drive scan feetech",
+        help="List every Feetech STS servo that answers; reads only, and moves nothing.",
+        add=_add_scan,
+        run=_scan_feetech,
+        details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
+        examples=("drive scan feetech /dev/ttyACM0", "drive scan feetech /dev/ttyACM0 --baud 1000000 --json"),
+    ),
+    Command(
+        name="drive emulate feetech",
+        help="Emulate the Feetech servos of a robot, as a process at the other end of pseudo terminals.",
+        add=_add_emulation,
+        run=_emulate_feetech,
+        examples=("drive emulate feetech triplet", "drive emulate feetech triplet --channel tail --channel head"),
+    ),
+    Command(
+        name="drive load feetech",
+        help="Print bytes, time and rate of a cycle with Feetech servos for every baud rate.",
+        add=add_json,
+        run=_load_feetech,
+        examples=("drive load feetech", "drive load feetech --json"),
     ),
 )

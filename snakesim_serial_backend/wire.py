@@ -284,3 +284,21 @@ def latency_s(port: str, root: Path = Path("/")) -> float:
         if is_emulated(port):
             return 0.0
         return USB_LATENCY_S
+
+
+def open_log(path: str, setting: str) -> TextIO | None:
+    """Open the file for all bytes; None without a path.
+
+    Args:
+        path: the file; it is overwritten.
+        setting: where the scenario names it, for messages.
+
+    Raises:
+        BackendError: the file cannot be written.
+    """
+    if not path:
+        return None
+    try:
+        return Path(path).open("w", encoding="utf-8")
+    except OSError as error:
+        raise BackendError(f"`{setting}` = {path!r}: {error.strerror}", code="file/not-writable") from error

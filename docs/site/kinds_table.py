@@ -13,7 +13,7 @@ from snakesim_hal.programs.preflight import find_backend
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "inject-faults.md"
 BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"
 BEGIN_DRIVES = "<!-- drive types, from here: made by `make schemas` -->\n"
-DRIVE_TYPES = ("odrive", "moteus", "cia402", "dynamixel")
+DRIVE_TYPES = ("odrive", "moteus", "cia402", "dynamixel", "feetech")
 TARGETS = {
     "process": "`host`, `guidance`, `navigation`, `control`, and `router` with `--with-router`, which cannot hang",
     "key": "`sensor/joints`, `actuator/joints`, ...",

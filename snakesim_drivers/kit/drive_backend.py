@@ -59,6 +59,7 @@ class DriveBackendParts:
     open_drives: Callable[[DriveReadings], Drives]  # opens the buses; raises ConfigError and BackendError
     watchdogs_s: Sequence[float]  # time of each joint's watchdog, from tail to head
     decimation: int = 1  # control cycles from one reading of the slowest bus to the next
+    without_watchdog: frozenset[int] = NO_DRIVES  # joints whose drives do not stop by themselves
 
 
 class DriveBackend(Backend):
@@ -115,7 +116,8 @@ class DriveBackend(Backend):
             self.close()
             raise
         description = self._make_description(config, parts.name, parts.hardware)
-        self._description = with_serials(description, self._readings.serials, self._readings.firmware)
+        description = with_serials(description, self._readings.serials, self._readings.firmware)
+        self._description = _note_missing_watchdogs(description, parts.without_watchdog)
 
     def describe(self) -> Description:
         """Return the robot of the robot file, with the sensors and serial numbers of its drives."""
@@ -326,3 +328,11 @@ class DriveBackend(Backend):
         if pose_delay_s is not None:
             sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=pose_delay_s))
         return sensors
+
+
+def _note_missing_watchdogs(robot: Description, joints: frozenset[int]) -> Description:
+    """Return a description in which these joints have no watchdog."""
+    noted = [
+        msgspec.structs.replace(joint, watchdog=False) if i in joints else joint for i, joint in enumerate(robot.joints)
+    ]
+    return msgspec.structs.replace(robot, joints=noted)

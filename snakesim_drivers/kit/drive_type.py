@@ -26,7 +26,8 @@ from snakesim_drivers.kit.drives import Drives
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import make_receiver
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.joints import Joint, Measurement
+from snakesim_hal.model.robot import RobotFile, without_measurements
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import ClockMode
@@ -145,6 +146,9 @@ class BusesBackend(DriveBackend):
             open_drives=open_buses,
             watchdogs_s=_list_watchdogs_s(parts),
             decimation=max(part.settings.decimation for part in parts),
+            without_watchdog=frozenset(
+                joint for part in parts if not part.driver_type.has_watchdog for joint in part.joints
+            ),
         )
         super().__init__(config, backend_parts)
 
@@ -158,6 +162,13 @@ class DriverTypeBackend(BusesBackend):
     the four abstract class methods. The host's thread calls all of them, before the backend is opened or while it is.
     `list_ports`, `list_bus_faults` and `check_drives` open nothing, as `Backend.check` does, which calls them.
     """
+
+    has_watchdog: ClassVar[bool] = True  # False: a drive whose host dies holds its last setpoint
+    unmeasured: ClassVar[Collection[Measurement]] = ()  # what drives of this type do not measure
+
+    @classmethod
+    def limit_modes(cls, robot: RobotFile) -> RobotFile:
+        return without_measurements(super().limit_modes(robot), cls.unmeasured)
 
     @classmethod
     @abstractmethod

@@ -45,7 +45,12 @@ class MixedBackend(BusesBackend):
         """Return the robot with only those modes that each joint has in its driver type."""
         joints = dict(robot.joints)
         for joint in robot.joint_table:
-            supported_modes = find_driver_type(robot, joint).supported_modes
+            driver_type = find_driver_type(robot, joint)
+            if driver_type.unmeasured:
+                measures = [quantity for quantity in joint.drive.measures if quantity not in driver_type.unmeasured]
+                exceptions = joints.get(joint.name, JointExceptions())
+                joints[joint.name] = msgspec.structs.replace(exceptions, measures=measures)
+            supported_modes = driver_type.supported_modes
             if supported_modes is not None:
                 modes = [mode for mode in joint.drive.modes if mode in supported_modes]
                 exceptions = joints.get(joint.name, JointExceptions())

@@ -231,6 +231,11 @@ ERROR_CODES = {
         "The value in the robot file is outside the range of the drive.",
         "Change the value in the robot file to the allowed range.",
     ),
+    "drive/no-watchdog": ErrorCode(
+        "The scenario does not accept that these drives have no watchdog.",
+        "Their protocol has none: they hold their last angle if the host dies or the cable breaks.",
+        "Put a relay of an emergency stop circuit into their supply, and set the key that the message names.",
+    ),
     "drive/unsupported-setting": ErrorCode(
         "The robot file asks for something that this type of drive cannot do.",
         "A limit, id, gain, stop mode or travel is beyond the drive or its protocol.",

@@ -265,6 +265,19 @@ def with_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
     return msgspec.structs.replace(robot, drive=all_drives, joints=joints)
 
 
+def without_measurements(robot: RobotFile, missing: Collection[Measurement]) -> RobotFile:
+    """Return the robot with drives that do not measure these quantities, whatever its file gives for its joints."""
+    measured = [quantity for quantity in robot.drive.measures if quantity not in missing]
+    joints: dict[str, JointExceptions] = {}
+    for name, differing in robot.joints.items():
+        if differing.measures is None:
+            joints[name] = differing
+        else:
+            kept = [quantity for quantity in differing.measures if quantity not in missing]
+            joints[name] = msgspec.structs.replace(differing, measures=kept)
+    return msgspec.structs.replace(robot, drive=msgspec.structs.replace(robot.drive, measures=measured), joints=joints)
+
+
 def describe_robot(
     robot: RobotFile,
     *,

@@ -18,6 +18,18 @@ def describe_what_moves(robot: Description | None) -> str:
     where = f"backend {robot.backend}"
     if robot.hardware:
         where += f" on {robot.hardware}"
+    unguarded = describe_missing_watchdogs(robot)
     if robot.emulated:
-        return f"{EMULATED}: nothing real moves ({where})"
-    return f"{REAL}: motors move ({where})"
+        return f"{EMULATED}: nothing real moves ({where}){unguarded}"
+    return f"{REAL}: motors move ({where}){unguarded}"
+
+
+def describe_missing_watchdogs(robot: Description) -> str:
+    """Return a clause about the joints whose drives have no watchdog; empty if every drive has one."""
+    names = [joint.name for joint in robot.joints if not joint.watchdog]
+    if not names:
+        return ""
+    which = "no joint has a watchdog"
+    if len(names) < len(robot.joints):
+        which = f"no watchdog: {', '.join(names)}"
+    return f"; {which}: it holds its last angle if the host dies, until its supply is cut"

@@ -1,8 +1,6 @@
 """The backend `dynamixel`: checks, and the ports that it opens."""
 
 from collections.abc import Collection, Sequence
-from pathlib import Path
-from typing import TextIO
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
@@ -10,7 +8,7 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, joint_label, make_body
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.dynamixel import registers as at
@@ -21,7 +19,7 @@ from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.servos import Servos, ServosContext
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
-from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
+from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated, open_log
 
 # A silence of this length ends an answer, whichever is longer.
 MIN_GAP_S = 0.002
@@ -61,7 +59,7 @@ class DynamixelBackend(DriverTypeBackend):
         clock = context.clock
         body = context.body
         gap_s = max(MIN_GAP_S, GAP_PER_PERIOD * config.period_ns * 1e-9)
-        log = _open_log(settings.log)
+        log = open_log(settings.log, "backends.dynamixel.log")
 
         def open_servos(port_name: str, numbers: Sequence[int], readings: DriveReadings) -> Servos:
             """Open a port with the servos of these joints; emulated servos are on a pseudo terminal."""
@@ -202,15 +200,3 @@ def emulated_model(settings: DynamixelSettings) -> EmulatedModel:
     if current_a is None:
         current_a = UNKNOWN_CURRENT_UNIT_A
     return EmulatedModel(number, current_a)
-
-
-def _open_log(path: str) -> TextIO | None:
-    """Open the file for all bytes; None without a path. Raises BackendError."""
-    if not path:
-        return None
-    try:
-        return Path(path).open("w", encoding="utf-8")
-    except OSError as error:
-        raise BackendError(
-            f"`backends.dynamixel.log` = {path!r}: {error.strerror}", code="file/not-writable"
-        ) from error

@@ -14,6 +14,7 @@ from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
+from snakesim_serial_backend.servo_bus import ANSWERS_TWICE, GARBLED
 
 # Registers that are written at every start.
 STARTUP_REGISTERS = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
@@ -24,13 +25,6 @@ MEASURED_SIZE = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos
 READS = 3  # to distinguish a second servo from a single disturbance
 ATTEMPTS = 3  # to read or write registers
 MIN_DOUBLED = 2  # reads with an answer too many that show a second servo
-# Two servos with one id: their answers follow each other if their return delays differ, and collide if they do not.
-ANSWERS_TWICE = "is duplicated: it answers one question twice; give each servo its own id"
-GARBLED = (
-    "a second servo has its id, or the line is disturbed; give each servo its own id, one after the other alone on the "
-    "bus, and check cables and terminators"
-)
-
 NO_ANSWER = "does not answer: it is off, or has another id or baud rate"
 
 _log = logging.getLogger("snakesim.dynamixel")

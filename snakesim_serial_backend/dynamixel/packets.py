@@ -165,6 +165,10 @@ class Decoder:
                 del self._bytes[:length]
                 yield packet
 
+    def feed_statuses(self, data: bytes) -> Iterator[Packet]:
+        """Take in bytes, and yield the statuses that are complete now."""
+        return (packet for packet in self.feed(data) if packet.instruction == Instruction.STATUS)
+
     @property
     def garbled(self) -> bool:
         """Whether bytes have arrived that are no packet."""

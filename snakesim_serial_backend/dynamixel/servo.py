@@ -5,20 +5,18 @@ from dataclasses import dataclass
 
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.servo_bus import SerialServo
 
 REVOLUTION_RAD = 2 * math.pi  # rad
 SLACK_RAD = 0.3  # beyond its travel, where a servo may wake up
 OUT_OF_REACH = 1.2  # factor on the angle at which full torque would be reached
 
 
-@dataclass
-class Servo:
+@dataclass(kw_only=True)
+class Servo(SerialServo[Port]):
     """A servo of one joint. Angles and torques are those of its horn."""
 
     # How it is built.
-    id: int
-    name: str
-    port: Port
     constant: float  # N·m/A
     stiffness: float  # N·m/rad
     damping: float  # N·m·s/rad
@@ -32,23 +30,7 @@ class Servo:
     # What it reported.
     turns: int = 0  # whole revolutions to be added to the angle that it reports
     current_a: float = 0.0
-    enabled: bool = False  # whether its torque is on
     watchdog: int = 0
-    errors: int = 0  # bits of `HardwareError`
-    alert: bool = False  # whether it has errors that it has not named yet
-    health_ns: int = -1  # when its state was last read
-    answered_twice: int = 0  # requests in a row
-    garbled: int = 0  # requests in a row that were answered by garbled bytes alone
-
-    # What was sent to it.
-    follows: bool = False  # whether its torque was switched on
-    switched_ns: int = -1  # when its torque was switched on or off
-    booting_ns: int = -1  # when it was restarted, until it answers again
-
-    @property
-    def label(self) -> str:
-        """The name of the servo in messages."""
-        return f"{self.name} (id {self.id} on {self.port.wire.port})"
 
     def out_of_reach_rad(self, direction: float) -> float:
         """Return a goal so far beyond its travel that its position law demands full torque at any speed within.
@@ -63,9 +45,3 @@ class Servo:
     def gain_registers(self) -> bytes:
         """Return the gains of its position law as registers."""
         return at.gains_form.pack(*at.gains(self.stiffness, self.damping, self.unit_nm))
-
-    def record_switch(self, *, follows: bool, now_ns: int) -> None:
-        """Record that its torque was switched on or off."""
-        self.follows = follows
-        self.switched_ns = now_ns
-        self.enabled = False  # until it reports otherwise

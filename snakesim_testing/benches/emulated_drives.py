@@ -12,6 +12,7 @@ from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_drivers.template.minimal_driver import MinimalDrives, MinimalEmulator
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
+from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
 from snakesim_testing.can.driver_loop import chain_of
 from snakesim_testing.contract.bench import TorqueSwitch
 from snakesim_testing.contract.kit_drives import KitDrives
@@ -78,5 +79,7 @@ def enabled_drives(emulator: Any) -> list[bool]:
             return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
         case MinimalEmulator():
             return emulator.list_enabled()
+        case EmulatedFeetech():
+            return [servo.on for servo in emulator.servos]
         case _:
             raise TypeError(f"drives of an unknown driver type: {emulator}")

@@ -120,6 +120,11 @@ class Rig:
         """Return whether a joint measures its torque, by its description."""
         return "torque" in self.robot.joints[joint].measures
 
+    @property
+    def joints_without_watchdog(self) -> list[str]:
+        """The joints whose drives do not stop by themselves, by the description."""
+        return [joint.name for joint in self.robot.joints if not joint.watchdog]
+
     def skip_without(self, *modes: Mode, torque: bool = False) -> None:
         """Skip the clause if joint 0 or 1 does not have these modes, or does not measure its torque.
 

@@ -21,7 +21,8 @@ def test_the_description_matches_the_robot_file(bench: Bench, rig: Rig) -> None:
     wanted = describe_run_robot(bench.config)
     assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
     for joint, expected in zip(robot.joints, wanted.joints, strict=True):
-        drive = {"serial": joint.serial, "firmware": joint.firmware}  # from the drive, not from the file
+        # These are from the drive, not from the file.
+        drive = {"serial": joint.serial, "firmware": joint.firmware, "watchdog": joint.watchdog}
         assert joint == msgspec.structs.replace(expected, **drive)
     assert robot.links == wanted.links
     for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "stop_mode", "custom"):

@@ -24,6 +24,9 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     Once the host goes on, the backend reports each of those stops as a fault of its joint, whatever the operator asks
     for first. No drive is enabled again before the fault is reset and the robot armed.
     """
+    unguarded = rig.joints_without_watchdog
+    if unguarded:
+        pytest.skip(f"described without a watchdog, so they hold while the host is frozen: {unguarded}")
     rig.cruise()
     rig.spoiled = True
     assert all(drives.enabled()), f"armed, and enabled are {drives.enabled()}"
@@ -43,6 +46,31 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     rig.cruise()
     assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
     assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
+
+
+def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: Rig, drives: EmulatedDrives) -> None:
+    """Drives that are described without a watchdog hold while the host does nothing.
+
+    Once it goes on, the backend switches each of them off at once, reports it as a fault of its joint, and enables none
+    before the fault is reset and the robot armed.
+    """
+    unguarded = rig.joints_without_watchdog
+    if not unguarded:
+        pytest.skip("every joint is described with a watchdog")
+    rig.cruise()
+    rig.spoiled = True
+    began = rig.tick
+    rig.freeze_host(t.FROZEN_S, drives.freeze_driver)
+    rig.idle(t.TRANSPORT_PERIODS)
+    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
+    record = rig.record_since(began)
+    named = {fault.joint for fault in record.faults if fault.cause}
+    assert named >= {*unguarded}, f"reported were {record.faults}"
+    assert rig.authority.state in ("fault", "estop"), rig.authority.state
+    rig.reset()
+    assert_drives_stay_off(rig, drives, t.ARMING_PERIODS)
+    rig.cruise()
+    assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
 
 
 def assert_drives_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:

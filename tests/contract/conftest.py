@@ -76,6 +76,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("cia402", "cia402", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("feetech", "feetech", mute=cut_drive_off, drives=DrivesOfAnyFamily),
         Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_joint, drives=KitDrives),
         Bench("homing-driver", HomingBackend, mute=mute_joint, drives=KitDrives),
         Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),

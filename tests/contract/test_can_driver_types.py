@@ -19,8 +19,11 @@ from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.programs.preflight import with_backend_modes
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
+from snakesim_serial_backend.feetech import registers as feetech
+from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.hal.small_robots import run_config
@@ -102,6 +105,15 @@ FAMILIES = {
         "stopped by its bus watchdog",
         "overheating",
     ),
+    "feetech": Family(
+        FeetechBackend,
+        lambda emulator: emulator.servos,
+        lambda servo: servo.on,
+        lambda emulator, joint: emulator.servos[joint].table[feetech.TORQUE_ENABLE : feetech.GOALS],
+        "held its last angle",
+        "overheating",
+        firmware="3.10",
+    ),
 }
 on_can = pytest.mark.parametrize("driver_type", ["odrive", "moteus", "cia402"], indirect=True)
 
@@ -112,6 +124,7 @@ class Robot(DriveRig):
     def __init__(self, driver_type: Family, **settings: Any) -> None:
         self.driver_type = driver_type
         config = run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
+        config = with_backend_modes(config, driver_type.backend)
         fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": driver_type.bring_up_s}
         super().__init__(config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings)))
 
@@ -131,6 +144,13 @@ class Robot(DriveRig):
 @pytest.fixture(params=FAMILIES)
 def driver_type(request: pytest.FixtureRequest) -> Family:
     return FAMILIES[request.param]
+
+
+@pytest.fixture
+def with_watchdog(driver_type: Family) -> None:
+    """Only for driver types whose drives stop by themselves."""
+    if not driver_type.backend.has_watchdog:
+        pytest.skip(f"the driver type {driver_type.backend.name} declares that its drives have no watchdog")
 
 
 @pytest.fixture
@@ -209,6 +229,7 @@ def test_joint_lost_while_armed_is_ignored_until_used_again(robot: Robot) -> Non
     assert robot.following() == [True] * JOINTS
 
 
+@pytest.mark.usefixtures("with_watchdog")
 def test_drives_stop_by_watchdog_when_driver_is_gone(
     robot: Robot,
 ) -> None:
@@ -226,6 +247,7 @@ def test_drives_stop_by_watchdog_when_driver_is_gone(
     assert robot.run(SHOWN, "armed") == []
 
 
+@pytest.mark.usefixtures("with_watchdog")
 def test_drives_stopped_behind_cut_bus_are_read_before_clearing(robot: Robot) -> None:
     """The driver ran all the time, and commanded them to damp and to be idle; nothing of it got through."""
     robot.run(30, "armed")
@@ -243,6 +265,7 @@ def test_drives_stopped_behind_cut_bus_are_read_before_clearing(robot: Robot) ->
     assert robot.following() == [True] * JOINTS
 
 
+@pytest.mark.usefixtures("with_watchdog")
 def test_unreadable_stop_is_not_cleared_meanwhile(robot: Robot) -> None:
     """The host was frozen, and one drive does not answer after it: its watchdog's stop is reported once it does."""
     robot.run(20, "armed")

@@ -34,7 +34,7 @@ from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, load
 from snakesim_hal.programs.preflight import backend_settings
 from snakesim_serial_backend.dynamixel.backend import emulator_of
-from snakesim_serial_backend.dynamixel.command import named
+from snakesim_serial_backend.emulation import named
 from snakesim_serial_backend.wire import Pty
 from snakesim_testing.benches.emulated_drives import enabled_drives
 

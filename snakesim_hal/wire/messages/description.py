@@ -42,6 +42,9 @@ class JointDescription(Message, frozen=True, kw_only=True):
         Meta(max_length=8),
         about("beside angle and velocity; a torque that is not measured is 0, heat and voltage then stop nothing"),
     ] = msgspec.field(default_factory=lambda: list(get_args(Measurement)))
+    watchdog: Annotated[
+        bool, about("its drive stops by itself without setpoints; false: it holds its last angle if the host dies")
+    ] = True
     serial: Annotated[str, Meta(max_length=64), about("serial number that its drive reports; empty: none")] = ""
     firmware: Annotated[str, Meta(max_length=64), about("firmware version that its drive reports; empty: none")] = ""
 

@@ -33,6 +33,7 @@ DRIVE_TYPES: dict[str, DriveType] = {
     "moteus": DriveType("can", "channels", is_can_fd=True),
     "cia402": DriveType("can", "channels"),
     "dynamixel": DriveType("serial", "ports"),
+    "feetech": DriveType("serial", "ports"),
 }
 
 

@@ -25,6 +25,7 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
         "drive emulate moteus",
         "drive emulate cia402",
         "drive emulate dynamixel",
+        "drive emulate feetech",
     ),
     *("drive replay can", "drive dbc", "drive new"),
     *("recording report", "recording export", "recording video", "recording plot", "recording rosbag"),

@@ -1,0 +1,63 @@
+"""What `snakesim drive scan dynamixel` finds: the servos that answer on a port, and what their registers contain."""
+
+import struct
+from collections.abc import Iterator
+
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.packets import Packet
+from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.wire import SerialWire
+
+GAP_S = 0.2  # silence that ends an answer: longer than any servo's return delay
+COLUMNS = (
+    *("port", "baud", "id", "model", "firmware", "mode", "offset", "angle"),
+    *("current limit", "voltage", "heat", "errors"),
+)
+
+
+def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
+    """Yield a row of text, by `COLUMNS`, for each servo that answers on a port at its baud rate."""
+    port = Port(wire, GAP_S)
+    for ping in port.scan():
+        yield _describe_servo(port, ping)
+
+
+def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
+    """Return the row of a servo. ping: its answer to a ping, with model and firmware."""
+    number, firmware = struct.unpack("<HB", ping.data[:3])
+    model = at.model_name(number)
+    if number in at.MODELS:
+        model = f"{model} ({number})"
+    row = dict.fromkeys(COLUMNS, "-")
+    row |= {
+        "port": port.wire.port,
+        "baud": str(port.wire.baud),
+        "id": str(ping.id),
+        "model": model,
+        "firmware": str(firmware),
+    }
+    table = port.read(ping.id, 0, at.SIZE)
+    if table is not None:
+        row |= _describe_registers(table.data)
+    return row
+
+
+def _describe_registers(data: bytes) -> dict[str, str]:
+    """Return the columns that are read from a servo's control table."""
+    (position,) = struct.unpack_from("<i", data, at.PRESENT_POSITION)
+    (homing_offset,) = struct.unpack_from("<i", data, at.HOMING_OFFSET)
+    (current_limit,) = struct.unpack_from("<H", data, at.CURRENT_LIMIT)
+    (voltage,) = struct.unpack_from("<H", data, at.VOLTAGE)
+    errors = data[at.HARDWARE_ERROR]
+    baud_of_value = {value: baud for baud, value in at.RATE.items()}
+    baud = baud_of_value.get(data[at.BAUD_RATE])
+    return {
+        "baud": str(baud) if baud is not None else "-",
+        "mode": str(data[at.OPERATING_MODE]),
+        "offset": str(homing_offset),
+        "angle": f"{position * at.RAD:.3f} rad",
+        "current limit": str(current_limit),
+        "voltage": f"{voltage * at.VOLTS:.1f} V",
+        "heat": f"{data[at.TEMPERATURE]} °C",
+        "errors": at.error_names(errors) if errors else "none",
+    }

@@ -1,0 +1,281 @@
+"""Emulated servos: control table, packets, errors and restarts of the STS series, on a body that moves.
+
+They have no watchdog, as the real ones. They do *not* simulate bit rate and delays of answers, speed and acceleration,
+the overload protection, encoder faults, and the position law's gains: a motor has the stiffness and the damping of the
+robot file. A goal switches the torque on, which real servos may do.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from snakesim_drivers.emulation.drive_emulator import DriveEmulator
+from snakesim_drivers.emulation.emulated_body import EmulatedBody
+from snakesim_hal.wire.messages import Mode
+from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech.packets import (
+    EVERYBODY,
+    OFFSET_SIGN_BIT,
+    SIGN_BIT,
+    Decoder,
+    Instruction,
+    Packet,
+    ServoError,
+    encode,
+    from_signed,
+    to_signed,
+)
+from snakesim_serial_backend.wire import Pty
+
+MODEL = 777  # STS3215
+FIRMWARE = (3, 10)
+FACTORY_DELAY = 250  # of an answer, in 2 us
+FACTORY_UNLOADING = 44  # overload, overcurrent, overheating
+SECOND_SERVO_COUNTS = 500  # how far from a servo a second one with its id is
+
+
+@dataclass
+class EmulatedServo:
+    """One servo: its control table, and what the table does not hold."""
+
+    table: bytearray
+    port: Pty
+    stall_torque_nm: float
+
+    def read_word(self, address: int) -> int:
+        """Return a register of 2 bytes."""
+        return int.from_bytes(self.table[address : address + 2], "little")
+
+    def write_word(self, address: int, value: int) -> None:
+        """Set a register of 2 bytes."""
+        self.table[address : address + 2] = value.to_bytes(2, "little")
+
+    @property
+    def id(self) -> int:
+        """The id to which the servo answers."""
+        return self.table[at.ID]
+
+    @property
+    def on(self) -> bool:
+        """Whether the torque is on."""
+        return self.table[at.TORQUE_ENABLE] == 1
+
+
+class EmulatedFeetech(DriveEmulator[Pty]):
+    """All servos of a robot, at the other end of their ports."""
+
+    def __init__(
+        self,
+        body: EmulatedBody,
+        ports: Sequence[Pty],
+        stall_torques_nm: Sequence[float],
+        baud: int,
+        speed_unit_counts_s: float,
+        clock_ns: Callable[[], int],
+    ) -> None:
+        """Make a servo for every joint of a body.
+
+        Args:
+            body: the body that the servos move.
+            ports: the port of every joint's servo.
+            stall_torques_nm: stall torque of every joint's servo.
+            baud: baud rate that the servos are set to.
+            speed_unit_counts_s: counts per second in a unit of speed.
+            clock_ns: a clock with any origin.
+        """
+        self._speed_unit_rad_s = speed_unit_counts_s * at.RAD
+        self.servos: list[EmulatedServo] = []
+        for joint, port, stall_torque_nm in zip(body.joints, ports, stall_torques_nm, strict=True):
+            servo = EmulatedServo(bytearray(at.SIZE), port, stall_torque_nm)
+            _write_factory_settings(servo, joint.id, baud)
+            servo.table[at.MIN_VOLTAGE] = round(joint.limits.min_voltage_v / at.VOLTS)
+            servo.table[at.MAX_VOLTAGE] = min(round(joint.supply.voltage_v / at.VOLTS) + 20, 255)
+            self.servos.append(servo)
+        super().__init__(body, ports, clock_ns)
+        self._decoders = [Decoder() for _ in self._bus_ends]
+        self._delay_of_second = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
+        for i in range(len(self.servos)):
+            self.restart(i)
+
+    def __call__(self) -> None:
+        """Handle what has arrived, and let time pass up to now."""
+        received = [port.receive() for port in self._bus_ends]  # may wait for the kernel, so it comes before the lock
+        with self.body.lock:
+            self.catch_up()
+            for port, decoder, data in zip(self._bus_ends, self._decoders, received, strict=True):
+                for packet in decoder.feed(data):
+                    self._handle_packet(port, packet)
+            self.pass_time()
+
+    # --- packets ----------------------------------------------------------------------------------------------
+
+    def _handle_packet(self, port: Pty, packet: Packet) -> None:
+        """Handle a packet for one servo or for several servos of a port."""
+        listening = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)]
+        index_of_id = {self.servos[i].id: i for i in listening}
+        match packet.code:
+            case Instruction.SYNC_WRITE:
+                self._write_several(packet.parameters, index_of_id)
+            case Instruction.SYNC_READ:
+                self._read_several(packet.parameters, index_of_id)
+            case Instruction.PING if packet.id == EVERYBODY:
+                for _, i in sorted(index_of_id.items()):
+                    self._answer(i, b"")
+            case _ if packet.id in index_of_id:
+                self._execute(index_of_id[packet.id], packet)
+            case _:
+                pass
+
+    def _execute(self, i: int, packet: Packet) -> None:
+        """Execute an instruction to one servo, and answer it."""
+        match packet.code:
+            case Instruction.PING:
+                self._answer(i, b"")
+            case Instruction.READ:
+                address, size = packet.parameters
+                self._answer(i, self._read(i, address, size), self._read_second(i, address, size))
+            case Instruction.WRITE:
+                self._write(i, packet.parameters[0], packet.parameters[1:])
+                if self.servos[i].table[at.STATUS_LEVEL]:
+                    self._answer(i, b"")
+            case _:
+                pass
+
+    def _write_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+        """Execute a sync write: address, size, and an id with data for each servo."""
+        address, size = parameters[:2]
+        for start in range(2, len(parameters), size + 1):
+            i = index_of_id.get(parameters[start])
+            if i is not None:
+                self._write(i, address, parameters[start + 1 : start + 1 + size])
+
+    def _read_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+        """Answer a sync read in the order of its ids. The first servo that is silent ends the answers."""
+        address, size = parameters[:2]
+        for id_ in parameters[2:]:
+            i = index_of_id.get(id_)
+            if i is None or self.body.is_silent(i):
+                return
+            self._answer(i, self._read(i, address, size), self._read_second(i, address, size))
+
+    def _answer(self, i: int, data: bytes, second_data: bytes | None = None) -> None:
+        """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
+        if self.body.is_silent(i):
+            return
+        servo = self.servos[i]
+        error = servo.table[at.STATUS]
+        status = encode(servo.id, error, data)
+        if not self.body.is_duplicated(i):
+            servo.port.send(status)
+            return
+        second_status = encode(servo.id, error, data if second_data is None else second_data)
+        if servo.table[at.DELAY] == self._delay_of_second[i]:
+            servo.port.send(bytes(a & b for a, b in zip(status, second_status, strict=True)))  # a 0 of either wins
+        else:
+            servo.port.send(status + second_status)
+
+    def _read(self, i: int, address: int, size: int) -> bytes:
+        """Return the data of registers; 0 beyond the last one."""
+        self._measure(i)
+        return bytes(self.servos[i].table[address : address + size]).ljust(size, b"\0")
+
+    def _read_second(self, i: int, address: int, size: int) -> bytes:
+        """Return the same registers of a second servo with the id of this one."""
+        table = self.servos[i].table[:]
+        position = int.from_bytes(table[at.PRESENT : at.PRESENT + 2], "little")
+        second_position = (position + SECOND_SERVO_COUNTS) % at.COUNTS
+        table[at.PRESENT : at.PRESENT + 2] = second_position.to_bytes(2, "little")
+        return bytes(table[address : address + size]).ljust(size, b"\0")
+
+    def _measure(self, i: int) -> None:
+        """Update the registers of what a servo measures."""
+        servo = self.servos[i]
+        angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
+        voltage_v, current_a = self.body.read_supply(i)
+        offset = to_signed(servo.read_word(at.HOMING_OFFSET), OFFSET_SIGN_BIT)
+        position = (round(angle_rad / at.RAD) + at.MIDDLE - offset) % at.COUNTS
+        speed = max(min(round(velocity_rad_s / self._speed_unit_rad_s), 32767), -32767)
+        load = max(min(round(torque_nm / servo.stall_torque_nm * at.PER_MILLE), 1023), -1023)
+        servo.write_word(at.PRESENT, position)
+        servo.write_word(at.PRESENT + 2, from_signed(speed, SIGN_BIT))
+        servo.write_word(at.PRESENT + 4, from_signed(load, 10))
+        servo.table[at.VOLTAGE] = min(round(voltage_v / at.VOLTS), 255)
+        servo.table[at.TEMPERATURE] = min(max(round(self.body.read_temperatures(i)[0]), 0), 255)
+        servo.write_word(at.CURRENT, min(round(abs(current_a) / at.CURRENT_A), 32767))
+
+    def _write(self, i: int, address: int, data: bytes) -> None:
+        """Set registers, as far as they can be written: a servo does not report a refusal."""
+        servo = self.servos[i]
+        end = address + len(data)
+        if address < at.ID or end > at.PRESENT:
+            return
+        if address < at.EEPROM_SIZE and (servo.table[at.LOCK] or servo.on):
+            return
+        servo.table[address:end] = data
+        if address <= at.DELAY < end and self.body.is_duplicated(i):
+            self._delay_of_second[i] = data[at.DELAY - address]
+        if address <= at.GOALS < end:
+            servo.table[at.TORQUE_ENABLE] = 1
+        if servo.table[at.STATUS] & servo.table[at.UNLOADING]:
+            servo.table[at.TORQUE_ENABLE] = 0
+        self._drive(i)
+
+    # --- motors -----------------------------------------------------------------------------------------------
+
+    def restart(self, i: int) -> None:
+        """Reset all registers from address 40 on."""
+        servo = self.servos[i]
+        servo.table[at.TORQUE_ENABLE :] = bytes(at.SIZE - at.TORQUE_ENABLE)
+        servo.write_word(at.TORQUE_LIMIT, servo.read_word(at.MAX_TORQUE))
+        servo.table[at.LOCK] = at.LOCKED
+        self._measure(i)
+        servo.write_word(at.GOALS, servo.read_word(at.PRESENT))
+        self._drive(i)
+
+    def _drive(self, i: int) -> None:
+        """Drive the body to the goal, as the registers specify."""
+        servo = self.servos[i]
+        joint = self.body.joints[i]
+        speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
+        if not servo.on or servo.table[at.OPERATING_MODE] != at.POSITION_MODE:
+            self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
+            return
+        offset = to_signed(servo.read_word(at.HOMING_OFFSET), OFFSET_SIGN_BIT)
+        goal = to_signed(servo.read_word(at.GOALS), SIGN_BIT)
+        goal = min(max(goal, servo.read_word(at.MIN_POSITION)), servo.read_word(at.MAX_POSITION))
+        limit_nm = min(servo.read_word(at.TORQUE_LIMIT), at.PER_MILLE) / at.PER_MILLE * servo.stall_torque_nm
+        stiffness = joint.motor.stiffness_nm_per_rad / joint.drive.gear**2
+        damping = joint.motor.damping_nm_s_per_rad / joint.drive.gear**2
+        goal_rad = at.to_angle_rad(goal + offset)
+        self.body.drive_motor(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
+
+    def on_step(self, now_us: float) -> None:
+        """Detect servos that are too hot or have too little supply voltage."""
+        del now_us
+        for i, servo in enumerate(self.servos):
+            errors = 0
+            if self.body.is_too_hot(i):
+                errors |= ServoError.OVERHEATING
+            if self.body.read_supply(i)[0] < servo.table[at.MIN_VOLTAGE] * at.VOLTS:
+                errors |= ServoError.VOLTAGE
+            servo.table[at.STATUS] = errors
+            if servo.on and errors & servo.table[at.UNLOADING]:
+                servo.table[at.TORQUE_ENABLE] = 0
+                self._drive(i)
+
+
+def _write_factory_settings(servo: EmulatedServo, id_: int, baud: int) -> None:
+    """Set the registers that a servo keeps without power."""
+    servo.table[at.FIRMWARE : at.FIRMWARE + 2] = bytes(FIRMWARE)
+    servo.write_word(at.MODEL, MODEL)
+    servo.table[at.ID] = id_
+    servo.table[at.BAUD_RATE] = at.RATE[baud]
+    servo.table[at.DELAY] = FACTORY_DELAY
+    servo.table[at.STATUS_LEVEL] = 1
+    servo.write_word(at.MAX_POSITION, at.LAST_POSITION)
+    servo.table[at.MAX_TEMPERATURE] = 70  # °C
+    servo.write_word(at.MAX_TORQUE, at.PER_MILLE)
+    servo.table[at.PHASE] = 12
+    servo.table[at.UNLOADING] = FACTORY_UNLOADING
+    servo.table[at.PROTECTIVE_TORQUE] = 20  # percent
+    servo.table[at.PROTECTION_TIME] = 200
+    servo.table[at.OVERLOAD_TORQUE] = 80  # percent

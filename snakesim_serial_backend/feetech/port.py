@@ -1,0 +1,64 @@
+"""One serial port with Feetech servos: requests with their answers, and writes that no servo answers."""
+
+from collections.abc import Sequence
+
+from snakesim_serial_backend.feetech.packets import (
+    EVERYBODY,
+    LAST_ID,
+    Decoder,
+    Instruction,
+    Packet,
+    encode,
+    encode_sync_read,
+    encode_sync_write,
+)
+from snakesim_serial_backend.request_port import Answers, RequestPort
+
+SCAN_S = 0.003  # in which each id may answer a ping to all
+
+
+class Port(RequestPort[Packet]):
+    """The requests of Feetech's protocol."""
+
+    def ping(self, id_: int) -> Answers[Packet]:
+        """Request a sign of life of a servo, which has no data."""
+        return self._request_all_answers(id_, encode(id_, Instruction.PING), 0, 1)
+
+    def read_alone(self, id_: int, address: int, size: int) -> Answers[Packet]:
+        """Read registers of a servo, and wait for a second answer, too."""
+        return self._request_all_answers(id_, encode(id_, Instruction.READ, bytes([address, size])), size, 2)
+
+    def scan(self) -> list[Packet]:
+        """Return the answers of all servos to a ping to all."""
+        gap_s = self._gap_s + LAST_ID * SCAN_S
+        return list(self._request(self._make_decoder(), encode(EVERYBODY, Instruction.PING), gap_s, gap_s))
+
+    def read(self, id_: int, address: int, size: int) -> Packet | None:
+        """Read registers of a servo; None without an answer that is complete."""
+        return self._request_one(id_, encode(id_, Instruction.READ, bytes([address, size])), size)
+
+    def write(self, id_: int, address: int, data: bytes) -> Packet | None:
+        """Write registers of a servo, and return its answer, which does not tell whether it accepted them."""
+        return self._request_one(id_, encode(id_, Instruction.WRITE, bytes([address]) + data), 0)
+
+    def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, Packet]:
+        """Read the same registers of several servos at once.
+
+        Returns:
+            The statuses of the servos that answer, by id. A silent servo may silence all behind it.
+        """
+        if not ids:
+            return {}
+        statuses = self._request_each(ids, encode_sync_read(ids, address, size), size)
+        return {status.id: status for status in statuses}
+
+    def write_all(self, address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> None:
+        """Write the same registers of several servos at once; they do not answer.
+
+        data_of_ids: id and data of each servo, all equally long.
+        """
+        if data_of_ids:
+            self.wire.send(encode_sync_write(address, data_of_ids))
+
+    def _make_decoder(self) -> Decoder:
+        return Decoder()

@@ -1,0 +1,55 @@
+"""What `snakesim drive scan feetech` finds: the servos that answer on a port, and what their registers contain."""
+
+from collections.abc import Iterator
+
+from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, Packet, to_signed
+from snakesim_serial_backend.feetech.port import Port
+from snakesim_serial_backend.wire import SerialWire
+
+GAP_S = 0.2  # silence that ends an answer: longer than any servo's return delay
+COLUMNS = (
+    *("port", "baud", "id", "model", "firmware", "mode", "offset", "angle"),
+    *("torque", "voltage", "heat", "errors"),
+)
+
+
+def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
+    """Yield a row of text, by `COLUMNS`, for each servo that answers on a port at its baud rate."""
+    port = Port(wire, GAP_S)
+    for ping in port.scan():
+        yield _describe_servo(port, ping)
+
+
+def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
+    """Return the row of a servo. ping: its answer to a ping."""
+    row = dict.fromkeys(COLUMNS, "-")
+    row |= {"port": port.wire.port, "baud": str(port.wire.baud), "id": str(ping.id)}
+    table = port.read(ping.id, 0, at.CURRENT + 2)
+    if table is not None:
+        row |= _describe_registers(table.data)
+        row["errors"] = at.error_names(table.error) if table.error else "none"
+    return row
+
+
+def _describe_registers(data: bytes) -> dict[str, str]:
+    """Return the columns that are read from a servo's control table."""
+    number = _word(data, at.MODEL)
+    model = at.model_name(number)
+    if number in at.MODELS:
+        model = f"{model} ({number})"
+    angle_rad = at.to_angle_rad(to_signed(_word(data, at.PRESENT), SIGN_BIT))
+    return {
+        "model": model,
+        "firmware": f"{data[at.FIRMWARE]}.{data[at.FIRMWARE + 1]}",
+        "mode": str(data[at.OPERATING_MODE]),
+        "offset": str(to_signed(_word(data, at.HOMING_OFFSET), OFFSET_SIGN_BIT)),
+        "angle": f"{angle_rad:.3f} rad",
+        "torque": "on" if data[at.TORQUE_ENABLE] else "off",
+        "voltage": f"{data[at.VOLTAGE] * at.VOLTS:.1f} V",
+        "heat": f"{data[at.TEMPERATURE]} °C",
+    }
+
+
+def _word(data: bytes, address: int) -> int:
+    return int.from_bytes(data[address : address + 2], "little")

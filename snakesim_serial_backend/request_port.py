@@ -1,0 +1,224 @@
+"""Requests on a half-duplex serial bus, each with its answers, for any protocol.
+
+An answer may arrive after the wait for it is over: a USB adapter is slow, or a computer pauses. The next request would
+then get two answers. So the port remembers the requests that have no answer yet, and counts a late answer for the
+oldest of them. Only an answer to which no request belongs shows that a second servo has the same id.
+"""
+
+import contextlib
+import time
+from abc import ABC, abstractmethod
+from collections import defaultdict, deque
+from collections.abc import Collection, Iterator, Sequence
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+from snakesim_serial_backend.wire import SerialWire
+
+CHUNK_BYTES = 64  # that an adapter passes on at once
+PATIENT_GAP_S = 0.25  # silence that ends the wait for an answer before the control cycle runs
+SECOND_ANSWER_GAP_S = 0.02  # silence that ends the wait for a second answer: a return delay is 0.5 ms at most
+IDLE_S = 0.05  # silence after which the line is idle
+MAX_DRAIN_S = 1.0  # for a line that never becomes idle
+LATE_S = 2.0  # after which an answer does not arrive any more
+
+
+class Status(Protocol):
+    """A packet in which a servo answers."""
+
+    @property
+    def id(self) -> int:
+        """The servo that answers."""
+        ...
+
+    @property
+    def data(self) -> bytes:
+        """The registers in the answer."""
+        ...
+
+
+StatusT = TypeVar("StatusT", bound=Status)
+StatusT_co = TypeVar("StatusT_co", bound=Status, covariant=True)
+
+
+class StatusDecoder(Protocol[StatusT_co]):
+    """Finds the statuses in a stream of bytes."""
+
+    @property
+    def garbled(self) -> bool:
+        """Whether bytes have arrived that are no packet."""
+        ...
+
+    def feed_statuses(self, data: bytes) -> Iterator[StatusT_co]:
+        """Take in bytes, and yield the statuses that are complete now."""
+        ...
+
+
+class Answers(NamedTuple, Generic[StatusT]):
+    """Everything that arrived after one request to one servo."""
+
+    statuses: list[StatusT]  # of that servo: answers to this request
+    surplus: int  # answers of that servo to which no request belongs: two servos have its id, one answers after another
+    garbled: bool  # bytes arrived that are no packet: two servos answer at the same time, or the line is disturbed
+
+
+class RequestPort(ABC, Generic[StatusT]):
+    """Sends one request after another, because the bus is half duplex. A protocol derives its port from it.
+
+    Attributes:
+        wire: the serial port.
+    """
+
+    def __init__(self, wire: SerialWire, gap_s: float) -> None:
+        """gap_s: silence that ends an answer, besides the time that bytes and adapter take."""
+        self.wire = wire
+        self._gap_s = gap_s
+        self._second_gap_s = gap_s
+        self._received = bytearray()  # since the newest request
+        self._unanswered_s: dict[int, deque[float]] = defaultdict(deque)  # when each servo was asked, the oldest first
+
+    @abstractmethod
+    def _make_decoder(self) -> StatusDecoder[StatusT]:
+        """Return a decoder that has received no bytes yet."""
+
+    @abstractmethod
+    def read_alone(self, id_: int, address: int, size: int) -> Answers[StatusT]:
+        """Read registers of a servo, and wait for a second answer, too."""
+
+    @abstractmethod
+    def read(self, id_: int, address: int, size: int) -> StatusT | None:
+        """Read registers of a servo; None without an answer that is complete."""
+
+    @abstractmethod
+    def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, StatusT]:
+        """Read the same registers of several servos at once.
+
+        Returns:
+            The statuses of the servos that answer, by id. A silent servo may silence all behind it.
+        """
+
+    @abstractmethod
+    def write(self, id_: int, address: int, data: bytes) -> StatusT | None:
+        """Write registers of a servo, and return its answer; its `error` is 0 if the servo accepted them."""
+
+    @abstractmethod
+    def write_all(self, address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> None:
+        """Write the same registers of several servos at once; they do not answer.
+
+        data_of_ids: id and data of each servo, all equally long.
+        """
+
+    @contextlib.contextmanager
+    def wait_patiently(self) -> Iterator[None]:
+        """Wait longer for answers, because no control cycle depends on them yet."""
+        gap_s = self._gap_s
+        second_gap_s = self._second_gap_s
+        self._gap_s = max(gap_s, PATIENT_GAP_S)
+        self._second_gap_s = max(second_gap_s, SECOND_ANSWER_GAP_S)
+        try:
+            yield
+        finally:
+            self._gap_s = gap_s
+            self._second_gap_s = second_gap_s
+
+    def wait_until_idle(self) -> None:
+        """Receive late answers until the line is idle, and assign them to the requests that they belong to."""
+        decoder = self._make_decoder()
+        end_s = time.monotonic() + MAX_DRAIN_S
+        while time.monotonic() < end_s:
+            data = self.wire.receive(IDLE_S)
+            if not data:
+                return
+            for packet in decoder.feed_statuses(data):
+                self._match_answer(packet.id)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _request_one(self, id_: int, request: bytes, size: int) -> StatusT | None:
+        """Send a request to one servo, and return its answer. size: bytes of data in it."""
+        answers = self._request_all_answers(id_, request, size, 1)
+        if not answers.statuses:
+            return None
+        return answers.statuses[0]
+
+    def _request_all_answers(self, id_: int, request: bytes, size: int, max_answers: int) -> Answers[StatusT]:
+        """Send a request to one servo, and return its answers.
+
+        Args:
+            id_: the servo.
+            request: the packet to it.
+            size: bytes of data in an answer; others are late answers to other requests.
+            max_answers: number of answers after which to stop waiting.
+        """
+        self._note_request([id_])
+        decoder = self._make_decoder()
+        statuses: list[StatusT] = []
+        surplus = 0
+        for status in self._request(decoder, request, self._gap_s, self._second_gap_s):
+            is_expected = self._match_answer(status.id)
+            if status.id != id_:
+                continue
+            if not is_expected:
+                surplus += 1
+            if len(status.data) == size:
+                statuses.append(status)
+            if len(statuses) >= max_answers:
+                break
+        return Answers(statuses, surplus, decoder.garbled)
+
+    def _request_each(self, ids: Collection[int], request: bytes, size: int) -> list[StatusT]:
+        """Send a sync read, and return the answers, of which each servo sends one.
+
+        A servo that seems to answer twice is left out: whoever reads it alone then finds why.
+        """
+        self._note_request(ids)
+        doubled: set[int] = set()
+        statuses: list[StatusT] = []
+        for status in self._request(self._make_decoder(), request, self._gap_s, self._gap_s):
+            if not self._match_answer(status.id):
+                doubled.add(status.id)
+            elif status.id in ids and len(status.data) == size:
+                statuses.append(status)
+            if len(statuses) >= len(ids):
+                break
+        return [status for status in statuses if status.id not in doubled]
+
+    def _request(
+        self, decoder: StatusDecoder[StatusT], request: bytes, gap_s: float, next_gap_s: float
+    ) -> Iterator[StatusT]:
+        """Send a request, and yield the statuses that arrive until the bus is silent.
+
+        Args:
+            decoder: of the bytes that arrive.
+            request: the packet to send.
+            gap_s: silence that ends the wait for the first status.
+            next_gap_s: silence that ends the wait for a further one.
+        """
+        wire = self.wire
+        self._received.clear()
+        wire.send(request)
+        busy_s = wire.time_s(len(request) + CHUNK_BYTES) + wire.latency_s
+        while data := wire.receive(gap_s + busy_s):
+            self._received += data
+            for status in decoder.feed_statuses(data):
+                gap_s = next_gap_s
+                yield status
+
+    def _note_request(self, ids: Collection[int]) -> None:
+        """Remember that these servos are being asked."""
+        for id_ in ids:
+            self._forget_unanswered(id_)
+            self._unanswered_s[id_].append(time.monotonic())
+
+    def _match_answer(self, id_: int) -> bool:
+        """Assign an answer to the oldest request to a servo without one; return False if there is no such request."""
+        if not self._unanswered_s[id_]:
+            return False
+        self._unanswered_s[id_].popleft()
+        return True
+
+    def _forget_unanswered(self, id_: int) -> None:
+        """Forget the requests to a servo whose answers do not arrive any more."""
+        unanswered_s = self._unanswered_s[id_]
+        oldest_s = time.monotonic() - LATE_S
+        while unanswered_s and (self.wire.answers_at_once or unanswered_s[0] < oldest_s):
+            unanswered_s.popleft()

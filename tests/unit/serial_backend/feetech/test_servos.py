@@ -1,0 +1,256 @@
+"""The Feetech driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
+
+Errors, restarts and lost joints are in `tests/contract/test_can_driver_types.py`.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from snakesim_drivers.kit.mixed import MixedBackend
+from snakesim_hal.base.errors import BackendError, ConfigError
+from snakesim_hal.model.what_moves import describe_what_moves
+from snakesim_hal.programs.preflight import with_backend_modes
+from snakesim_hal.wire.messages import Mode
+from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech.backend import FeetechBackend
+from snakesim_serial_backend.feetech.emulator import EmulatedFeetech, EmulatedServo
+from snakesim_serial_backend.feetech.settings import FeetechSettings
+from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
+from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.messages import raises_error
+
+JOINTS = 4
+NOTICED = 10  # ticks in which a fault shows: each servo reports its state every fourth
+REAL = ["/dev/ttyACM0"]
+
+
+class Robot(DriveRig):
+    """The backend and its servos."""
+
+    def __init__(self, settings: FeetechSettings | None = None, **dotted: Any) -> None:
+        config = run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        config = with_backend_modes(config, FeetechBackend)
+        settings = settings or FeetechSettings(physics_model="inertia", bring_up_limit_s=0.5)
+        super().__init__(config, FeetechBackend(config, settings))
+
+    @property
+    def emulator(self) -> EmulatedFeetech:
+        return drives_of(self.backend)._emulator
+
+    def torques_on(self) -> list[bool]:
+        return [servo.on for servo in self.emulator.servos]
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    one = Robot()
+    yield one
+    one.backend.close()
+
+
+@pytest.fixture
+def delivered(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[list[EmulatedServo]], None]], None]:
+    """Change servos before the driver finds them."""
+
+    def change(servos: Callable[[list[EmulatedServo]], None]) -> None:
+        made = EmulatedFeetech.__init__
+
+        def otherwise(emulator: EmulatedFeetech, *rest: Any) -> None:
+            made(emulator, *rest)
+            servos(emulator.servos)
+
+        monkeypatch.setattr(EmulatedFeetech, "__init__", otherwise)
+
+    return change
+
+
+def check(**settings: Any) -> None:
+    config = with_backend_modes(run_config(backend="feetech", robot__chain__modules=JOINTS), FeetechBackend)
+    FeetechBackend.check(config, FeetechSettings(**settings))
+
+
+def test_real_servos_are_refused_until_the_missing_watchdog_is_accepted() -> None:
+    with raises_error(ConfigError, code="drive/no-watchdog", field="accept_no_watchdog"):
+        check(ports=REAL, stall_torque_nm=2.0)
+    with raises_error(ConfigError, code="drive/unsupported-setting", field="stall_torque_nm"):
+        check(ports=REAL, accept_no_watchdog=True)
+    check(ports=REAL, accept_no_watchdog=True, stall_torque_nm=2.0)
+    check(ports=["/dev/pts/7"])
+
+
+def test_every_joint_is_described_without_watchdog_and_without_torque(robot: Robot) -> None:
+    description = robot.backend.describe()
+    assert [joint.watchdog for joint in description.joints] == [False] * JOINTS
+    assert all("torque" not in joint.measures for joint in description.joints)
+    assert all(joint.modes == [Mode.PASSIVE, Mode.POSITION] for joint in description.joints)
+    assert "no joint has a watchdog: it holds its last angle if the host dies" in describe_what_moves(description)
+
+
+def test_mixed_robot_names_the_joints_without_watchdog() -> None:
+    config = run_config(
+        backend="mixed",
+        robot__chain__modules=2,
+        robot__drive={"driver": "dynamixel"},
+        robot__joints={"joint_2": {"driver": "feetech"}},
+        clock_mode="lockstep",
+        rate_hz=50,
+    )
+    config = with_backend_modes(config, MixedBackend)
+    backend = MixedBackend(config, MixedBackend.Settings(physics_model="inertia"))
+    description = backend.describe()
+    backend.close()
+    assert [joint.watchdog for joint in description.joints] == [True, False]
+    assert ["torque" in joint.measures for joint in description.joints] == [True, False]
+    assert "; no watchdog: joint_2: it holds" in describe_what_moves(description)
+
+
+def test_servos_hold_while_driver_is_away_and_are_off_once_it_runs(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.tick += 100
+    robot.backend._clock.robot_ns += 1_000_000_000
+    robot.emulator()
+    assert robot.torques_on() == [True] * JOINTS, "nothing stops a servo whose driver is away"
+    faults = robot.run(NOTICED, "armed")
+    assert {(fault.what, fault.joint) for fault in faults} == {("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)}
+    assert all("held its last angle for 1.0" in fault.cause for fault in faults), faults
+    assert robot.torques_on() == [False] * JOINTS
+    assert robot.run(5, "fault") == []
+    assert robot.run(20, "disarmed") == []
+    assert robot.torques_on() == [False] * JOINTS
+    assert robot.run(30, "armed") == []
+    assert robot.torques_on() == [True] * JOINTS
+
+
+def test_short_pause_of_the_driver_is_no_fault(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.tick += 7
+    robot.backend._clock.robot_ns += 70_000_000
+    assert robot.run(NOTICED, "armed") == []
+    assert robot.torques_on() == [True] * JOINTS
+
+
+def test_servos_behind_a_cut_bus_hold_and_are_off_once_it_is_back(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.go_wrong("cut:bus_1@0-9")
+    assert "interface_down" in {fault.what for fault in robot.run(30, "armed")}
+    assert robot.torques_on() == [True] * JOINTS
+    robot.go_wrong("cut:bus_1@0-9", begins=False)
+    robot.run(20, "fault")
+    assert robot.torques_on() == [False] * JOINTS
+
+
+@pytest.mark.parametrize("lifecycle", ["disarmed", "estop"])
+def test_torque_is_off_whenever_the_robot_is_not_armed(robot: Robot, lifecycle: Any) -> None:
+    robot.run(20, "armed")
+    robot.run(3, lifecycle)
+    assert robot.torques_on() == [False] * JOINTS
+
+
+def test_closing_switches_the_torque_off() -> None:
+    robot = Robot()
+    robot.run(20, "armed")
+    servos = robot.emulator.servos
+    robot.backend.close()
+    assert [servo.on for servo in servos] == [False] * JOINTS
+
+
+def test_joint_that_becomes_passive_has_no_torque(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.mode = Mode.PASSIVE
+    robot.run(3, "armed")
+    assert robot.torques_on() == [False] * JOINTS
+    robot.mode = Mode.POSITION
+    assert robot.run(30, "armed") == []
+    assert robot.torques_on() == [True] * JOINTS
+
+
+def test_silent_servo_gets_no_goal_before_it_has_reported_its_state(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.go_wrong("mute:joint_2@0-9")
+    robot.run(2, "armed")
+    robot.target = 0.3
+    goal = robot.emulator.servos[1].read_word(at.GOALS)
+    robot.run(1, "armed")
+    assert robot.emulator.servos[1].read_word(at.GOALS) == goal
+    assert robot.emulator.servos[2].read_word(at.GOALS) == at.to_position(0.3)
+
+
+def test_torque_limit_is_a_part_of_the_stall_torque() -> None:
+    settings = FeetechSettings(physics_model="inertia", stall_torque_nm=8.0)
+    robot = Robot(settings)
+    robot.limit_nm = 2.0
+    robot.run(5, "armed")
+    assert {servo.read_word(at.TORQUE_LIMIT) for servo in robot.emulator.servos} == {250}
+    robot.backend.close()
+
+
+def test_registers_are_written_only_where_they_differ(robot: Robot, delivered: Any) -> None:
+    servo = robot.emulator.servos[0]
+    assert servo.table[at.DELAY] == 0
+    assert servo.table[at.LOCK] == at.LOCKED
+    delivered(lambda servos: servos[0].table.__setitem__(at.PHASE, 12 | at.MULTI_TURN_FEEDBACK))
+    other = Robot()
+    assert other.emulator.servos[0].table[at.PHASE] == 12
+    other.backend.close()
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "reason"),
+    [
+        (at.ID, 9, "does not answer: it is off, or has another id or baud rate"),
+        (at.MODEL, 5, "is of another model: model 773; the driver knows STS3215, STS3250"),
+        (at.MAX_POSITION, 100, "has position limits of 0 to 2148 (registers 9 and 11), and its joint travels from"),
+        (at.UNLOADING, 0, "keeps its torque on in spite of overheating, overload (register 19 is 0)"),
+        (at.MAX_TEMPERATURE, 95, "allows itself 95 °C (register 13)"),
+        (at.OVERLOAD_TORQUE, 0, "has the overload torque 0 (register 36)"),
+        (at.PROTECTIVE_TORQUE, 90, "keeps a protective torque of 90 %"),
+        (at.MIN_VOLTAGE, 250, "allows 25.0 to"),
+        (at.MAX_TORQUE, 0, "has a torque limit of 768 per mille (register 16)"),
+    ],
+)
+def test_unsafe_register_is_named_at_start(delivered: Any, address: int, value: int, reason: str) -> None:
+    def change(servos: list[EmulatedServo]) -> None:
+        servos[1].table[address] = value
+        if address == at.MAX_POSITION:
+            servos[1].write_word(address, at.MIDDLE + value)
+
+    delivered(change)
+    with pytest.raises(BackendError) as raised:
+        Robot()
+    assert "joint_2 (id 2 on /dev/pts/" in str(raised.value)
+    assert reason in str(raised.value)
+
+
+def test_homing_offset_is_kept_and_another_one_is_refused(delivered: Any) -> None:
+    delivered(lambda servos: servos[0].write_word(at.HOMING_OFFSET, 100 | 1 << 11))
+    robot = Robot()
+    robot.run(1, "disarmed")
+    assert robot.joints is not None
+    assert robot.joints.angle_rad[0] == pytest.approx(100 * at.RAD, abs=0.002)
+    assert robot.emulator.servos[0].read_word(at.HOMING_OFFSET) == 100 | 1 << 11
+    robot.backend.close()
+    with raises_error(BackendError, code="drive/not-complete", field="homing_offsets"):
+        Robot(FeetechSettings(physics_model="inertia", homing_offsets={"joint_1": 7}))
+
+
+@pytest.mark.parametrize("drive", [{"zero_rad": 3.0}, {"gear": 8.0}, {"zero_rad": -3.0, "sign": -1}])
+def test_travel_across_the_end_of_the_count_is_refused(drive: dict[str, Any]) -> None:
+    config = run_config(backend="feetech", robot__chain__modules=JOINTS, robot__drive=drive)
+    with raises_error(ConfigError, code="drive/unsupported-setting", field="zero_rad"):
+        FeetechBackend.check(with_backend_modes(config, FeetechBackend), FeetechSettings())
+
+
+@pytest.mark.parametrize("answers", ["collide", "follow each other"])
+def test_second_servo_with_the_same_id_stops_the_robot_and_blocks_start(robot: Robot, answers: str) -> None:
+    if answers == "collide":
+        robot.emulator._delay_of_second[1] = 0
+    robot.run(20, "armed")
+    robot.go_wrong("duplicate:joint_2@0-9")
+    faults = robot.run(NOTICED, "armed")
+    assert faults[0].joint == "joint_2"
+    assert faults[0].what in ("duplicate_node", "drive_silent")
+    assert robot.torques_on() == [False] * JOINTS
+    with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
+        robot.backend._drives.bring_up()
