@@ -76,7 +76,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def scan_torques(folder: Path) -> list[str]:
     """Return whether the torque of each servo is on, as the scan prints it."""
     found = snakesim("drive", "scan", "feetech", "servos", "--baud", "1000000", cwd=folder)
-    assert found.code == 0 and found.out.count("STS3215 (777)") == 4, found.said
+    assert found.code == 0 and found.out.count("STS3215 (777)") == 4, found.printed
     return re.findall(r" rad +(on|off) ", found.out)
 
 
@@ -88,8 +88,8 @@ def run(folder: Path, *arguments: str) -> Ended:
 def test_external_servos_are_detected_and_driven_and_off_afterwards(folder: Path) -> None:
     assert scan_torques(folder) == ["off"] * 4
     ended = run(folder, "--duration", "2")
-    assert ended.code == 0, ended.said
-    assert UNGUARDED in ended.said
+    assert ended.code == 0, ended.printed
+    assert UNGUARDED in ended.printed
     assert scan_torques(folder) == ["off"] * 4
 
 
@@ -98,7 +98,7 @@ def test_servos_hold_while_host_is_frozen_and_are_off_once_it_resumes(folder: Pa
     ended = run(folder, "--fault", "freeze:host@0.5-2", "--duration", "5", "--out", str(folder / "frozen"))
     record = RunRecord.load(folder / "frozen").host
     assert record.armed_ticks > 5, "it was armed when it was frozen"
-    assert ended.code == 1 and record.lifecycle == "fault", ended.said
+    assert ended.code == 1 and record.lifecycle == "fault", ended.printed
     alone = {fault.joint for fault in record.faults if "held its last angle" in fault.cause}
     assert len(alone) == 4, record.faults
     assert scan_torques(folder) == ["off"] * 4
@@ -131,7 +131,7 @@ def test_servos_keep_their_torque_when_host_is_killed_and_the_next_start_switche
             60.0,
         )
         status = snakesim("status", *network, cwd=folder)
-        assert UNGUARDED in status.out, status.said
+        assert UNGUARDED in status.out, status.printed
         host.send_signal(signal.SIGKILL)
         host.wait(10)
         assert scan_torques(folder) == ["on"] * 4, "this is what a missing watchdog means"
