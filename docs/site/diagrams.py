@@ -62,6 +62,16 @@ WIRINGS = {
         "fed in every few servos,\nabout 3 A for each connector",
         chained_power=True,
     ),
+    "wiring-feetech.svg": Wiring(
+        "Wiring of Feetech servos on a serial bus, with their supply behind a relay",
+        "URT-1, or adapter\nfor TTL",
+        "half-duplex TTL, 1 Mbit/s, with power in the same cable",
+        "STS3215",
+        "",
+        'ports = ["/dev/ttyACM0"]',
+        "behind the relay: without it\nservos hold if the host dies",
+        chained_power=True,
+    ),
     "wiring-joint-modules.svg": Wiring(
         "Wiring of joint modules on CAN",
         "CAN adapter\nof the kernel",

@@ -1,8 +1,9 @@
 """The settings that the host and the services of a robot must share, as short texts, to compare them between computers.
 
 Each process reads its own copy of the scenario, perhaps from another checkout. Settings that only one process uses may
-differ: the backend, the duration of a run, injected faults, and which process starts a service. So may the control
-modes of the drives: the host leaves out those that its backend does not have, and publishes the remaining ones.
+differ: the backend, the duration of a run, injected faults, and which process starts a service. So may the abilities
+of the drives, which are their control modes and what they measure: the host leaves out those that its backend does not
+have, and publishes the remaining ones.
 """
 
 import hashlib
@@ -15,6 +16,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.quantities import MAX_SHARED_SETTINGS
 
+ABILITIES = ("modes", "measures")  # keys of a drive that may differ
 HASH_DIGITS = 12
 MAX_LEVELS = 3  # of a key, such as robot.limits.speed_rad_s; deeper tables are hashed
 MAX_KEY = 64  # characters
@@ -50,12 +52,13 @@ def shared_settings(config: RunConfig) -> dict[str, str]:
 
 
 def _shared_robot(robot: RobotFile) -> dict[str, Any]:
-    """Return a robot file without the control modes of its drives."""
+    """Return a robot file without the abilities of its drives."""
     table: dict[str, Any] = msgspec.to_builtins(robot)
-    table["drive"].pop("modes")
+    for ability in ABILITIES:
+        table["drive"].pop(ability)
     exceptions: dict[str, Any] = {}
     for joint, values in table["joints"].items():
-        given = {key: value for key, value in values.items() if value is not None and key != "modes"}
+        given = {key: value for key, value in values.items() if value is not None and key not in ABILITIES}
         if given:
             exceptions[joint] = given
     table["joints"] = exceptions

@@ -169,8 +169,7 @@ def _check_protections(servo: Servo, eeprom: bytes) -> str:
     if eeprom[at.PROTECTIVE_TORQUE] > eeprom[at.OVERLOAD_TORQUE]:
         return (
             f"keeps a protective torque of {eeprom[at.PROTECTIVE_TORQUE]} % (register {at.PROTECTIVE_TORQUE}), which "
-            f"is more than its overload torque of {eeprom[at.OVERLOAD_TORQUE]} % (register {at.OVERLOAD_TORQUE}): "
-            "lower it"
+            f"exceeds its overload torque, {eeprom[at.OVERLOAD_TORQUE]} % (register {at.OVERLOAD_TORQUE}): lower it"
         )
     min_voltage_v = eeprom[at.MIN_VOLTAGE] * at.VOLTS
     max_voltage_v = eeprom[at.MAX_VOLTAGE] * at.VOLTS

@@ -25,13 +25,19 @@ IN_TIME = "torque_is_off_in_time_by_the_drives_own_log"
 AFTER_WATCHDOG = "torque_is_off_after_watchdog_by_the_drives_own_log"
 RESTARTED = "a_drive_restarted_in_motion_stays_off_until_reset"
 DUPLICATE = "two_drives_with_one_id_stop_the_robot"
+UNGUARDED = "drives_without_watchdog_are_off_once_frozen_host_resumes"
 BUS_LOST = "a_bus_that_is_lost_and_restored_enables_no_drive"
 SUPPLY = "supply_and_temperatures_are_in_volts_and_degrees"
 SAGGING = "a_sagging_supply_is_reported_at_its_joint"
 
 
-def breaks(*clauses: str) -> Callable[[Any], Any]:
-    """Register broken drives, or a broken emulator, with the clauses that must fail on them."""
+def breaks(*clauses: str, declares_watchdog: bool = True) -> Callable[[Any], Any]:
+    """Register broken drives, or a broken emulator, with the clauses that must fail on them.
+
+    Args:
+        clauses: names of the contract tests that must fail.
+        declares_watchdog: False: the driver type declares that its drives have no watchdog.
+    """
 
     def register(broken: Any) -> Any:
         drives_type = broken if issubclass(broken, MinimalDrives) else MinimalDrives
@@ -39,6 +45,7 @@ def breaks(*clauses: str) -> Callable[[Any], Any]:
 
         class Broken(MinimalBackend):
             name = broken.__name__
+            has_watchdog = declares_watchdog
 
             @classmethod
             def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
@@ -115,6 +122,11 @@ class HasNoWatchdogAtAll(MinimalEmulator):
         for drive in self.drives:
             drive.fed_us = now_us
         super().on_step(now_us)
+
+
+@breaks(UNGUARDED, declares_watchdog=False)
+class HoldsAfterAPause(HasNoWatchdogAtAll):
+    """Drives without a watchdog, whose driver does not notice that its host has done nothing for a while."""
 
 
 @breaks(AFTER_WATCHDOG)
