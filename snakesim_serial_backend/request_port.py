@@ -171,7 +171,7 @@ class RequestPort(ABC, Generic[StatusT]):
         <<<<<<< ours
                 A servo that seems to answer twice is left out. The caller then reads it alone and finds why.
         ||||||| base
-                A servo that seems to answer twice is left out: whoever reads it alone then finds why.
+                A servo that seems to answer twice is left out, so that the driver reads it alone, and finds why.
         =======
                 A servo that seems to answer twice is left out, so that the driver reads it alone, and finds why.
         >>>>>>> theirs
