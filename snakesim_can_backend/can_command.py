@@ -279,15 +279,15 @@ def replay_log(arguments: argparse.Namespace) -> int:
     replay.read(log)
     if not replay.joints:
         finding = f"{replay.frames} frames, and no Sync among them: the log of another bus"
-        print_line(f"{arguments.log}: {finding}{looks(replay.foreign)}")
+        print_line(f"{arguments.log}: {finding}{looks(replay.other_protocol_frames)}")
         return FAILED
     print_line(f"{arguments.log}: {replay.frames} frames, {len(replay.joints)} Syncs")
     for line in log.report():
         print_line(f"  {line}")
-    for name, silent_syncs in zip(layout.joints, replay.silent, strict=True):
+    for name, silent_syncs in zip(layout.joints, replay.unanswered_syncs, strict=True):
         if silent_syncs:
             print_line(f"  {name} did not answer {silent_syncs} Syncs in time")
-    for node, frame_count in sorted(replay.reading.unknown_nodes.items()):
+    for node, frame_count in sorted(replay.reports.unknown_nodes.items()):
         print_line(f"  {frame_count} frames of node {node}, which is not of this robot")
     comparison = compare_with_run_log(replay, layout, rows)
     if comparison.first_wrong:
@@ -297,10 +297,10 @@ def replay_log(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def looks(foreign: Counter[str]) -> str:
+def looks(other_protocol_frames: Counter[str]) -> str:
     """Return whose the frames look like that are none of joint modules; empty if that is not known."""
     kinds: Counter[str] = Counter()
-    for looks_as, count in foreign.items():
+    for looks_as, count in other_protocol_frames.items():
         kinds[looks_as.partition(" of node")[0].removeprefix("as ")] += count
     del kinds[""]
     [(kind, count)] = kinds.most_common(1) or [("", 0)]

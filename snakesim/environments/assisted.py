@@ -1,4 +1,8 @@
-"""A robot whose controller drives it while an environment corrects the targets: a whole run in this process."""
+"""A simulated robot whose controller drives it while an environment adds corrections to the position targets.
+
+This is what the action `residual:CONTROLLER` of an environment uses: residual reinforcement learning. Host, simulation,
+guidance, navigation and control run in this process, one tick for each step.
+"""
 
 import contextlib
 import io
@@ -30,26 +34,32 @@ OVER = object()
 
 
 class AssistedRobot:
-    """A simulated robot, armed, with guidance, navigation and control of its scenario."""
+    """A simulated robot, armed, with guidance, navigation and control of its scenario.
+
+    The control service runs a subclass of the scenario's controller, which adds the corrections of `step` to the
+    position targets of that controller.
+    """
 
     def __init__(self, config: RunConfig) -> None:
-        """Start the run and wait until the robot is armed.
+        """Start the run, and run ticks without corrections until the robot is armed.
+
+        This blocks until then, which may take seconds. Nothing stays open if it fails.
 
         Args:
-            config: Configuration of the run; its controller is the one that is corrected.
+            config: Configuration of the run; its controller is the one whose targets are corrected.
 
         Raises:
-            SnakesimError: The run cannot begin.
+            SnakesimError: The run cannot begin, or the robot is not ready to arm in time.
         """
-        # The corrected controller has the configuration section of the original one.
-        self._residual: list[float] = [0.0] * config.robot.chain.modules
-        name = f"residual:{config.controller.rpartition(':')[2]}"
-        plugin = _make_corrected(load_controller(config.controller), self._residual)
-        longer = msgspec.structs.replace(config, controller=name, duration_s=config.duration_s + SPARE_S)
+        self._correction_rad: list[float] = [0.0] * config.robot.chain.modules  # the controller reads it in every tick
+        # The part after the colon is the configuration section, which both controllers share.
+        corrected_name = f"residual:{config.controller.rpartition(':')[2]}"
+        corrected_class = _make_corrected(load_controller(config.controller), self._correction_rad)
+        run_config = msgspec.structs.replace(config, controller=corrected_name, duration_s=config.duration_s + SPARE_S)
 
         self._service_output = io.StringIO()  # not shown: the reason of a failure is in `failed` of the run
-        with offer_plugin(CONTROLLERS, name, plugin), contextlib.ExitStack() as opening:
-            self._run = opening.enter_context(InProcessRun(longer))
+        with offer_plugin(CONTROLLERS, corrected_name, corrected_class), contextlib.ExitStack() as opening:
+            self._run = opening.enter_context(InProcessRun(run_config))
             self._subscribe(opening)
             self._ticks = self._run.iterate_ticks(before_services=True)
             opening.callback(self._ticks.close)
@@ -57,10 +67,8 @@ class AssistedRobot:
             self._index = {joint.name: i for i, joint in enumerate(self.description.joints)}
             self.newest: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
             self.limited: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
-            self._run_tick()
-            while not self._run.host.authority.arm_session:
-                self._run_tick()
-            self._opened = opening.pop_all()
+            self._run_until_armed()
+            self._opened = opening.pop_all()  # from now on `close` closes everything
 
     def _subscribe(self, opening: contextlib.ExitStack) -> None:
         """Open the readers of what the environment observes."""
@@ -96,7 +104,7 @@ class AssistedRobot:
             BackendError: The run has ended.
             ControllerError: The controller has failed.
         """
-        self._residual[:] = target
+        self._correction_rad[:] = target
         self._run_tick()
         applied = self._applied.newest(lambda _: True)
         if applied is None:
@@ -107,6 +115,12 @@ class AssistedRobot:
     def close(self) -> None:
         """End the run."""
         self._opened.close()
+
+    def _run_until_armed(self) -> None:
+        """Run one tick or more, until the robot is armed for the first time. Raises SnakesimError."""
+        self._run_tick()
+        while self._run.host.authority.arm_session == 0:
+            self._run_tick()
 
     def _run_tick(self) -> None:
         """Run one tick and read its samples. Raises ControllerError, BackendError."""
@@ -135,12 +149,12 @@ def _find_cause(errors: Mapping[str, SnakesimError]) -> BaseException | None:
     return None if error is None else error.__cause__
 
 
-def _make_corrected(controller_class: type[Controller[Any]], residual_rad: list[float]) -> type[Controller[Any]]:
+def _make_corrected(controller_class: type[Controller[Any]], corrections_rad: list[float]) -> type[Controller[Any]]:
     """Return a controller class that adds corrections to the position targets of another one.
 
     Args:
         controller_class: The class of the other controller.
-        residual_rad: (joints,) corrections in rad. The list is read in every tick.
+        corrections_rad: (joints,) corrections in rad. The list is read in every tick.
     """
 
     # A subclass, so that it has the declarations, the parameters and the check of the other controller.
@@ -149,10 +163,10 @@ def _make_corrected(controller_class: type[Controller[Any]], residual_rad: list[
             command = super().update(observation)  # pyright: ignore[reportAbstractUsage] - not abstract here
             setpoints = command.setpoints
             target = list(setpoints.target)
-            for i, residual in enumerate(residual_rad):
-                # A residual of 0 is not added, so that the target stays the same to the bit.
-                if residual and setpoints.mode[i] is Mode.POSITION:
-                    target[i] = setpoints.target[i] + residual
+            for i, correction_rad in enumerate(corrections_rad):
+                # A correction of 0 is not added, so that the target stays the same to the bit.
+                if correction_rad and setpoints.mode[i] is Mode.POSITION:
+                    target[i] = setpoints.target[i] + correction_rad
             corrected = RequestedSetpoints(setpoints.mode, target, setpoints.torque_limit_nm)
             return ControllerCommand(corrected, command.telemetry)
 

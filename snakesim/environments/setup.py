@@ -22,7 +22,7 @@ MAX_SEED = 2**31
 
 
 class EnvironmentSetup:
-    """What all environments with the same arguments share.
+    """The checked arguments of environments, and what all environments with the same arguments share.
 
     Attributes:
         config: the configuration of the scenario, without what a seed changes.
@@ -58,20 +58,8 @@ class EnvironmentSetup:
                 "SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file",
                 code="python/invalid-argument",
             )
-        if type(frame_skip) is not int or frame_skip < 1:
-            raise ConfigError(
-                f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more",
-                code="python/invalid-argument",
-            )
-        if render_mode not in (None, *RENDER_MODES):
-            raise ConfigError(
-                f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out", code="python/invalid-argument"
-            )
-        if not residual_rad > 0:
-            raise ConfigError(
-                f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad", code="python/invalid-argument"
-            )
-        controller = corrected_controller(action)
+        _check_step_arguments(frame_skip, render_mode, residual_rad)
+        controller = corrected_controller(action)  # whose targets the actions correct; None: actions are targets
         overrides = list_overrides(set, duration_s=duration)
         if controller is not None:
             if not safe:
@@ -102,7 +90,15 @@ class EnvironmentSetup:
         self._declare_spaces(observe, flat)
 
     def _declare_spaces(self, observe: Sequence[str] | None, flat: bool) -> None:
-        """Set the action space and the observation space, and a name and a unit for every number in them."""
+        """Set the action space and the observation space, and a name and a unit for every number in them.
+
+        An observation consists of parts, such as the joint angles. In a flat space the numbers of all parts are one
+        vector, otherwise the space is a dict of the parts.
+
+        Args:
+            observe: names of the parts; None: those of `select_parts`.
+            flat: whether an observation is one vector.
+        """
         self.action_space = _make_box(self.commands.low, self.commands.high)
         self.action_names = list(self.commands.names)
         self.action_units = [self.commands.unit] * len(self.action_names)
@@ -128,7 +124,14 @@ class EnvironmentSetup:
             self.slices = slices
 
     def make_config(self, seed: int) -> RunConfig:
-        """Return the configuration of the episode of a seed. Raises ConfigError."""
+        """Return the configuration of an episode.
+
+        Args:
+            seed: replaces the seed of the run and that of the random obstacle fields, and randomizes parameters.
+
+        Raises:
+            ConfigError: A randomized value is not allowed.
+        """
         if not self._randomizations:  # faster than to load the scenario again
             return self._replace_seeds(seed)
         field_keys = [f"scene.random_field.{i}.seed" for i in range(self.new_fields)]
@@ -156,15 +159,46 @@ class EnvironmentSetup:
         return msgspec.structs.replace(self.config, seed=seed, scene=scene)
 
     def _load_config(self, seed: int, seed_keys: Sequence[str] = ()) -> RunConfig:
-        """Load the scenario with the numbers that are drawn for a seed, and with the seed itself at `seed_keys`.
+        """Load the scenario with the parameters that a seed randomizes.
 
-        Raises ConfigError.
+        Args:
+            seed: of the random numbers.
+            seed_keys: keys of the configuration that get the seed itself as their value.
+
+        Raises:
+            ConfigError: The scenario or a randomized value is wrong.
         """
         overrides = [*self._overrides]
         overrides += [Override(key, seed, "seed") for key in seed_keys]
         for randomization in self._randomizations:
             overrides += randomization.overrides_for_scene(seed, "randomize")
         return load_checked(self._scenario, overrides, processes=False)
+
+
+def _check_step_arguments(frame_skip: int, render_mode: str | None, residual_rad: float) -> None:
+    """Check the arguments that decide what a step does.
+
+    Args:
+        frame_skip: Ticks of each step.
+        render_mode: How pictures are made; None: no pictures.
+        residual_rad: Largest correction of a controller's target, in rad.
+
+    Raises:
+        ConfigError: An argument is wrong.
+    """
+    if type(frame_skip) is not int or frame_skip < 1:
+        raise ConfigError(
+            f"frame_skip={frame_skip!r:.60}: give a whole number of ticks, 1 or more",
+            code="python/invalid-argument",
+        )
+    if render_mode not in (None, *RENDER_MODES):
+        raise ConfigError(
+            f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out", code="python/invalid-argument"
+        )
+    if not residual_rad > 0:
+        raise ConfigError(
+            f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad", code="python/invalid-argument"
+        )
 
 
 def _make_box(low: Sequence[float], high: Sequence[float]) -> spaces.Box:

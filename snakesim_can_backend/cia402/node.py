@@ -30,7 +30,14 @@ NO_SUBINDEX = 0x0609_0011
 NOT_EXPEDITED = 0x0800_0000
 WRONG_STATE = 0x0800_0022
 MAX_PDO_BYTES = 8
-LAST_SYNCHRONOUS_TYPE = 240
+LAST_SYNCHRONOUS_TYPE = 240  # transmission types from 1 to this one: the PDO is sent after a SYNC
+CAN_ID_MASK = 0x7FF  # the bits of a COB-ID that are the id of the frame
+
+# Subindices of the communication parameters of a PDO.
+COB_ID_SUB = 1
+TRANSMISSION_TYPE_SUB = 2
+
+# Indices in the object dictionary.
 COMMUNICATION_OBJECTS = range(0x1000, 0x2000)  # that a reset of the communication sets to their defaults
 RECEIVE_COMMUNICATION = range(0x1400, 0x1600)
 RECEIVE_MAPPING = range(0x1600, 0x1800)
@@ -155,7 +162,7 @@ class Node:
         if self.nmt_state != NmtState.OPERATIONAL:
             return None
         for index in self._list_pdos(RECEIVE_COMMUNICATION):
-            if self.values[index, 1] == cob_id:
+            if self.values[index, COB_ID_SUB] == cob_id:
                 return list(self._unpack(index + MAPPING_OFFSET, data))
         return None
 
@@ -164,46 +171,96 @@ class Node:
         if self.nmt_state != NmtState.OPERATIONAL:
             return
         for index in self._list_pdos(TRANSMIT_COMMUNICATION):
-            cob_id = self.values[index, 1]
-            is_synchronous = 1 <= self.values.get((index, 2), 0) <= LAST_SYNCHRONOUS_TYPE
-            if is_synchronous and not cob_id & PDO_OFF:
-                yield cob_id & 0x7FF, self._pack(index + MAPPING_OFFSET)
+            cob_id = self.values[index, COB_ID_SUB]
+            transmission_type = self.values.get((index, TRANSMISSION_TYPE_SUB), 0)
+            is_synchronous = 1 <= transmission_type <= LAST_SYNCHRONOUS_TYPE
+            is_on = not cob_id & PDO_OFF
+            if is_synchronous and is_on:
+                yield cob_id & CAN_ID_MASK, self._pack(index + MAPPING_OFFSET)
 
     def _list_pdos(self, indices: range) -> list[int]:
-        return sorted(index for index, sub in self.eds.objects if index in indices and sub == 1)
+        """Return the indices of the communication parameters of all PDOs of one direction that the node has."""
+        return sorted(index for index, sub in self.eds.objects if index in indices and sub == COB_ID_SUB)
 
     def _list_mapped(self, mapping_index: int) -> Iterator[tuple[Address, int]]:
-        """Yield the objects of a PDO, and their lengths in bytes."""
-        for sub in range(1, self.values.get((mapping_index, 0), 0) + 1):
-            mapped = self.values.get((mapping_index, sub), 0)
-            yield (mapped >> 16, mapped >> 8 & 0xFF), (mapped & 0xFF) // 8
+        """Yield the objects in a PDO, in the order of its data, and their lengths in bytes.
+
+        Args:
+            mapping_index: index of the mapping parameters of the PDO. Their subindex 0 is the number of mapped objects,
+                and the subindices from 1 on are the entries; see `_parse_mapping_entry`.
+        """
+        object_count = self.values.get((mapping_index, 0), 0)
+        for sub in range(1, object_count + 1):
+            yield _parse_mapping_entry(self.values.get((mapping_index, sub), 0))
 
     def _unpack(self, mapping_index: int, data: bytes) -> Iterator[tuple[Address, int]]:
+        """Yield the objects that the data of a PDO writes, and their values."""
         offset = 0
         for address, size in self._list_mapped(mapping_index):
             yield address, int.from_bytes(data[offset : offset + size], "little")
             offset += size
 
     def _pack(self, mapping_index: int) -> bytes:
+        """Return the data of a PDO: the present values of its objects, one after another, little-endian."""
         return b"".join(
             self.get(address).to_bytes(size, "little") for address, size in self._list_mapped(mapping_index)
         )
 
     def _check_mapping(self, address: Address, value: int) -> None:
-        """Refuse a change of an active mapping, and objects that cannot be mapped. Raises SdoAbortError."""
+        """Check a value that a host writes into the mapping parameters of a PDO; other objects need no check.
+
+        A mapping may be changed only while its PDO is off. Its entries may be changed only while subindex 0, the number
+        of mapped objects, is 0. A host then sets subindex 0 to the number of entries, which activates the mapping.
+
+        Args:
+            address: the object that is written.
+            value: its new value.
+
+        Raises:
+            SdoAbortError: the mapping is in use, an object cannot be mapped, or the objects are too long for a frame.
+        """
         index, sub = address
         if index not in RECEIVE_MAPPING and index not in TRANSMIT_MAPPING:
             return
-        cob_id = self.values.get((index - MAPPING_OFFSET, 1), PDO_OFF)
-        if not cob_id & PDO_OFF or (sub and self.values.get((index, 0), 0)):
+        cob_id = self.values.get((index - MAPPING_OFFSET, COB_ID_SUB), PDO_OFF)
+        pdo_is_on = not cob_id & PDO_OFF
+        if pdo_is_on:
             raise SdoAbortError(WRONG_STATE)
-        if sub:
-            described = self.eds.objects.get((value >> 16, value >> 8 & 0xFF))
-            if described is None:
-                raise SdoAbortError(NO_OBJECT)
-            if not described.mappable or described.size != (value & 0xFF) // 8:
-                raise SdoAbortError(NOT_MAPPABLE)
+        if sub == 0:
+            self._check_mapped_length(index, value)
             return
-        sizes = [(self.values.get((index, entry), 0) & 0xFF) // 8 for entry in range(1, value + 1)]
-        if sum(sizes) > MAX_PDO_BYTES:
+        mapping_is_active = self.values.get((index, 0), 0) > 0
+        if mapping_is_active:
+            raise SdoAbortError(WRONG_STATE)
+        self._check_mapping_entry(value)
+
+    def _check_mapping_entry(self, entry: int) -> None:
+        """Check that the object of an entry exists, may be in a PDO, and has that length. Raises SdoAbortError."""
+        mapped_address, size = _parse_mapping_entry(entry)
+        described = self.eds.objects.get(mapped_address)
+        if described is None:
+            raise SdoAbortError(NO_OBJECT)
+        if not described.mappable or described.size != size:
+            raise SdoAbortError(NOT_MAPPABLE)
+
+    def _check_mapped_length(self, mapping_index: int, object_count: int) -> None:
+        """Check that the first objects of a mapping fit into one frame. Raises SdoAbortError."""
+        total_bytes = 0
+        for sub in range(1, object_count + 1):
+            _, size = _parse_mapping_entry(self.values.get((mapping_index, sub), 0))
+            total_bytes += size
+        if total_bytes > MAX_PDO_BYTES:
             raise SdoAbortError(TOO_LONG_TO_MAP)
+
+
+def _parse_mapping_entry(entry: int) -> tuple[Address, int]:
+    """Return the object of a mapping entry, and its length in bytes.
+
+    Bits 31 to 16 of an entry are the object's index, bits 15 to 8 its subindex, and bits 7 to 0 its length in bits.
+
+    Source: CiA 301, PDO mapping parameter record.
+    """
+    index = entry >> 16
+    sub = (entry >> 8) & 0xFF
+    length_bits = entry & 0xFF
+    return (index, sub), length_bits // 8

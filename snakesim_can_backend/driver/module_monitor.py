@@ -59,7 +59,7 @@ class ModuleMonitor:
         self._unsent: dict[str, int] = {}  # consecutive cycles in which a bus rejected frames
         self._unsent_sync: dict[str, int] = {}  # newest Sync at which a bus rejected frames
         self._down: set[str] = set()  # buses whose interface is down
-        self._unknown_nodes: dict[int, int] = {}  # frames of unexpected nodes in consecutive cycles
+        self._unknown_node_frames: dict[int, int] = {}  # by node: frames in consecutive cycles, each with some
         self.minor_error_counts: dict[str, int] = {}  # bus errors that are not faults, by kind
 
     def reset(self, sync: int) -> None:
@@ -96,7 +96,9 @@ class ModuleMonitor:
             self._unsent_sync[channel] = reading.sync
 
         findings = self._check_buses(errors, unsent_channels)
-        findings += self._check_unknown_senders(reading)
+        findings += self._find_unknown_nodes(reading)
+        findings += self._find_other_host(reading)
+        reading.reset_sender_counts()
         for joint, module in enumerate(reading.modules):
             findings += self._check_answers(joint, module, reading)
             findings += self._check_state(joint, module, reading, lifecycle, isolated=joint in isolated)
@@ -245,7 +247,8 @@ class ModuleMonitor:
         """Return findings about bus errors, and about buses that have rejected frames for several cycles.
 
         Args:
-            errors: bus errors since the last call; those that are not faults are only counted.
+            errors: bus errors since the last call; those that are not faults are only counted, in
+                `minor_error_counts`.
             unsent: channels of the buses that rejected a frame in this cycle.
         """
         findings: list[Finding] = []
@@ -259,6 +262,8 @@ class ModuleMonitor:
                 self.minor_error_counts[error.kind] = self.minor_error_counts.get(error.kind, 0) + 1
             else:
                 findings.append(Finding(error.kind, f"{error.channel}: {error.detail}; {advice}"))
+        # Consecutive cycles are counted: a bus that sent everything in this cycle begins at 0 again. So does one whose
+        # interface is down, which is a finding of its own.
         self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
         for channel, cycles in self._unsent.items():
             if cycles >= IN_A_ROW:
@@ -273,29 +278,43 @@ class ModuleMonitor:
         )
         return Finding("bus_stuck", cause)
 
-    def _check_unknown_senders(self, reading: ModuleReports) -> list[Finding]:
-        """Return findings about nodes that are no joints, and about other programs that command the modules.
+    def _find_unknown_nodes(self, reading: ModuleReports) -> list[Finding]:
+        """Return a finding for each node on the bus that is no joint of this robot.
+
+        One frame may be a transmission error, so a node is reported only after UNKNOWN_NODE_FRAMES frames. A cycle
+        without any frame of a node ends the count of that node.
 
         Args:
-            reading: counts of frames from other senders, which are reset.
+            reading: reports of the modules, with the frames of unknown nodes in this cycle.
         """
+        frame_counts: dict[int, int] = {}
+        for node, new_frames in reading.unknown_nodes.items():
+            frame_counts[node] = self._unknown_node_frames.get(node, 0) + new_frames
+        self._unknown_node_frames = frame_counts  # without the nodes that sent no frame in this cycle
+
         findings: list[Finding] = []
-        self._unknown_nodes = {
-            node: self._unknown_nodes.get(node, 0) + frames for node, frames in reading.unknown_nodes.items()
-        }
-        for node, frames in self._unknown_nodes.items():
+        for node, frames in frame_counts.items():
             if frames >= UNKNOWN_NODE_FRAMES:
                 findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
-        reading.unknown_nodes.clear()
+        return findings
 
+    def _find_other_host(self, reading: ModuleReports) -> list[Finding]:
+        """Return findings about frames that only a host sends and that this driver did not send.
+
+        An Emergency may come from any node. Every other frame of a host shows that a second program commands the
+        modules. It may have written their parameters, so all joints are marked as changed; see `take_changed`.
+
+        Args:
+            reading: reports of the modules, with the frames of other hosts in this cycle, by opcode.
+        """
+        findings: list[Finding] = []
         other_host = reading.from_other_host
         if other_host[Opcode.EMERGENCY]:
             findings.append(Finding("emergency", "a node on the bus sent an Emergency"))
         if other_host.keys() - {Opcode.EMERGENCY}:
             cause = "another program commands the modules on this bus; end one of the two"
             findings.append(Finding("second_host", cause))
-            self._changed |= set(range(len(reading.modules)))  # it may have written their parameters
-        other_host.clear()
+            self._changed |= set(range(len(reading.modules)))
         return findings
 
 

@@ -1,4 +1,4 @@
-"""Replays a log of the bus through the driver's own reading of it: the joint states of every tick, without a bus.
+"""Replays a log of the bus through the code with which the driver reads a bus: the joint states of every tick.
 
 A tick begins at its Sync. Its sample is taken when all awaited modules have answered, or when the driver would no
 longer have waited for them. Frames that were received together have one time in the log, and are read together here.
@@ -31,26 +31,27 @@ VALUES = ("angle_rad", "velocity_rad_s", "torque_nm")
 class LogReplay:
     """Reads a log frame by frame as the driver reads a bus, and collects the joint states of every Sync."""
 
-    def __init__(self, mounting: Mounting, reports: ReportSchedule, answer_limit_s: float) -> None:
+    def __init__(self, mounting: Mounting, schedule: ReportSchedule, answer_limit_s: float) -> None:
         """Prepare to read the log of a bus as the driver would have read the bus.
 
         Args:
-            mounting: how the modules' shafts move the joints.
-            reports: which reports the modules send, and how often.
+            mounting: converts shaft angles and torques of the modules into those of the joints: sign, gear, zero.
+            schedule: which reports the modules send, and how often.
             answer_limit_s: how long the driver waits for the answers to a Sync.
         """
         joints = len(mounting.sign)
         self._mounting = mounting
-        self._reports = reports
+        self._schedule = schedule
         self._answer_limit_s = answer_limit_s
-        self._open_until_s: float | None = None  # end of the wait for the newest Sync; None: its sample is taken
-        self.reading = ModuleReports(joints)
+        # Log time at which the wait for the answers to the newest Sync ends; None: its sample has been taken.
+        self._answer_deadline_s: float | None = None
+        self.reports = ModuleReports(joints)
 
         # Results.
         self.frames = 0
-        self.foreign: Counter[str] = Counter()  # frames that are none of the protocol, by their likely origin
+        self.other_protocol_frames: Counter[str] = Counter()  # by likely origin
         self.joints: list[Floats] = []  # by Sync: VALUES of all joints, (3, n_joints)
-        self.silent = [0] * joints  # Syncs that each joint did not answer in time
+        self.unanswered_syncs = [0] * joints  # by joint: Syncs without an answer in time
 
     def read(self, log: Iterable[can.Message]) -> None:
         """Read a whole log.
@@ -59,42 +60,56 @@ class LogReplay:
         taken.
         """
         for (time_s, _), messages in groupby(log, key=lambda message: (message.timestamp, message.channel)):
-            if self._open_until_s is not None and time_s > self._open_until_s:
+            if self._answer_deadline_s is not None and time_s > self._answer_deadline_s:
                 self._take_sample()
             for message in messages:
                 self._read_message(message, time_s)
-            if self._open_until_s is not None and self.reading.complete:
+            if self._answer_deadline_s is not None and self.reports.complete:
                 self._take_sample()
 
     def _read_message(self, message: can.Message, time_s: float) -> None:
+        """Count a message of the log, and process it as the driver would when it arrives on the bus.
+
+        Args:
+            message: the frame, or an error that the bus reported.
+            time_s: its time in the log.
+        """
         self.frames += 1
-        self.foreign[guess_origin(message)] += not matches_protocol(message)
+        if not matches_protocol(message):
+            self.other_protocol_frames[guess_origin(message)] += 1
         is_standard_data_frame = not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
         if not is_standard_data_frame:
             return
         frame = Frame(message.arbitration_id, bytes(message.data))
         opcode = parse_opcode(frame.id)
         if opcode not in FROM_HOST:
-            self.reading.process_frame(frame)
+            self.reports.process_frame(frame)
         elif opcode == Opcode.SYNC and len(frame.data) == SYNC_BYTES:
             self._begin_sync(frame, time_s)
 
     def _begin_sync(self, frame: Frame, time_s: float) -> None:
+        """Begin the tick of a Sync, and end the one before. A Sync is on every bus, and counts once.
+
+        Args:
+            frame: the Sync, whose first byte is the lowest 8 bits of its number.
+            time_s: its time in the log.
+        """
         count = frame.data[0]
-        if count == self.reading.sync & SYNC_COUNT_MASK:  # the same Sync, on another bus
+        if count == self.reports.sync & SYNC_COUNT_MASK:  # the same Sync, on another bus
             return
-        if self._open_until_s is not None:
+        if self._answer_deadline_s is not None:
             self._take_sample()
-        sync = self.reading.sync + 1
-        self.reading.begin_sync(sync, contacts=contacts_due(self._reports, sync), tail=self._reports.tail)
-        self._open_until_s = time_s + self._answer_limit_s
+        sync = self.reports.sync + 1
+        self.reports.begin_sync(sync, contacts=contacts_due(self._schedule, sync), tail=self._schedule.tail)
+        self._answer_deadline_s = time_s + self._answer_limit_s
 
     def _take_sample(self) -> None:
         """Store the joint states of the newest Sync, and count the joints that did not answer it."""
-        self.joints.append(joint_values(self.reading, self._mounting))
-        for joint, module in enumerate(self.reading.modules):
-            self.silent[joint] += module.sync != self.reading.sync
-        self._open_until_s = None
+        self.joints.append(joint_values(self.reports, self._mounting))
+        for joint, module in enumerate(self.reports.modules):
+            if module.sync != self.reports.sync:
+                self.unanswered_syncs[joint] += 1
+        self._answer_deadline_s = None
 
 
 @dataclass(frozen=True)

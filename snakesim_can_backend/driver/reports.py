@@ -197,6 +197,11 @@ class ModuleReports:
         for module in self.modules:
             module.frames = 0
 
+    def reset_sender_counts(self) -> None:
+        """Forget the frames of unknown nodes and of other hosts, because the next control cycle counts its own."""
+        self.unknown_nodes.clear()
+        self.from_other_host.clear()
+
     def process_frame(self, frame: Frame) -> None:
         """Store the report in one received frame, or count the frame if it is none of this robot's."""
         known = self._handlers.get(frame.id)

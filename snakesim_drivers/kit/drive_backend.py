@@ -95,14 +95,17 @@ class DriveBackend(Backend):
         self._open = True
         self._tick = 0
         self._lifecycle: LifecycleState = "disarmed"
-        self._following = NO_DRIVES
+        self._driven = NO_DRIVES  # joints whose drives got setpoints in the newest cycle
         self._braking = Braking(
             [round(watchdog_s * 1e9) for watchdog_s in parts.watchdogs_s], holds=config.robot.safety.action == "hold"
         )
         # Faults.
         self._reported = ReportedFindings()
+        # Isolated joints have failed, and the robot continues without them until a reset.
         self._isolated = NO_DRIVES
-        self._pending = NO_DRIVES  # just reported as failed: the HAL is expected to isolate them
+        self._awaiting_isolation = (
+            NO_DRIVES  # reported as failed since the newest setpoints: the HAL should isolate them
+        )
         self._grace_cycles = 0  # left, in which drives may report errors from before a reset
         try:
             self._drives = parts.open_drives(self._readings)
@@ -134,7 +137,10 @@ class DriveBackend(Backend):
         return self._make_samples(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """Send setpoints to the drives that follow in this lifecycle state, and switch off the others.
+        """Send setpoints to the drives that are driven in this lifecycle state, and switch off the others.
+
+        The order matters. Drives get the lifecycle state before anything else. Then errors of drives are reset, which
+        needs the lifecycle state and the isolated joints of the cycle before. Setpoints are last.
 
         Args:
             setpoints: setpoints of all joints that have passed the limiter, and which joints are isolated.
@@ -143,15 +149,13 @@ class DriveBackend(Backend):
         if not self._open:
             return
         self._send_lifecycle(lifecycle, setpoints.isolated)
-        returned = (self._isolated | self._pending) - setpoints.isolated
-        self._isolated = setpoints.isolated
-        self._pending = NO_DRIVES
+        reconnected = self._update_isolated(setpoints.isolated)
         connected = frozenset(range(len(self._joint_names))) - self._isolated
-        self._reset_faults(lifecycle, connected, returned)
-        self._following = self._joints_to_drive(lifecycle, connected, setpoints.mode)
-        self._lifecycle = lifecycle
+        self._reset_faults(lifecycle, connected, reconnected)
+        self._driven = self._joints_to_drive(lifecycle, connected, setpoints.mode)
+        self._lifecycle = lifecycle  # only now, because the two calls above need the state before
         command = BusCommand(
-            following=self._following,
+            following=self._driven,
             modes=setpoints.mode,
             targets=self._mounting.to_drive_targets(setpoints.mode, setpoints.target),
             limits_nm=self._mounting.to_drive_torque_limit_nm(np.array(setpoints.torque_limit_nm)),
@@ -167,13 +171,17 @@ class DriveBackend(Backend):
         self._drives.poll()
 
     def faults(self) -> list[Fault]:
-        """Return the faults that are new since the last call. One that affects the whole robot stops it at once."""
+        """Return the faults that are new since the last call.
+
+        A fault of single joints isolates these if the robot may continue without them. Any other fault stops the robot
+        at once: its drives get the state `fault` now, and not only with the setpoints of the next cycle.
+        """
         if not self._open:
             return []
         new_findings = self._reported.filter_new(self._relevant_findings())
         failed = frozenset(finding.joint for finding in new_findings if finding.joint is not None)
         if self._can_isolate(new_findings, failed):
-            self._pending |= failed
+            self._awaiting_isolation |= failed
         elif new_findings and self._lifecycle not in LATCHED_STATES:
             try:
                 self._send_lifecycle("fault", self._isolated)
@@ -209,12 +217,23 @@ class DriveBackend(Backend):
 
     # --- inside -----------------------------------------------------------------------------------------------
 
+    def _update_isolated(self, isolated: frozenset[int]) -> frozenset[int]:
+        """Store which joints the HAL isolates now, and return those that are connected again.
+
+        Connected again are the joints that were isolated before, and those that were reported as failed but not
+        isolated, for example because the operator reset the robot in the same cycle.
+        """
+        reconnected = (self._isolated | self._awaiting_isolation) - isolated
+        self._isolated = isolated
+        self._awaiting_isolation = NO_DRIVES
+        return reconnected
+
     def _joints_to_drive(
         self, lifecycle: LifecycleState, connected: frozenset[int], modes: Sequence[Mode]
     ) -> frozenset[int]:
         """Return the joints whose drives get setpoints in this lifecycle state.
 
-        In a fault these are the joints that followed before it and still brake: no other joint begins to follow.
+        In a fault these are the joints that were driven before it and still brake; no drive is enabled anew.
 
         Args:
             lifecycle: State of the robot in this cycle.
@@ -228,26 +247,29 @@ class DriveBackend(Backend):
                 return connected
             case "fault":
                 speeds = self._mounting.to_joint_velocity_rad_s(self._readings.velocity_rad_s)
-                followed_before = connected & self._following
-                return self._braking.select_braking_joints(followed_before, modes, speeds, self._clock.now_ns())
+                driven_before = connected & self._driven
+                return self._braking.select_braking_joints(driven_before, modes, speeds, self._clock.now_ns())
             case _:
                 return NO_DRIVES
 
-    def _reset_faults(self, lifecycle: LifecycleState, connected: frozenset[int], returned: frozenset[int]) -> None:
-        """Clear errors of drives after the operator's reset: it ends a latched state, or the isolation of joints.
+    def _reset_faults(self, lifecycle: LifecycleState, connected: frozenset[int], reconnected: frozenset[int]) -> None:
+        """Reset errors of drives if the operator has just reset the robot; otherwise do nothing.
+
+        A reset shows in one of two ways: the robot leaves a latched state, which resets all connected drives, or
+        isolated joints are connected again, which resets only these. Call it before `_lifecycle` gets the new state.
 
         Args:
             lifecycle: The new lifecycle state.
             connected: Joints that are not isolated.
-            returned: Joints that were isolated until now, or should have been.
+            reconnected: Joints that were isolated until now, or should have been.
         """
         if lifecycle in LATCHED_STATES:
             return
         was_latched = self._lifecycle in LATCHED_STATES
-        if not was_latched and not returned:
+        if not was_latched and not reconnected:
             return
         self._reported.reset()
-        self._drives.reset_faults(connected if was_latched else returned)
+        self._drives.reset_faults(connected if was_latched else reconnected)
         self._grace_cycles = self.reset_grace_cycles * self._decimation
 
     def _relevant_findings(self) -> list[Finding]:

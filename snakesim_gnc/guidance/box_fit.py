@@ -49,7 +49,7 @@ class Boxes:
     center_sd_m: Floats  # (b, 2) along and across yaw
     half_sd_m: Floats  # (b, 2)
     misfit: Floats  # (b,) sum of squared, weighted, limited distances
-    faces: NDArray[np.int_]  # (b,) number of faces that were seen
+    seen_face_count: NDArray[np.int_]  # (b,) how many of the four faces were seen
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def fit_boxes(points: Floats, weight: Floats, outward: Floats) -> Boxes:
     yaw_rad = fine_rad[rows, best] + _interpolate_minimum_rad(misfit, best)
     rotated_points = _Points.in_headings(points, outward, yaw_rad[:, None])
     faces, misfit = _fit_faces(rotated_points, weight)
-    return _close_boxes(rotated_points, weight, yaw_rad, faces, misfit[:, 0])
+    return _complete_boxes(rotated_points, weight, yaw_rad, faces, misfit[:, 0])
 
 
 def _rotate(vectors: Floats, yaw: Floats) -> tuple[Floats, Floats]:
@@ -178,14 +178,17 @@ def _interpolate_minimum_rad(misfit: Floats, best: NDArray[np.intp]) -> Floats:
     return np.where(center == best, np.clip(offset, -0.5, 0.5) * step_rad, 0.0)
 
 
-def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces, misfit: Floats) -> Boxes:
-    """Return boxes from the faces that the sensor saw, with assumed faces on the sides that it did not see.
+def _complete_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces, misfit: Floats) -> Boxes:
+    """Return complete boxes from the faces that the sensor saw, with assumed faces on the sides that it did not see.
+
+    A sensor sees at most two faces of a box: one on each axis. The ends of both axes give the center and the size in
+    the heading of the box, and the heading turns the center into the world.
 
     Args:
         points: the points of b obstacles, each in the coordinates of its one fitted heading.
         weight: (b, p) information of the points in 1 / m².
         yaw_rad: (b,) fitted headings.
-        faces: places of the four faces, (b, 1) each.
+        faces: places of the four faces, (b, 1) each in m: low and high along the heading, low and high across it.
         misfit: (b,) sum of the weighted squared distances of the points from the faces.
 
     Returns:
@@ -195,14 +198,17 @@ def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces,
     extent_x_m = extents.high_m[0] - extents.low_m[0]
     extent_y_m = extents.high_m[1] - extents.low_m[1]
     longest_m = np.maximum(extent_x_m, extent_y_m)
-    depth_m = np.where(longest_m > WALL_M, WALL_THICKNESS_M, DEPTH_M)  # of a box of which one face was seen
+    is_wall = longest_m > WALL_M
+    assumed_depth_m = np.where(is_wall, WALL_THICKNESS_M, DEPTH_M)  # of a box of which one face was seen
     center_m = np.empty((len(yaw_rad), 2))  # along the heading and across it
     half_m = np.empty((len(yaw_rad), 2))
     sd_m = np.empty((len(yaw_rad), 2))
     for axis in (0, 1):
-        bottom_m, top_m, sd_m[:, axis] = _close_axis(axis, extents, faces, depth_m)
-        center_m[:, axis] = 0.5 * (bottom_m + top_m)
-        half_m[:, axis] = np.maximum(0.5 * (top_m - bottom_m), MIN_HALF_M)
+        low_end_m, high_end_m, sd_m[:, axis] = _find_ends(axis, extents, faces, assumed_depth_m)
+        center_m[:, axis] = 0.5 * (low_end_m + high_end_m)
+        half_m[:, axis] = np.maximum(0.5 * (high_end_m - low_end_m), MIN_HALF_M)
+
+    # Rotate the centers from the axes of the boxes into the world.
     cosine = np.cos(yaw_rad)
     sine = np.sin(yaw_rad)
     center_x = cosine * center_m[:, 0] - sine * center_m[:, 1]
@@ -214,7 +220,7 @@ def _close_boxes(points: _Points, weight: Floats, yaw_rad: Floats, faces: Faces,
         center_sd_m=sd_m,
         half_sd_m=sd_m.copy(),
         misfit=misfit,
-        faces=np.sum(extents.is_seen, axis=0),
+        seen_face_count=np.sum(extents.is_seen, axis=0),
     )
 
 
@@ -259,42 +265,44 @@ def _measure_extents(points: _Points, weight: Floats, faces: Faces) -> _Extents:
     return extents
 
 
-def _close_axis(axis: int, extents: _Extents, faces: Faces, depth_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """Find the two ends of b boxes along one axis.
+def _find_ends(axis: int, extents: _Extents, faces: Faces, assumed_depth_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Find the low end and the high end of b boxes along one axis.
 
-    An end is the face there if the sensor saw it. Otherwise, if it saw a face of the other axis, the end is where the
-    points of that face end. Otherwise it is at an assumed depth behind the opposite face.
+    An end is the face there if the sensor saw that face. Otherwise, if the sensor saw a face of the other axis, the end
+    is where the points of that face end. Otherwise the end is at an assumed depth behind the opposite face.
 
     Args:
         axis: 0 along the heading, 1 across it.
         extents: range of the points, and which faces were seen.
         faces: places of the four faces, (b, 1) each in m: low and high of axis 0, low and high of axis 1.
-        depth_m: (b,) assumed depths.
+        assumed_depth_m: (b,) size of a box along the axis of its only seen face, unless its points reach further.
 
     Returns:
-        The lower end, the upper end, and the standard deviation of half the size, (b,) each in m.
+        The low end, the high end, and the standard deviation of half the size, (b,) each in m.
     """
     low_face = 2 * axis
-    high_face = 2 * axis + 1
-    other_low_face = 2 - low_face
-    has_low = extents.is_seen[low_face]
-    has_high = extents.is_seen[high_face]
-    has_other = extents.is_seen[other_low_face] | extents.is_seen[other_low_face + 1]
-    low_m = extents.low_m[axis]
-    high_m = extents.high_m[axis]
-    assumed_size_m = np.maximum(depth_m, high_m - low_m)
+    high_face = low_face + 1
+    other_axis = 1 - axis
+    other_low_face = 2 * other_axis
+    other_high_face = other_low_face + 1
+    saw_low = extents.is_seen[low_face]
+    saw_high = extents.is_seen[high_face]
+    saw_other_axis = extents.is_seen[other_low_face] | extents.is_seen[other_high_face]
+    first_point_m = extents.low_m[axis]
+    last_point_m = extents.high_m[axis]
+    assumed_size_m = np.maximum(assumed_depth_m, last_point_m - first_point_m)
     low_face_m = faces[low_face][:, 0]
     high_face_m = faces[high_face][:, 0]
 
-    bottom_m = np.where(has_other | ~has_high, low_m, high_face_m - assumed_size_m)
-    bottom_m = np.where(has_low, low_face_m, bottom_m)
-    top_m = np.where(has_other | ~has_low, high_m, low_face_m + assumed_size_m)
-    top_m = np.where(has_high, high_face_m, top_m)
+    low_end_if_unseen_m = np.where(saw_other_axis | ~saw_high, first_point_m, high_face_m - assumed_size_m)
+    low_end_m = np.where(saw_low, low_face_m, low_end_if_unseen_m)
+    high_end_if_unseen_m = np.where(saw_other_axis | ~saw_low, last_point_m, low_face_m + assumed_size_m)
+    high_end_m = np.where(saw_high, high_face_m, high_end_if_unseen_m)
 
-    open_sd_m = np.where(has_other, END_SD_M, DEPTH_SD_M)
-    bottom_sd_m = np.where(has_low, _sd_m(extents.information[low_face]), open_sd_m)
-    top_sd_m = np.where(has_high, _sd_m(extents.information[high_face]), open_sd_m)
-    return bottom_m, top_m, 0.5 * np.hypot(bottom_sd_m, top_sd_m)
+    unseen_sd_m = np.where(saw_other_axis, END_SD_M, DEPTH_SD_M)
+    low_sd_m = np.where(saw_low, _sd_m(extents.information[low_face]), unseen_sd_m)
+    high_sd_m = np.where(saw_high, _sd_m(extents.information[high_face]), unseen_sd_m)
+    return low_end_m, high_end_m, 0.5 * np.hypot(low_sd_m, high_sd_m)
 
 
 def _sd_m(information: Floats) -> Floats:

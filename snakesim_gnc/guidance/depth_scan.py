@@ -150,26 +150,20 @@ class DepthScanner:
             pixels: the pixels that may show an obstacle.
         """
         bin_count = len(free_m)
-        bins = pixels.bins
-        range_m = self._find_upright_m(pixels, bin_count)
-        spread_m = self._noise.sd_m(np.nan_to_num(range_m))
-        width_m = SPREAD_SD * spread_m + CELL_RATIO * CELL_M
-        count = np.zeros(bin_count)
-        on_surface = np.zeros(len(bins), dtype=bool)
-        # Alternately select the pixels near the range of their bin, and set that range to their mean.
-        for _ in range(RANGE_ITERATIONS):
-            with np.errstate(invalid="ignore"):
-                on_surface = np.abs(pixels.ranges_m - range_m[bins]) < width_m[bins]
-            count = np.bincount(bins[on_surface], minlength=bin_count).astype(np.float64)
-            total_m = np.bincount(bins[on_surface], pixels.ranges_m[on_surface], bin_count)
-            range_m = total_m / np.where(count > 0, count, np.nan)
+        first_range_m = self._find_upright_m(pixels, bin_count)
+        pixel_sd_m = self._noise.sd_m(np.nan_to_num(first_range_m))
+        range_m, on_surface = _average_ranges(pixels, first_range_m, pixel_sd_m)
 
+        bins = pixels.bins[on_surface]
+        points = pixels.points[on_surface]
+        count = np.bincount(bins, minlength=bin_count).astype(np.float64)
         has_surface = count > 0
-        total_x = np.bincount(bins[on_surface], pixels.points[on_surface, 0], bin_count)
-        total_y = np.bincount(bins[on_surface], pixels.points[on_surface, 1], bin_count)
+        total_x = np.bincount(bins, points[:, 0], bin_count)
+        total_y = np.bincount(bins, points[:, 1], bin_count)
         mean_xy = np.stack([total_x, total_y], axis=1) / np.where(has_surface, count, np.nan)[:, None]
         top_m = np.full(bin_count, -np.inf)
-        np.maximum.at(top_m, bins[on_surface], pixels.heights_m[on_surface])
+        np.maximum.at(top_m, bins, pixels.heights_m[on_surface])
+        mean_sd_m = pixel_sd_m / np.sqrt(np.maximum(count, 1.0))
         return Scan(
             timestamp_ns=timestamp_ns,
             origin_w=origin_w,
@@ -177,7 +171,7 @@ class DepthScanner:
             step_rad=self._step_rad,
             range_m=range_m,
             points_w=origin_w + mean_xy,
-            sd_m=np.hypot(spread_m / np.sqrt(np.maximum(count, 1.0)), SURFACE_SD_M),
+            sd_m=np.hypot(mean_sd_m, SURFACE_SD_M),
             free_m=np.where(has_surface, np.nan_to_num(range_m), free_m),
             top_m=np.where(has_surface, top_m, np.nan),
         )
@@ -197,3 +191,30 @@ class DepthScanner:
         nearest = is_upright.argmax(axis=1)
         range_m = STRETCH_M * np.sinh((nearest + 0.5) * (CELL_M / STRETCH_M))
         return np.where(is_upright.any(axis=1), range_m, np.nan)
+
+
+def _average_ranges(pixels: _Pixels, first_range_m: Floats, pixel_sd_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Average the ranges of the pixels of the surface in each bin.
+
+    The pixels near the range of their bin are selected, and the range of the bin is set to their mean; and again.
+
+    Args:
+        pixels: the m pixels that may show an obstacle.
+        first_range_m: (n_bins,) first guess of the range of the surface; NaN for a bin without one.
+        pixel_sd_m: (n_bins,) standard deviation of the range of one pixel there.
+
+    Returns:
+        (n_bins,) mean ranges in m, NaN for a bin without a surface; and (m,) whether each pixel is on its surface.
+    """
+    bins = pixels.bins
+    bin_count = len(first_range_m)
+    max_error_m = SPREAD_SD * pixel_sd_m + CELL_RATIO * CELL_M
+    range_m = first_range_m
+    on_surface = np.zeros(len(bins), dtype=bool)
+    for _ in range(RANGE_ITERATIONS):
+        with np.errstate(invalid="ignore"):
+            on_surface = np.abs(pixels.ranges_m - range_m[bins]) < max_error_m[bins]
+        count = np.bincount(bins[on_surface], minlength=bin_count).astype(np.float64)
+        total_m = np.bincount(bins[on_surface], pixels.ranges_m[on_surface], bin_count)
+        range_m = total_m / np.where(count > 0, count, np.nan)
+    return range_m, on_surface

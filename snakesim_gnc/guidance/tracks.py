@@ -164,7 +164,7 @@ def fit_shapes(tracks: Sequence[Track]) -> None:
         boxes = fit_boxes(
             points[candidates, :max_cells], weight[candidates, :max_cells], outward[candidates, :max_cells]
         )
-        parameters = np.where(boxes.faces > 1, BOX_PARAMETERS, SINGLE_FACE_PARAMETERS)
+        parameters = np.where(boxes.seen_face_count > 1, BOX_PARAMETERS, SINGLE_FACE_PARAMETERS)
         box_cost[candidates] = boxes.misfit + parameters * log_cells[candidates]
         box_rows = {int(index): row for row, index in enumerate(candidates)}
 

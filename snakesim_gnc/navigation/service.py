@@ -47,27 +47,44 @@ class Navigation(Service):
             robot: description of the robot.
         """
         config = self._config
-        surveyed_obstacles = survey_obstacles(config)
+        mission = config.mission
+        surveyed_obstacles = survey_obstacles(config)  # of the scene file, whether or not the mission knows them
         self._intents.start_over()
         self._body = PlanarBody(robot)
         self._recent_angles = RecentAngles()
         self._rises = PlatformRises(_find_platforms(config, robot))
-        self._known_path = _make_known_path(config, surveyed_obstacles) if config.mission.goal is None else None
+
+        # Without a goal the robot follows a known path. The clutter planner is for goals, and intents with a heading.
+        self._known_path = None
+        if mission.goal is None:
+            self._known_path = _make_known_path(config, surveyed_obstacles)
+        has_map = mission.map == "known"
         schedule = config.services.get(self.name, ServiceSchedule())
         self._planner = ClutterPlanner(
-            config.mission.goal or HeadingGoal(),
-            surveyed_obstacles if config.mission.map == "known" else None,
+            mission.goal or HeadingGoal(),
+            surveyed_obstacles if has_map else None,
             search=SearchParameters(
                 body_length_m=self._body.length_m,
                 radius_m=self._body.radius_m,
                 segment_m=max(self._body.segments_m),
-                assumed_obstacle_friction=config.mission.assumed_obstacle_friction,
+                assumed_obstacle_friction=mission.assumed_obstacle_friction,
             ),
+            # Time for the work of one update: until the next one, or the latency of the service if that is less.
             turn_s=min(schedule.decimation, schedule.latency_ticks) / config.rate_hz,
         )
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """Return the trajectory at this tick. An operator's intent is used as soon as it arrives."""
+        """Return the trajectory that the robot shall follow from this tick on, with its platforms to climb.
+
+        It follows the known path, unless there is a goal or an operator commands a heading: then the clutter planner
+        plans it. An operator's intent is used as soon as it arrives.
+
+        Args:
+            clock: the tick and its time.
+
+        Returns:
+            The message and its key; None while there is no trajectory.
+        """
         world = self._client.read(self._world)
         joints = self._client.read(self._joints)
         desired = self._intents.desired(self._intent.newest(), clock.timestamp_ns)

@@ -27,8 +27,8 @@ MAX_UNIT_LENGTH = 20  # characters
 SCHEMAS_CACHED = 128  # more than a robot may have custom sensors, for programs that watch several robots
 SHARED_FIELDS = frozenset(CustomSample.__struct_fields__)
 EXAMPLE = 'Annotated[float, bounded(-1.6, 1.6, "rad")], or q.Angle, of snakesim_hal.wire.quantities'
-# What msgspec raises for a schema or a class that cannot be a message.
-UNBUILDABLE = (TypeError, ValueError, OverflowError, RecursionError)
+# What msgspec raises for a schema or a class that cannot become a message.
+SCHEMA_ERRORS = (TypeError, ValueError, OverflowError, RecursionError)
 _FIELD_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
 # The bounds of a number: as JSON Schema calls them, and as msgspec does.
 _BOUNDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiveMaximum": "lt"}
@@ -88,36 +88,46 @@ def make_message_schema(message: Any, whose: str) -> str:
         parse_custom_message(text)
     except WireError as error:
         raise ConfigError(f"{whose}: {message.__name__}{error.detail}", code="plugin/not-loadable") from None
-    except UNBUILDABLE as error:
+    except SCHEMA_ERRORS as error:
         raise ConfigError(f"{whose}: {message.__name__} is no message: {error}", code="plugin/not-loadable") from None
     return text
 
 
 @lru_cache(SCHEMAS_CACHED)
 def parse_custom_message(schema: str) -> CustomMessage:
-    """Make the message that a schema describes.
+    """Return the message that a JSON Schema describes; the newest SCHEMAS_CACHED of them are cached.
+
+    Args:
+        schema: from a robot's description or a recording, so it may be wrong or hostile.
 
     Raises:
-        WireError: the schema is of no use; the error's detail begins with the field.
+        WireError: the schema describes no allowed message; the error's detail begins with the field.
     """
     if len(schema) > MAX_CUSTOM_SCHEMA:
         raise WireError("malformed", f" has a schema of {len(schema)} characters, at most {MAX_CUSTOM_SCHEMA}")
     try:
-        return _make_kind(schema)
+        return _build_custom_message(schema)
     except WireError:
         raise
-    except (*UNBUILDABLE, KeyError, AttributeError, msgspec.DecodeError) as error:
+    except (*SCHEMA_ERRORS, KeyError, AttributeError, msgspec.DecodeError) as error:
         raise WireError("malformed", f" has a schema that cannot be used: {shorten(str(error))}") from None
 
 
-def _make_kind(schema: str) -> CustomMessage:
-    """Make the message of a schema. Raises any of UNBUILDABLE and more for a schema that is not one of a message."""
+def _build_custom_message(schema: str) -> CustomMessage:
+    """Build the message class that a JSON Schema describes, and find the units of its fields.
+
+    The text comes from another process and may be anything: the caller turns all errors into a WireError.
+
+    Raises:
+        WireError: a field, or the number of fields, is not allowed in a message.
+        KeyError, AttributeError, msgspec.DecodeError, or one of SCHEMA_ERRORS: the text is no schema of a message.
+    """
     content = msgspec.json.decode(schema, type=dict[str, Any])
     fields = {name: field for name, field in content["properties"].items() if name not in SHARED_FIELDS}
     if not 0 < len(fields) <= MAX_FIELDS or not str(content["title"]).isidentifier():
         raise WireError("malformed", f" has {len(fields)} fields of its own, must have 1 to {MAX_FIELDS}")
     required = content.get("required", ())
-    definitions: list[Any] = []  # as `msgspec.defstruct` wants them
+    definitions: list[Any] = []  # as `msgspec.defstruct` wants them: (name, type), or (name, type, default)
     units: dict[str, str] = {}
     for name, field in fields.items():
         if not _FIELD_NAME.fullmatch(name) or hasattr(CustomSample, name):
@@ -128,7 +138,7 @@ def _make_kind(schema: str) -> CustomMessage:
         else:
             definitions.append((name, field_type | None, None))
     message: Any = msgspec.defstruct(content["title"], definitions, bases=(CustomSample,), frozen=True, kw_only=True)
-    msgspec.msgpack.Decoder(message)  # refuses bounds that it cannot check
+    msgspec.msgpack.Decoder(message)  # raises for bounds that msgspec cannot check
     return CustomMessage(message, units, schema)
 
 
@@ -198,17 +208,17 @@ def find_custom_message(key: str, robot: Description) -> CustomMessage | None:
 
 def find_custom_messages(robot: Description) -> dict[str, CustomMessage]:
     """Return the messages of all custom sensors of a robot, by key."""
-    kinds: dict[str, CustomMessage] = {}
+    messages: dict[str, CustomMessage] = {}
     for key in robot.custom:
-        kind = find_custom_message(key, robot)
-        if kind is not None:
-            kinds[key] = kind
-    return kinds
+        message = find_custom_message(key, robot)
+        if message is not None:
+            messages[key] = message
+    return messages
 
 
 def find_message_type(key: str, robot: Description | None) -> type[Message] | None:
     """Return the message at a key: as the robot describes it if it is known, else that of the key space."""
-    kind = None if robot is None else find_custom_message(key, robot)
-    if kind is None:
+    custom_message = None if robot is None else find_custom_message(key, robot)
+    if custom_message is None:
         return keys.find_message(key)
-    return kind.message
+    return custom_message.message

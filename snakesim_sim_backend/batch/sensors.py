@@ -24,6 +24,7 @@ NUMBERS_OF_POSE = 7  # position and quaternion
 NUMBERS_OF_VELOCITY = 6  # linear and angular
 NUMBERS_OF_RAW_POSE = 19  # those of pose and velocity, and 6 of noise
 NUMBERS_OF_CONTACT = 6  # of noise: of position and force
+FORCE_NUMBERS = np.arange(3, 6)  # those of the force, among the numbers of a contact
 ROUNDING_ERROR = 1e-9  # relative; more than that of the size of a force
 
 
@@ -193,26 +194,40 @@ class SensorArrays:
         self._contacts = _replace_contacts(self._contacts, sample, due)
 
     def _draw_contact_noise(self, touches: TouchArrays) -> ContactSample:
-        """Return the contacts above the threshold with the random numbers of their forces."""
+        """Return the contacts above the threshold with the random numbers of their forces.
+
+        Every robot has a stream of random numbers of its own. Its first detected contact uses the next 6 numbers of it,
+        3 for the position and 3 for the force, its second contact the 6 after them, and so on. Positions are not
+        observed here, but their numbers are left out of the stream as if they were.
+
+        Args:
+            touches: contacts of all robots, those of each robot one after another, in the order of the robots.
+        """
         is_detected = _find_strong(touches.force_w, self._contact_threshold_n[touches.robot])
         if not is_detected.all():
             touches = _select(touches, is_detected)
         if not len(touches.robot):
             return NO_CONTACTS
+        contact_count = len(touches.robot)
         contacts_of_robot = np.bincount(touches.robot, minlength=self._count)
-        rank = np.arange(len(touches.robot)) - (np.cumsum(contacts_of_robot) - contacts_of_robot)[touches.robot]
-        noise = np.zeros((len(touches.robot), 3))
+        first_of_robot = np.cumsum(contacts_of_robot) - contacts_of_robot  # row of each robot's first contact
+        # Number of each contact among those of its robot, from 0.
+        number_in_robot = np.arange(contact_count) - first_of_robot[touches.robot]
+        noise = np.zeros((contact_count, 3))
         if self._contacts_have_noise:
-            numbers = self._noise.peek(NUMBERS_OF_CONTACT * int(contacts_of_robot.max()))
-            of_force = NUMBERS_OF_CONTACT * rank[:, None] + np.arange(3, 6)
-            noise = numbers[touches.robot[:, None], of_force]
+            next_numbers = self._noise.peek(NUMBERS_OF_CONTACT * int(contacts_of_robot.max()))
+            force_columns = NUMBERS_OF_CONTACT * number_in_robot[:, None] + FORCE_NUMBERS
+            noise = next_numbers[touches.robot[:, None], force_columns]
+            # `peek` leaves the numbers in the streams; each robot has used those of its own contacts.
             self._noise.skip_each(NUMBERS_OF_CONTACT * contacts_of_robot)
-        if len(rank) > MAX_CONTACTS:
-            fits = rank < MAX_CONTACTS
-            return ContactSample(_select(touches, fits), noise[fits])
+        if contact_count > MAX_CONTACTS:
+            # A message holds no more contacts of a robot.
+            fits_in_message = number_in_robot < MAX_CONTACTS
+            return ContactSample(_select(touches, fits_in_message), noise[fits_in_message])
         return ContactSample(touches, noise)
 
     def _sample_poses(self, due: Mask, simulations: Simulations, starts: bool) -> None:
+        """Store pose, velocity and random numbers of the robots that are due. Noise is added when a pose is read."""
         noise = self._no_pose_noise
         if self._pose_has_noise:
             noise = self._noise.peek(6)

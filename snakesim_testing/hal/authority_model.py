@@ -15,10 +15,27 @@ JOINTS = 3
 ALL = list(range(JOINTS))
 WORDS = ("overheated", "leak", "undervoltage")  # in the order in which they are reported for a joint
 PERIOD_S = PERIOD_NS * 1e-9
-ANGLE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, FAR = 1.5, 5.0, 100.0, 4.0, 80.0, 0.3  # of the test robot
-STIFFNESS, DAMPING, VELOCITY_GAIN = 40.0, 1.0, 1.0
-REACH, SLACK = 2 * SPEED, 0.05  # rad/s and rad: what is believed of a joint
-REACTION_S = 4 * PERIOD_S
+
+# Limits of every joint of the test robot, as in `ROBOT` of `small_robots`. Angles are limited to both sides of 0.
+ANGLE_LIMIT_RAD = 1.5
+SPEED_LIMIT_RAD_S = 5.0
+ACCELERATION_LIMIT_RAD_S2 = 100.0
+TORQUE_LIMIT_NM = 4.0
+TORQUE_RATE_LIMIT_NM_S = 80.0
+MAX_STEP_RAD = 0.3  # the most that a position target may be from the measured angle
+
+# Gains of the drives' own controllers.
+STIFFNESS_NM_PER_RAD = 40.0
+DAMPING_NM_S_PER_RAD = 1.0
+VELOCITY_GAIN_NM_S_PER_RAD = 1.0
+
+# Gain of the limiter, which brakes a joint near its end stops with a torque proportional to its excess speed.
+BRAKE_GAIN_NM_S_PER_RAD = 1.0
+REACTION_S = 4 * PERIOD_S  # for which a joint keeps its speed before it begins to brake
+
+# A measured angle is believed if the joint can have moved there since the last angle that was believed.
+MAX_BELIEVED_SPEED_RAD_S = 2 * SPEED_LIMIT_RAD_S
+BELIEVED_ERROR_RAD = 0.05
 DERATE_FROM, STOP_AT, MIN_V, MIN_SHARE = 80.0, 105.0, 18.0, 0.2
 KNOWN_FOR_NS, LOW_FOR_NS = 3_000_000_000, 50_000_000
 LONG_NS = 1_000_000_000  # a joint may be anywhere after that
@@ -27,34 +44,70 @@ NAN, INF = float("nan"), float("inf")
 
 
 def within(value: float, low: float, high: float) -> float:
+    """Return the value, limited to the range from low to high."""
     return min(max(value, low), high)
 
 
-def stoppable(distance: float) -> float:
-    """Return the speed from which a joint stops within a distance, after it went on for the reaction time."""
-    if distance <= 0:
+def max_stopping_speed_rad_s(distance_rad: float) -> float:
+    """Return the highest speed from which a joint still stops within a distance; 0 if there is no distance left.
+
+    The joint keeps its speed v for the reaction time t, and then brakes with the limit a of its acceleration:
+
+        distance = v t + v² / (2 a), so v = a (sqrt(t² + 2 distance / a) - t)
+    """
+    if distance_rad <= 0:
         return 0.0
-    return ACCELERATION * (math.sqrt(REACTION_S**2 + 2 * distance / ACCELERATION) - REACTION_S)
+    total_time_s = math.sqrt(REACTION_S**2 + 2 * distance_rad / ACCELERATION_LIMIT_RAD_S2)
+    return ACCELERATION_LIMIT_RAD_S2 * (total_time_s - REACTION_S)
 
 
-def torque_bounds(angle: float, velocity: float, torque_limit: float) -> tuple[float, float]:
-    """Return the range of torques that keep a joint able to stop at its end stops.
+def torque_bounds(angle_rad: float, velocity_rad_s: float, torque_limit_nm: float) -> tuple[float, float]:
+    """Return the lowest and the highest torque with which a joint can still stop at its end stops.
+
+    A torque may accelerate the joint up to the speed from which it stops in time. Above that speed the bound has the
+    opposite sign, and brakes the joint. At an end stop no torque may push further outwards.
 
     Args:
-        angle: Angle of the joint in rad.
-        velocity: Its velocity in rad/s.
-        torque_limit: Torque limit in N·m.
+        angle_rad: Measured angle of the joint.
+        velocity_rad_s: Its measured velocity.
+        torque_limit_nm: Torque limit of its drive, which also limits both bounds.
     """
-    # The limiter brakes with 1 N·m·s/rad, so speeds and torques have the same numbers here.
-    low = -stoppable(ANGLE + angle) - velocity
-    high = stoppable(ANGLE - angle) - velocity
-    if angle >= ANGLE:  # at the upper stop: no torque pushes further
-        low = min(low, min(high, 0.0))
-        high = min(high, 0.0)
-    if angle <= -ANGLE:
-        high = max(high, max(low, 0.0))
-        low = max(low, 0.0)
-    return within(low, -torque_limit, torque_limit), within(high, -torque_limit, torque_limit)
+    max_speed_down_rad_s = max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle_rad)
+    max_speed_up_rad_s = max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle_rad)
+    low_nm = BRAKE_GAIN_NM_S_PER_RAD * (-max_speed_down_rad_s - velocity_rad_s)
+    high_nm = BRAKE_GAIN_NM_S_PER_RAD * (max_speed_up_rad_s - velocity_rad_s)
+    # At a stop, no torque outwards. The other bound moves with it where it would lie beyond it.
+    is_at_upper_stop = angle_rad >= ANGLE_LIMIT_RAD
+    if is_at_upper_stop:
+        high_inwards_nm = min(high_nm, 0.0)
+        low_nm = min(low_nm, high_inwards_nm)
+        high_nm = high_inwards_nm
+    is_at_lower_stop = angle_rad <= -ANGLE_LIMIT_RAD
+    if is_at_lower_stop:
+        low_inwards_nm = max(low_nm, 0.0)
+        high_nm = max(high_nm, low_inwards_nm)
+        low_nm = low_inwards_nm
+    return (
+        within(low_nm, -torque_limit_nm, torque_limit_nm),
+        within(high_nm, -torque_limit_nm, torque_limit_nm),
+    )
+
+
+def holding_position_target_rad(angle_rad: float, velocity_rad_s: float, torque_nm: float) -> float:
+    """Return the position target with which a drive would produce the torque that was measured.
+
+    A drive in position mode produces torque = stiffness (target - angle) - damping velocity. A joint that enters
+    position mode starts from this target, so its torque does not jump.
+    """
+    return angle_rad + (torque_nm + DAMPING_NM_S_PER_RAD * velocity_rad_s) / STIFFNESS_NM_PER_RAD
+
+
+def holding_velocity_target_rad_s(velocity_rad_s: float, torque_nm: float) -> float:
+    """Return the velocity target with which a drive would produce the torque that was measured.
+
+    A drive in velocity mode produces torque = gain (target - velocity).
+    """
+    return velocity_rad_s + torque_nm / VELOCITY_GAIN_NM_S_PER_RAD
 
 
 class Health:
@@ -110,7 +163,7 @@ class Model(RuleBasedStateMachine):
         self.last_sequence = -1
         self.measured: tuple[list[float], list[float], list[float]] = ([0.0] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS)
         self.doubt: set[int] | None = set(ALL)  # joints whose newest state is not believed; None: whatever their number
-        self.aside: set[int] = set()  # joints that have failed
+        self.isolated: set[int] = set()  # joints that have failed
         self.offered = 0
         self.rejected = 0
         self.faults = 0  # kept since the last reset
@@ -147,19 +200,26 @@ class Model(RuleBasedStateMachine):
         return 0.0 if self.last is None else self.last.setpoints.target[i]
 
     def beginning_of_halt(self, i: int) -> list[float]:
+        """Return angle, velocity and position target from which joint i brakes when the robot stops being armed."""
         angle, velocity, torque = (column[i] for column in self.measured)
-        target = angle + (torque + DAMPING * velocity) / STIFFNESS
+        target = holding_position_target_rad(angle, velocity, torque)
         if self.mode_before(i) is Mode.POSITION:
             target = self.target_before(i)
-        target = within(within(target, angle - FAR, angle + FAR), -ANGLE, ANGLE)
-        return [within(angle, -ANGLE, ANGLE), within(velocity, -SPEED, SPEED), target]
+        near_angle = within(target, angle - MAX_STEP_RAD, angle + MAX_STEP_RAD)
+        target = within(near_angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+        return [
+            within(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD),
+            within(velocity, -SPEED_LIMIT_RAD_S, SPEED_LIMIT_RAD_S),
+            target,
+        ]
 
     def halt_for_a_period(self, i: int) -> float:
+        """Brake joint i for one period with the acceleration limit, and return its next position target in rad."""
         assert self.halt is not None
         wanted, velocity, target = self.halt[i]
-        slower = math.copysign(max(abs(velocity) - ACCELERATION * PERIOD_S, 0.0), velocity)
-        wanted = within(wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE, ANGLE)
-        target = within(wanted, target - SPEED * PERIOD_S, target + SPEED * PERIOD_S)
+        slower = math.copysign(max(abs(velocity) - ACCELERATION_LIMIT_RAD_S2 * PERIOD_S, 0.0), velocity)
+        wanted = within(wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+        target = within(wanted, target - SPEED_LIMIT_RAD_S * PERIOD_S, target + SPEED_LIMIT_RAD_S * PERIOD_S)
         self.halt[i] = [wanted, slower, target]
         return target
 
@@ -167,7 +227,9 @@ class Model(RuleBasedStateMachine):
         """Whether an angle that is otherwise sound is believed; keeps those that are not."""
 
         def reachable(before: tuple[float, float]) -> bool:
-            return abs(angle - before[0]) <= SLACK + REACH * max(taken_s - before[1], 0.0)
+            angle_before, taken_before_s = before
+            passed_s = max(taken_s - taken_before_s, 0.0)
+            return abs(angle - angle_before) <= BELIEVED_ERROR_RAD + MAX_BELIEVED_SPEED_RAD_S * passed_s
 
         good, strays = self.good[i], self.strays[i]
         if good is None or reachable(good):
@@ -187,10 +249,10 @@ class Model(RuleBasedStateMachine):
         if self.same[i] and self.same[i][-1][0] != state_:
             self.same[i] = []
         self.same[i].append((state_, taken_s, self.target_before(i)))
-        limit = self.last.setpoints.torque_limit_nm[i] if self.last else TORQUE
+        limit = self.last.setpoints.torque_limit_nm[i] if self.last else TORQUE_LIMIT_NM
         targets = [target for _, _, target in self.same[i]]
         ways = [max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))]
-        far = [taken for (_, taken, _), way in zip(self.same[i], ways, strict=True) if way > FAR / 4]
+        far = [taken for (_, taken, _), way in zip(self.same[i], ways, strict=True) if way > MAX_STEP_RAD / 4]
         return bool(far) and taken_s - min(far) > LEASE_NS * 1e-9 and abs(state_[2]) < 0.95 * limit
 
     def drop_lease(self) -> None:
@@ -209,11 +271,11 @@ class Model(RuleBasedStateMachine):
 
     def lose(self, joints: set[int]) -> bool:
         """Whether the robot goes on without these joints, too."""
-        if joints <= self.aside:
+        if joints <= self.isolated:
             return True
-        if self.state != "armed" or len(self.aside | joints) > self.max_isolated:
+        if self.state != "armed" or len(self.isolated | joints) > self.max_isolated:
             return False
-        self.aside |= joints
+        self.isolated |= joints
         self.note_fault()
         return True
 
@@ -232,63 +294,73 @@ class Model(RuleBasedStateMachine):
         assert answer.epoch == self.epoch
         assert answer.lifecycle == self.state
 
-    def check_aside(self, decision: TickDecision) -> None:
+    def check_isolated(self, decision: TickDecision) -> None:
         points = decision.setpoints
-        assert points.isolated == self.aside
-        assert len(self.aside) <= self.max_isolated
-        assert self.authority.isolated_joints == [f"joint_{i + 1}" for i in sorted(self.aside)]
-        for i in self.aside:
+        assert points.isolated == self.isolated
+        assert len(self.isolated) <= self.max_isolated
+        assert self.authority.isolated_joints == [f"joint_{i + 1}" for i in sorted(self.isolated)]
+        for i in self.isolated:
             assert points.mode[i] == Mode.PASSIVE
             assert points.target[i] == 0.0
             assert points.torque_limit_nm[i] == 0.0
 
-    def of_the_rest(self, values: list[Any]) -> list[Any]:
-        """What concerns the joints that are not set aside."""
-        return [value for i, value in enumerate(values) if i not in self.aside]
+    def select_connected(self, values: list[Any]) -> list[Any]:
+        """Return the values of the joints that are not isolated."""
+        return [value for i, value in enumerate(values) if i not in self.isolated]
 
     def torques(self) -> Any:
-        return pytest.approx(self.of_the_rest([TORQUE * share for share in self.shares]))
+        return pytest.approx(self.select_connected([TORQUE_LIMIT_NM * share for share in self.shares]))
 
     def check_safe(self, decision: TickDecision) -> None:
         assert decision.sequence is None
         assert not decision.limited
         action = self.action if self.state == "fault" and self.halt is not None else "passive"
-        assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
+        assert self.select_connected(decision.setpoints.torque_limit_nm) == self.torques()
         if action == "hold":
-            assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION}
+            assert set(self.select_connected(decision.setpoints.mode)) <= {Mode.POSITION}
             held = [self.halt_for_a_period(i) for i in range(JOINTS)]
-            assert self.of_the_rest(decision.setpoints.target) == pytest.approx(self.of_the_rest(held))
-            assert all(abs(target) <= ANGLE for target in decision.setpoints.target)
+            assert self.select_connected(decision.setpoints.target) == pytest.approx(self.select_connected(held))
+            assert all(abs(target) <= ANGLE_LIMIT_RAD for target in decision.setpoints.target)
             return
         mode = Mode.VELOCITY if action == "damp" else Mode.PASSIVE
-        assert set(self.of_the_rest(decision.setpoints.mode)) <= {mode}
+        assert set(self.select_connected(decision.setpoints.mode)) <= {mode}
         assert decision.setpoints.target == [0.0] * JOINTS
 
     def check_held(self, decision: TickDecision, angle_rad: list[float]) -> None:
-        assert set(self.of_the_rest(decision.setpoints.mode)) <= {Mode.POSITION}
+        assert set(self.select_connected(decision.setpoints.mode)) <= {Mode.POSITION}
         assert not decision.limited
-        held = [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
-        assert self.of_the_rest(decision.setpoints.target) == self.of_the_rest(held)
-        assert self.of_the_rest(decision.setpoints.torque_limit_nm) == self.torques()
+        held = [within(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in angle_rad]
+        assert self.select_connected(decision.setpoints.target) == self.select_connected(held)
+        assert self.select_connected(decision.setpoints.torque_limit_nm) == self.torques()
 
     def check_commanded(self, decision: TickDecision, sent: JointCommand) -> None:
-        for i in self.aside:
+        """Check the setpoints of a tick in which a command counts: mode, torque limit and target of every joint.
+
+        Isolated joints are passive whatever the command says. A torque limit is at most that of the command and that of
+        the drive at its present temperature, and rises no faster than the limit of the torque's rate of change.
+
+        Args:
+            decision: What the authority applied.
+            sent: The command that counts.
+        """
+        for i in self.isolated:
             assert decision.limited.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
-        assert self.of_the_rest(decision.setpoints.mode) == self.of_the_rest(sent.mode)
-        for i in self.of_the_rest(ALL):
-            applied = decision.setpoints.torque_limit_nm[i]
-            before = TORQUE if self.last is None else self.last.setpoints.torque_limit_nm[i]
-            allowed = TORQUE if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
-            cool = TORQUE * self.shares[i] + TINY
-            assert 0.0 <= applied <= min(cool, allowed)
-            assert applied <= before + TORQUE_RATE * PERIOD_S + TINY
+        assert self.select_connected(decision.setpoints.mode) == self.select_connected(sent.mode)
+        for i in self.select_connected(ALL):
+            applied_nm = decision.setpoints.torque_limit_nm[i]
+            previous_nm = TORQUE_LIMIT_NM if self.last is None else self.last.setpoints.torque_limit_nm[i]
+            commanded_nm = TORQUE_LIMIT_NM if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
+            derated_nm = TORQUE_LIMIT_NM * self.shares[i] + TINY
+            assert 0.0 <= applied_nm <= min(derated_nm, commanded_nm)
+            assert applied_nm <= previous_nm + TORQUE_RATE_LIMIT_NM_S * PERIOD_S + TINY
             if sent.mode[i] is not Mode.PASSIVE:
-                self.check_target(i, decision, sent.mode[i], sent.target[i], bound_by_heat=min(TORQUE, allowed) > cool)
+                is_derated = min(TORQUE_LIMIT_NM, commanded_nm) > derated_nm
+                self.check_target(i, decision, sent.mode[i], sent.target[i], is_derated=is_derated)
             else:
                 assert decision.setpoints.target[i] == 0.0
                 assert i not in decision.limited
 
-    def check_target(self, i: int, decision: TickDecision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
+    def check_target(self, i: int, decision: TickDecision, mode: Mode, wanted: float, *, is_derated: bool) -> None:
         """Check the target that the authority applied to one joint.
 
         It must be inside the limits, change no faster than allowed, and be as near to the command as both permit. A
@@ -299,31 +371,32 @@ class Model(RuleBasedStateMachine):
             decision: What the authority applied.
             mode: Mode of the command.
             wanted: Target of the command, in rad, rad/s or N·m, by its mode.
-            bound_by_heat: Whether derating lowers the torque limit of the command.
+            is_derated: Whether the drive's temperature lowers the torque limit of the command.
         """
         angle, velocity, torque = (column[i] for column in self.measured)
         target = decision.setpoints.target[i]
+        # `previous` is the target before: in a new mode it is the one with which the torque does not jump.
         match mode:
             case Mode.POSITION:
-                low = within(angle - FAR, -ANGLE, ANGLE)
-                high = within(angle + FAR, -ANGLE, ANGLE)
-                max_change = SPEED * PERIOD_S
-                start = angle + (torque + DAMPING * velocity) / STIFFNESS
+                low = within(angle - MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+                high = within(angle + MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+                max_change = SPEED_LIMIT_RAD_S * PERIOD_S
+                previous = holding_position_target_rad(angle, velocity, torque)
             case Mode.VELOCITY:
-                low = max(-SPEED, -stoppable(ANGLE + angle))
-                high = min(SPEED, stoppable(ANGLE - angle))
-                max_change = ACCELERATION * PERIOD_S
-                start = velocity + torque / VELOCITY_GAIN
+                low = max(-SPEED_LIMIT_RAD_S, -max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle))
+                high = min(SPEED_LIMIT_RAD_S, max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle))
+                max_change = ACCELERATION_LIMIT_RAD_S2 * PERIOD_S
+                previous = holding_velocity_target_rad_s(velocity, torque)
             case _:
                 low, high = torque_bounds(angle, velocity, decision.setpoints.torque_limit_nm[i])
-                max_change = TORQUE_RATE * PERIOD_S
-                start = torque
+                max_change = TORQUE_RATE_LIMIT_NM_S * PERIOD_S
+                previous = torque
         if self.last is not None and self.last.setpoints.mode[i] is mode:
-            start = self.last.setpoints.target[i]
+            previous = self.last.setpoints.target[i]
         assert math.isfinite(target)
         assert low <= target <= high
         # The limits have priority over the rate of change.
-        assert abs(target - start) <= max_change + TINY or target in (low, high)
-        nearest_reachable = within(wanted, start - max_change, start + max_change)
+        assert abs(target - previous) <= max_change + TINY or target in (low, high)
+        nearest_reachable = within(wanted, previous - max_change, previous + max_change)
         assert abs(target - within(nearest_reachable, low, high)) <= TINY
-        assert (i in decision.limited) == (target != wanted or bound_by_heat)
+        assert (i in decision.limited) == (target != wanted or is_derated)

@@ -136,10 +136,12 @@ class BeamSearch:
         node = make_start_nodes(body_w[-1:], np.arctan2(ahead[:, 1], ahead[:, 0]))
         node.drag_m = task.initial_drag_m.sum(axis=0)[None]
         touched = find_touched(self._obstacles, middles_w, tangents, self._parameters, task)
-        for arc in np.flatnonzero(touched.counts):
+        for arc in np.flatnonzero(touched.is_usable):
             s_m = -STEP_M * (self._body_arcs - int(arc) - 0.5)
             row = slice(arc, arc + 1)
-            node.add_contacts(touched.counts[row], touched.obstacle[row], touched.gap_m[row], touched.wrench[row], s_m)
+            node.add_contacts(
+                touched.is_usable[row], touched.obstacle[row], touched.gap_m[row], touched.wrench[row], s_m
+            )
         node.margin_n = compute_node_margins_n(node, self._parameters)
         return node
 

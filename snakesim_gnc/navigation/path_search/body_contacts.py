@@ -1,5 +1,6 @@
-"""What the bodies of search nodes touch, and how hard they can push with it. Pure.
+"""The contacts of the bodies of search nodes, and the propulsion margin that they give. Pure.
 
+A contact normal is a unit vector from the obstacle to the body: the direction in which the obstacle pushes the body.
 In shapes, n is the number of nodes or points. Points are in the world frame.
 """
 
@@ -22,19 +23,22 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class TouchedObstacles:
-    """What bodies touch at one arc length each. All arrays have one row for each of n points on their axes."""
+    """The nearest obstacle at each of n points on the axes of bodies, and whether it is a contact there."""
 
-    push: Floats  # (n,) towards the goal, n.g; 0 without a contact
-    counts: Bools  # (n,) whether there is a contact that counts for the margin; the other arrays are valid only there
+    propulsion: Floats  # (n,) normal . goal, -1 to 1: positive propels, negative brakes; 0 without a contact
+    is_usable: Bools  # (n,) a contact that counts for the margin; obstacle, gap and wrench are valid only there
     obstacle: Ints  # (n,) index
     gap_m: Floats  # (n,) between skin and obstacle
-    wrench: Floats  # (n, 3) of a unit push
+    wrench: Floats  # (n, 3) of a normal force of 1 N with its friction: fx, fy, moment about the task's origin
 
 
 def find_touched(
     obstacles: ObstacleGrid, points_w: Floats, tangents: Floats, parameters: SearchParameters, task: SearchTask
 ) -> TouchedObstacles:
-    """Find the obstacles that bodies touch at points on their axes, and the push that these contacts allow.
+    """Find the obstacles that bodies touch at points on their axes, and the force that these contacts give.
+
+    A contact is a small gap at the side of the body. Obstacles ahead of the body, which a head would bump into, are not
+    contacts. Friction acts against the motion along the tangent.
 
     Args:
         obstacles: the map.
@@ -44,32 +48,38 @@ def find_touched(
         task: direction of the goal, and the origin of moments.
 
     Returns:
-        For each point, the nearest obstacle, the gap, whether it counts as a contact, and the wrench of a unit push.
+        For each point, the nearest obstacle, the gap, whether it is a usable contact, and the wrench of 1 N there.
     """
     nearest = obstacles.find_nearest(points_w[:, 0], points_w[:, 1])
     normals = nearest.normal_w
     gap_m = nearest.distance_m - parameters.radius_m
-    frontal = np.abs(_dot(normals, tangents))
-    is_contact = (nearest.obstacle != NO_OBSTACLE) & (gap_m < parameters.contact_distance_m) & (frontal < MAX_FRONTAL)
-    push = _dot(normals, task.goal_w)
-    skin_from_origin = points_w - normals * parameters.radius_m - task.origin_w
-    unit_push = normals - parameters.assumed_obstacle_friction * tangents
+    has_obstacle = nearest.obstacle != NO_OBSTACLE
+    is_close = gap_m < parameters.contact_distance_m
+    is_at_side = np.abs(_dot(normals, tangents)) < MAX_FRONTAL
+    is_contact = has_obstacle & is_close & is_at_side
+    propulsion = _dot(normals, task.goal_w)
+    contact_point_m = points_w - normals * parameters.radius_m - task.origin_w  # on the skin, from the origin
+    unit_force = normals - parameters.assumed_obstacle_friction * tangents
     return TouchedObstacles(
-        push=np.where(is_contact, push, 0.0),
-        counts=is_contact & (push > MIN_PUSH),
+        propulsion=np.where(is_contact, propulsion, 0.0),
+        is_usable=is_contact & (propulsion > MIN_PUSH),
         obstacle=nearest.obstacle,
         gap_m=gap_m,
-        wrench=wrenches(skin_from_origin, unit_push),
+        wrench=wrenches(contact_point_m, unit_force),
     )
 
 
 def compute_node_margins_n(nodes: NodeLayer, parameters: SearchParameters) -> Floats:
-    """Return the propulsion margin of each node's body, (n,), with the contacts that are not near its ends."""
+    """Return the propulsion margin in N of each node's body, (n,), from its contacts and its drag.
+
+    Contacts near the tail end and near the head are left out, because the body cannot push there.
+    """
     first_s_m = nodes.s_m - parameters.body_length_m + parameters.unused_tail_m
     last_s_m = nodes.s_m - parameters.unused_head_m
-    counts = (nodes.contact_s_m >= first_s_m) & (nodes.contact_s_m <= last_s_m)
-    contacts = np.where(counts[..., None], nodes.contact_wrench, 0.0)
-    return compute_margins_n(contacts, nodes.drag_m / parameters.body_length_m)
+    is_usable = (nodes.contact_s_m >= first_s_m) & (nodes.contact_s_m <= last_s_m)
+    usable_wrenches = np.where(is_usable[..., None], nodes.contact_wrench, 0.0)
+    drag_of_1_n = nodes.drag_m / parameters.body_length_m  # wrench of a drag of 1 N, spread over the whole body
+    return compute_margins_n(usable_wrenches, drag_of_1_n)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

@@ -84,7 +84,7 @@ class SpecifiedGrowth(PathGrowth):
     def _distance_from_initial_body(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
         """Return how far the ends of the arcs are from where the body lies at the same arc length, (n, c).
 
-        None if the body is not laid again, or if the arcs are ahead of its head.
+        None if the search does not start at the tail, or if the arcs are ahead of the measured head.
         """
         initial_body_w = self._task.initial_body_w
         if initial_body_w is None:
@@ -173,49 +173,87 @@ class SpecifiedGrowth(PathGrowth):
         return nodes
 
     def _add_contact_terms(self, nodes: NodeLayer, arcs: SearchArcs, candidates: Ints) -> None:
-        """Add the contacts and the drag of the newest arc to nodes, and the costs of contacts and propulsion margin.
+        """Add to new nodes what the body meets on their newest arcs: contacts, drag, and the costs of both.
+
+        A search of the whole body begins at the tail, and first follows the body where it already lies. Until the path
+        is one body length long, it is no complete body, and has no propulsion margin.
 
         Args:
-            nodes: the new nodes, which are changed.
+            nodes: the n new nodes; their contacts, drag, margins and costs are changed.
             arcs: all arcs from the parents of these nodes.
             candidates: (n,) index of each node's arc among the flattened arcs.
         """
-        parameters = self._parameters
-        task = self._task
         middles_w = np.stack([arcs.middle_x_m.ravel()[candidates], arcs.middle_y_m.ravel()[candidates]], axis=-1)
         headings_rad = arcs.middle_heading_rad.ravel()[candidates]
         tangents = np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=-1)
 
-        # While the search is still within the body, the margin has no meaning yet.
-        is_relaid = task.initial_body_w is not None
-        is_within_body = is_relaid and nodes.s_m < parameters.body_length_m - 0.5 * STEP_M
-        push_reward = parameters.push_reward_of_body if is_within_body else parameters.push_reward
-        touched = find_touched(self._obstacles, middles_w, tangents, parameters, task)
-        nodes.add_contacts(touched.counts, touched.obstacle, touched.gap_m, touched.wrench, nodes.s_m - 0.5 * STEP_M)
-        push = touched.push
-        nodes.cost_m += STEP_M * np.where(push > 0, -push_reward * push, -parameters.brake_cost * push)
+        starts_at_tail = self._task.initial_body_w is not None
+        is_incomplete = starts_at_tail and nodes.s_m < self._parameters.body_length_m - 0.5 * STEP_M
+        self._add_contacts(nodes, middles_w, tangents, is_incomplete=is_incomplete)
+        self._add_drag(nodes, middles_w, tangents)
+        # The margin depends on the contacts and the drag, which are complete now.
+        nodes.margin_n = compute_node_margins_n(nodes, self._parameters)
+        if not is_incomplete:
+            self._add_margin_cost(nodes)
 
-        nodes.arc_drag_m = STEP_M * wrenches(middles_w - task.origin_w, tangents)
-        nodes.drag_m += nodes.arc_drag_m - self._drag_left_behind_m(nodes.parent)
-        nodes.margin_n = compute_node_margins_n(nodes, parameters)
-        if is_within_body:
-            return
-        is_near = is_relaid and nodes.s_m < parameters.body_length_m + parameters.near_m
-        weak_margin_cost = parameters.weak_margin_cost_near if is_near else parameters.weak_margin_cost
-        weakness = np.clip(1.0 - nodes.margin_n / parameters.wanted_margin_n, 0.0, 1.0)
-        nodes.cost_m += STEP_M * weak_margin_cost * weakness
+    def _add_contacts(self, nodes: NodeLayer, middles_w: Floats, tangents: Floats, *, is_incomplete: bool) -> None:
+        """Store the contacts of the newest arcs, and add their cost: negative if they propel, positive if they brake.
 
-    def _drag_left_behind_m(self, parent_rows: Ints) -> Floats:
-        """Return the drag of the arc that the tail leaves when the head enters the next arc, (n, 3) or (3,).
+        Args:
+            nodes: the n new nodes, whose contacts and costs are changed.
+            middles_w: (n, 2) middles of their newest arcs, m.
+            tangents: (n, 2) unit vectors along these arcs.
+            is_incomplete: whether the path is still shorter than the body.
+        """
+        parameters = self._parameters
+        touched = find_touched(self._obstacles, middles_w, tangents, parameters, self._task)
+        middle_s_m = nodes.s_m - 0.5 * STEP_M
+        nodes.add_contacts(touched.is_usable, touched.obstacle, touched.gap_m, touched.wrench, middle_s_m)
+        push_reward = parameters.push_reward_of_body if is_incomplete else parameters.push_reward
+        propulsion = touched.propulsion
+        reward_cost = -push_reward * propulsion
+        brake_cost = -parameters.brake_cost * propulsion
+        nodes.cost_m += STEP_M * np.where(propulsion > 0, reward_cost, brake_cost)
 
-        The tail is one body length behind the head: on the body as it lay at first, and then on the path.
+    def _add_drag(self, nodes: NodeLayer, middles_w: Floats, tangents: Floats) -> None:
+        """Move the body's drag one arc forward: add the arc that the head enters, and subtract the one the tail leaves.
+
+        Args:
+            nodes: the n new nodes, whose drag is changed.
+            middles_w: (n, 2) middles of their newest arcs, m.
+            tangents: (n, 2) unit vectors along these arcs.
+        """
+        nodes.arc_drag_m = STEP_M * wrenches(middles_w - self._task.origin_w, tangents)
+        nodes.drag_m += nodes.arc_drag_m - self._drag_at_tail_m(nodes.parent)
+
+    def _add_margin_cost(self, nodes: NodeLayer) -> None:
+        """Add the cost of propulsion margins below the wanted one; it is higher just ahead of the measured head."""
+        parameters = self._parameters
+        starts_at_tail = self._task.initial_body_w is not None
+        is_just_ahead = starts_at_tail and nodes.s_m < parameters.body_length_m + parameters.near_m
+        weak_margin_cost = parameters.weak_margin_cost_near if is_just_ahead else parameters.weak_margin_cost
+        # 0 with the wanted margin, 1 without any.
+        missing_fraction = np.clip(1.0 - nodes.margin_n / parameters.wanted_margin_n, 0.0, 1.0)
+        nodes.cost_m += STEP_M * weak_margin_cost * missing_fraction
+
+    def _drag_at_tail_m(self, parent_rows: Ints) -> Floats:
+        """Return the drag integral of the arc that the tail leaves when the head enters the next arc.
+
+        That arc is one body length behind the head: on the initial body as long as the path is shorter than a body, and
+        then on the path.
+
+        Args:
+            parent_rows: (n,) rows of the nodes, in the newest layer, from which the head moves on.
+
+        Returns:
+            (n, 3) drag in m, m, m² for each node; or (3,), equal for all, while the tail is on the initial body.
         """
         layers = self._layers
         if len(layers) <= self._body_arcs:
             return self._task.initial_drag_m[len(layers) - 1]
         rows = parent_rows
-        for older in reversed(layers[len(layers) - self._body_arcs + 1 :]):
-            rows = older.parent[rows]
+        for layer in reversed(layers[len(layers) - self._body_arcs + 1 :]):
+            rows = layer.parent[rows]
         return layers[-self._body_arcs].arc_drag_m[rows]
 
     def _thin_out(self, nodes: NodeLayer) -> NodeLayer:

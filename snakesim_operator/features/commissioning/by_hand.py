@@ -188,15 +188,21 @@ def zero(path: Path, selection: RobotSelection, *, wait_for_enter: bool) -> int:
 
 
 def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
-    """Ask the person to turn each joint, and write the sign of those that count in the other direction.
+    """Ask the person to turn each joint in its positive direction, and correct the signs in the file.
+
+    A drive that measures a negative turn then has the wrong sign. The signs are written into the robot file at the end.
 
     Args:
         path: robot file.
         selection: which robot to address.
-        names: joints; none: all.
+        names: names of the joints; empty: all joints.
 
     Returns:
-        0; 1 if a joint was skipped, or another joint turned instead.
+        The exit code: 0; 1 if the sign of a joint is still unknown, because it was skipped or another joint turned.
+
+    Raises:
+        RefusedError: The robot is armed or does not answer.
+        ConfigError: The robot file cannot be used, or has no joint of such a name.
     """
     values: dict[str, dict[str, Any]] = {}
     unknown: list[str] = []
@@ -206,7 +212,7 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
             turn = _wait_for_turn(robot, joint, instruction)
             if turn is None:
                 unknown.append(joint.name)
-            elif turn.by_rad > 0:
+            elif turn.by_rad > 0:  # a turn as in DIRECTIONS is positive if the sign in the file is right
                 print_line(f"  {turn.by_rad:+.2f} rad: matches the file")
             else:
                 print_line(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
@@ -216,16 +222,22 @@ def direction(path: Path, selection: RobotSelection, names: Sequence[str]) -> in
 
 
 def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: float) -> int:
-    """Ask the person to turn each joint by an angle, and compare it with what its drive measures. Writes nothing.
+    """Ask the person to turn each joint by an angle, and compare the gear of its drive with what the drive measures.
+
+    The robot file is not changed: the person writes the gear ratio of the data sheet into it.
 
     Args:
         path: robot file.
         selection: which robot to address.
-        names: joints; none: all.
-        degrees: the angle.
+        names: names of the joints; empty: all joints.
+        degrees: the angle, in either direction.
 
     Returns:
-        0; 1 if a gear does not match the file, or is unknown.
+        The exit code: 0; 1 if a gear does not match the file, or is unknown because its joint was skipped.
+
+    Raises:
+        RefusedError: The robot is armed or does not answer.
+        ConfigError: The robot file cannot be used, or has no joint of such a name.
     """
     unknown: list[str] = []
     wrong: list[str] = []
@@ -236,12 +248,13 @@ def gear(path: Path, selection: RobotSelection, names: Sequence[str], degrees: f
             if turn is None:
                 unknown.append(joint.name)
                 continue
-            ratio = abs(turn.by_rad) / math.radians(degrees)
-            measured = f"  {math.degrees(abs(turn.by_rad)):.0f} of {degrees:g} degrees"
-            if abs(ratio - 1) < MAX_RATIO_ERROR:
+            measured_rad = abs(turn.by_rad)
+            measured_per_turned = measured_rad / math.radians(degrees)  # 1 if the gear in the file is right
+            measured = f"  {math.degrees(measured_rad):.0f} of {degrees:g} degrees"
+            if abs(measured_per_turned - 1) < MAX_RATIO_ERROR:
                 print_line(f"{measured}: matches the file")
             else:
-                gear_ratio = joint.drive.gear * ratio
+                gear_ratio = joint.drive.gear * measured_per_turned
                 print_line(f"{measured}: gear = {gear_ratio:.3g} or so; write that of its data sheet into the file")
                 wrong.append(joint.name)
     if wrong:
@@ -296,15 +309,19 @@ def _report_unknown(names: Sequence[str], command: str) -> int:
 
 
 def limits(path: Path, selection: RobotSelection, names: Sequence[str]) -> int:
-    """Watch how far each joint is moved, until Enter, and write that as its limits.
+    """Watch how far the person moves each joint, until Enter, and write that as its limits into the robot file.
 
     Args:
         path: robot file.
         selection: which robot to address.
-        names: joints; none: all.
+        names: names of the joints; empty: all joints.
 
     Returns:
-        0; 1 if one of them was not moved from end to end.
+        The exit code: 0; 1 if one of the joints was not moved from end to end, and keeps its limits.
+
+    Raises:
+        RefusedError: The robot is armed or does not answer.
+        ConfigError: The robot file cannot be used, or has no joint of such a name.
     """
     with _connect(path, selection, "robot calibrate limits") as robot:
         watched = choose_joints(robot.joints, names, path)

@@ -12,36 +12,53 @@ from snakesim_operator.features.evaluate.store import Results
 from snakesim_operator.results.metrics.intervals import Z95, mean_interval
 
 UNKNOWN = "–"
+# Headings of the columns. "crossed": runs that reached their goal. "net": of runs without a goal, whose displacement
+# from start to end counts, in any direction.
+SETTING = "setting"
+CONTROLLER = "controller"
+CROSSED = "crossed"
+CROSSED_INTERVAL = "95 %"
+ADVANCE_M = "m"
+ADVANCE_INTERVAL_M = "95 % of m"
+SPEED_M_S = "m/s"
+ENERGY_J_PER_M = "J/m"
+NET_M = "net m"
+NET_INTERVAL_M = "95 % of net m"
+NET_SPEED_M_S = "net m/s"
+NET_ENERGY_J_PER_M = "net J/m"
+STALLED_S = "stood s"
+DURATION_S = "time s"
+ERRORS = "errors"
 HEAD = (
-    "setting",
-    "controller",
-    "crossed",
-    "95 %",
-    "m",
-    "95 % of m",
-    "m/s",
-    "J/m",
-    "net m",
-    "95 % of net m",
-    "net m/s",
-    "net J/m",
-    "stood s",
-    "time s",
-    "errors",
-)
+    SETTING,
+    CONTROLLER,
+    CROSSED,
+    CROSSED_INTERVAL,
+    ADVANCE_M,
+    ADVANCE_INTERVAL_M,
+    SPEED_M_S,
+    ENERGY_J_PER_M,
+    NET_M,
+    NET_INTERVAL_M,
+    NET_SPEED_M_S,
+    NET_ENERGY_J_PER_M,
+    STALLED_S,
+    DURATION_S,
+    ERRORS,
+)  # in the order of the table
 TEXT_COLUMNS = 2  # setting and controller: always shown, and aligned to the left
 MAX_FAILURES = 5  # that are listed
 
 
 @dataclass(frozen=True)
 class ResultRow:
-    """The results of one setting with one controller: a row of the table."""
+    """The results of all runs of one setting with one controller: a row of the table."""
 
     row: int  # number of the setting, from 1
     setting: str
     controller: str
     value: float | None  # of the setting, where that is one number
-    outcomes: list[CaseOutcome]
+    outcomes: list[CaseOutcome]  # one for each run
 
     @property
     def runs(self) -> int:
@@ -79,22 +96,27 @@ class ResultRow:
 
     @property
     def cells(self) -> list[str]:
-        """Return the texts of this row of the table of results, one for each heading in HEAD; some are UNKNOWN."""
+        """Return the texts of this row of the table of results, one for each heading in HEAD; some are UNKNOWN.
+
+        Distances and stalls are those of all runs. Speed, energy and time are those of the runs that reached their
+        goal, or that had none. Each number is a median, but intervals are 95 % confidence intervals of means.
+        """
         duration = "crossed_s" if self.crossed else "duration_s"
-        return [
-            self.setting,
-            self.controller,
-            self._crossed_of_runs(),
-            self._crossed_interval(),
-            _format_median(self.values("advance_m"), 2),
-            self._mean_interval("advance_m"),
-            _format_median(self.values("advance_m_s", of_crossed=True), 3),
-            _format_median(self.values("energy_j_per_m", of_crossed=True), 1),
-            *self._net_displacement_cells(),
-            _format_median(self.values("stalled_s"), 1),
-            _format_median(self.values(duration, of_crossed=True), 1),
-            str(self.errors or ""),
-        ]
+        cells = {
+            SETTING: self.setting,
+            CONTROLLER: self.controller,
+            CROSSED: self._crossed_of_runs(),
+            CROSSED_INTERVAL: self._crossed_interval(),
+            ADVANCE_M: _format_median(self.values("advance_m"), 2),
+            ADVANCE_INTERVAL_M: self._mean_interval("advance_m"),
+            SPEED_M_S: _format_median(self.values("advance_m_s", of_crossed=True), 3),
+            ENERGY_J_PER_M: _format_median(self.values("energy_j_per_m", of_crossed=True), 1),
+            **self._net_displacement_cells(),
+            STALLED_S: _format_median(self.values("stalled_s"), 1),
+            DURATION_S: _format_median(self.values(duration, of_crossed=True), 1),
+            ERRORS: str(self.errors or ""),
+        }
+        return [cells[heading] for heading in HEAD]
 
     def _crossed_of_runs(self) -> str:
         if self.crossed is None:
@@ -107,16 +129,19 @@ class ResultRow:
         low, high = wilson_interval(self.crossed, self.runs)
         return f"{100 * low:.0f}-{100 * high:.0f}"
 
-    def _net_displacement_cells(self) -> list[str]:
-        """Return what the runs did along their net displacement; with a goal, the advance towards it counts instead."""
+    def _net_displacement_cells(self) -> dict[str, str]:
+        """Return the cells about the displacement from start to end, by heading.
+
+        They are UNKNOWN for runs with a goal, for which the advance towards the goal counts instead.
+        """
         if self.crossed is not None:
-            return [UNKNOWN] * 4
-        return [
-            _format_median(self.values("net_displacement_m"), 2),
-            self._mean_interval("net_displacement_m"),
-            _format_median(self.values("displacement_m_s"), 3),
-            _format_median(self.values("displacement_energy_j_per_m"), 1),
-        ]
+            return dict.fromkeys((NET_M, NET_INTERVAL_M, NET_SPEED_M_S, NET_ENERGY_J_PER_M), UNKNOWN)
+        return {
+            NET_M: _format_median(self.values("net_displacement_m"), 2),
+            NET_INTERVAL_M: self._mean_interval("net_displacement_m"),
+            NET_SPEED_M_S: _format_median(self.values("displacement_m_s"), 3),
+            NET_ENERGY_J_PER_M: _format_median(self.values("displacement_energy_j_per_m"), 1),
+        }
 
     def _mean_interval(self, name: str) -> str:
         """Return the interval of a mean; with a goal, the success rate has an interval instead."""

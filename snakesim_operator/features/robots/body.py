@@ -12,8 +12,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.links import capsule_inertia
-from snakesim_operator.features.robots.imported import UPS, Imported, ImportOptions
-from snakesim_operator.features.robots.urdf_tree import Body, Row, UrdfJoint
+from snakesim_operator.features.robots.imported import UPS, ImportOptions, ImportResult
+from snakesim_operator.features.robots.urdf_tree import Body, BodyChain, UrdfJoint
 from snakesim_operator.features.robots.xml_tree import Element
 
 LENGTH_DIGITS = 9  # lengths are rounded to a nanometer, which removes the noise of adding transforms
@@ -29,12 +29,12 @@ MIN_MASS_KG = 0.001
 MOMENT_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
 
 
-def put_body(imported: Imported, row: Row, order: ImportOptions, urdf: Element) -> list[Floats]:
+def put_body(imported: ImportResult, chain: BodyChain, order: ImportOptions, urdf: Element) -> list[Floats]:
     """Put chain, module and links into the values of a robot file.
 
     Args:
         imported: The import, whose values and report are extended.
-        row: Bodies and joints of the URDF, tail to head.
+        chain: Bodies and joints of the URDF, tail to head.
         order: How to read the URDF.
         urdf: The root element of the URDF.
 
@@ -44,7 +44,7 @@ def put_body(imported: Imported, row: Row, order: ImportOptions, urdf: Element) 
     Raises:
         ConfigError: The joints are not on a line, or turn about another axis than y or z.
     """
-    body_from_root = _find_body_axes(row, order, urdf)
+    body_from_root = _find_body_axes(chain, order, urdf)
     scale = order.scale
     if scale != 1.0:
         imported.changes.add(
@@ -53,36 +53,36 @@ def put_body(imported: Imported, row: Row, order: ImportOptions, urdf: Element) 
         )
 
     # Joints, in the body frame.
-    positions_b = np.array([body_from_root @ joint.origin for joint in row.joints]) * scale
+    positions_b = np.array([body_from_root @ joint.origin for joint in chain.joints]) * scale
     line_b = np.array([0.0, *positions_b[0][1:]])  # y and z of the line are those of the first joint
     on_line = positions_b - line_b
     joints_x = on_line[:, 0]
     gap_m = float(np.mean(np.diff(joints_x)))
-    _check_gap(row, joints_x, gap_m, urdf)
-    axes = [_read_axis(imported, joint, body_from_root @ joint.axis) for joint in row.joints]
-    for joint, axis, offset_m in zip(row.joints, axes, on_line, strict=True):
+    _check_gap(chain, joints_x, gap_m, urdf)
+    axes = [_read_axis(imported, joint, body_from_root @ joint.axis) for joint in chain.joints]
+    for joint, axis, offset_m in zip(chain.joints, axes, on_line, strict=True):
         _check_on_line(imported, joint, axis, offset_m, gap_m)
 
     # Outlines, from which the capsules follow.
-    outlines = [_place_outline(body, body_from_root, line_b, scale) for body in row.bodies]
+    outlines = [_place_outline(body, body_from_root, line_b, scale) for body in chain.bodies]
     radius_m = _choose_radius(outlines, gap_m, imported)
-    _report_shapes(imported, row, radius_m, scale)
-    lengths = _measure_lengths(joints_x, outlines, radius_m, imported, row)
+    _report_shapes(imported, chain, radius_m, scale)
+    lengths = _measure_lengths(joints_x, outlines, radius_m, imported, chain)
 
     # Links.
     starts_x = [joints_x[0] - lengths[0], *joints_x]
     frames = [_link_from_root(body_from_root, np.array([x, *positions_b[0][1:]])) for x in starts_x]
     links: list[dict[str, Any]] = []
-    for i, body in enumerate(row.bodies):
+    for i, body in enumerate(chain.bodies):
         links.append(_convert_link(imported, i, body, frames[i], lengths[i], radius_m, scale))
     _put_links(imported.table, links, axes, radius_m, urdf.source)
-    _put_names(imported, row, axes, body_from_root)
+    _put_names(imported, chain, axes, body_from_root)
     return frames
 
 
-def _find_body_axes(row: Row, order: ImportOptions, urdf: Element) -> Floats:
+def _find_body_axes(chain: BodyChain, order: ImportOptions, urdf: Element) -> Floats:
     """Return body_from_root, (3, 3): x from tail to head, z up. Raises ConfigError."""
-    along = row.joints[-1].origin - row.joints[0].origin
+    along = chain.joints[-1].origin - chain.joints[0].origin
     if np.linalg.norm(along) < 1e-9:
         raise urdf.error("has its first and last joint at the same place, so that the chain has no direction")
     x = along / np.linalg.norm(along)
@@ -95,23 +95,23 @@ def _find_body_axes(row: Row, order: ImportOptions, urdf: Element) -> Floats:
     return np.vstack([x, np.cross(z, x), z])
 
 
-def _check_gap(row: Row, joints_x: Floats, gap_m: float, urdf: Element) -> None:
+def _check_gap(chain: BodyChain, joints_x: Floats, gap_m: float, urdf: Element) -> None:
     """Raise ConfigError when the joints are so far apart that the unit of length must be wrong."""
     if gap_m <= MAX_GAP_M:
         return
-    widest = row.joints[1 + int(np.argmax(np.diff(joints_x)))]
+    widest = chain.joints[1 + int(np.argmax(np.diff(joints_x)))]
     raise urdf.error(
         f"has joints {gap_m:g} m apart, and a link has {MAX_GAP_M} m at most; in mm? Give --scale 0.001. The "
         f"widest gap is before joint {widest.place()}"
     )
 
 
-def _put_names(imported: Imported, row: Row, axes: list[str], body_from_root: Floats) -> None:
+def _put_names(imported: ImportResult, chain: BodyChain, axes: list[str], body_from_root: Floats) -> None:
     """Report the new names of links and joints, and keep which joints turn the other way round."""
-    for i, body in enumerate(row.bodies):
+    for i, body in enumerate(chain.bodies):
         if body.links != [f"link_{i}"]:
-            imported.names.append(f"link_{i}: {', '.join(body.places)}")
-    for i, (joint, axis) in enumerate(zip(row.joints, axes, strict=True)):
+            imported.names.append(f"link_{i}: {', '.join(body.link_places)}")
+    for i, (joint, axis) in enumerate(zip(chain.joints, axes, strict=True)):
         name = f"joint_{i + 1}"
         axis_b = body_from_root @ joint.axis
         component = 2 if axis == "yaw" else 1
@@ -130,7 +130,7 @@ def _link_from_root(body_from_root: Floats, start_b: Floats) -> Floats:
     return frame
 
 
-def _read_axis(imported: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
+def _read_axis(imported: ImportResult, joint: UrdfJoint, axis_b: Floats) -> str:
     """Return "yaw" or "pitch". A small tilt is removed and reported. Raises ConfigError for an oblique axis."""
     for name, component, letter in (("yaw", 2, "z"), ("pitch", 1, "y")):
         cosine = abs(float(axis_b[component]))
@@ -148,7 +148,7 @@ def _read_axis(imported: Imported, joint: UrdfJoint, axis_b: Floats) -> str:
     )
 
 
-def _check_on_line(imported: Imported, joint: UrdfJoint, axis: str, offset_m: Floats, gap_m: float) -> None:
+def _check_on_line(imported: ImportResult, joint: UrdfJoint, axis: str, offset_m: Floats, gap_m: float) -> None:
     """Report where a joint is moved onto the line of the others. Raises ConfigError when it is far beside it.
 
     Args:
@@ -192,9 +192,9 @@ def _place_outline(body: Body, body_from_root: Floats, line_b: Floats, scale: fl
     return np.vstack(body.points) @ body_from_root.T * scale - line_b
 
 
-def _report_shapes(imported: Imported, row: Row, radius_m: float, scale: float) -> None:
+def _report_shapes(imported: ImportResult, chain: BodyChain, radius_m: float, scale: float) -> None:
     """Report every shape that became a capsule, with its sizes."""
-    for body in row.bodies:
+    for body in chain.bodies:
         if _is_capsule(body, radius_m / scale):
             continue
         for shape in body.shapes:
@@ -212,7 +212,7 @@ def _is_capsule(body: Body, radius: float) -> bool:
     return all(math.isclose(shape.number("radius"), radius, rel_tol=1e-6) for shape in body.shapes)
 
 
-def _choose_radius(outlines: list[Floats | None], gap_m: float, imported: Imported) -> float:
+def _choose_radius(outlines: list[Floats | None], gap_m: float, imported: ImportResult) -> float:
     """Return the radius of all links in m, which is that of the widest link.
 
     Args:
@@ -253,7 +253,7 @@ def _measure_radius(points: Floats) -> float:
 
 
 def _measure_lengths(
-    joints_x: Floats, outlines: list[Floats | None], radius_m: float, imported: Imported, row: Row
+    joints_x: Floats, outlines: list[Floats | None], radius_m: float, imported: ImportResult, chain: BodyChain
 ) -> list[float]:
     """Return the length of every link in m, tail to head, without the caps of its capsule.
 
@@ -262,7 +262,7 @@ def _measure_lengths(
         outlines: For each link, (n, 3) points in m in the body frame; None if the link has no geometry.
         radius_m: Radius of all links.
         imported: The import, whose report is extended.
-        row: Bodies and joints of the URDF, tail to head.
+        chain: Bodies and joints of the URDF, tail to head.
 
     Raises:
         ConfigError: The robot is folded at zero angles.
@@ -277,7 +277,7 @@ def _measure_lengths(
         if gap_m < MIN_LENGTH_M:
             imported.changes.add(
                 f"joint_{i + 1} and joint_{i + 2} are {gap_m * 1e3:.2f} mm apart; here {MIN_LENGTH_M * 1e3:g} mm",
-                row.joints[i + 1].place("origin"),
+                chain.joints[i + 1].place("origin"),
             )
         inner_lengths_m.append(max(gap_m, MIN_LENGTH_M))
     head = len(outlines) - 1
@@ -287,7 +287,7 @@ def _measure_lengths(
 
 
 def _measure_end(
-    imported: Imported,
+    imported: ImportResult,
     index: int,
     outline: Floats | None,
     joint_x: float,
@@ -324,7 +324,7 @@ def _measure_end(
 
 
 def _convert_link(
-    imported: Imported, index: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
+    imported: ImportResult, index: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
 ) -> dict[str, Any]:
     """Return the entry of a link in [[links]] of the robot file.
 

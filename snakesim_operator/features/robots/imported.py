@@ -48,10 +48,13 @@ def join_places(places: list[str]) -> str:
 
 
 @dataclass
-class Imported:
-    """The values of a robot file, and the report on their import."""
+class ImportResult:
+    """What an import of a URDF yields: the values of a robot file, and the report on how they were found.
 
-    table: Table
+    The functions of an import get this object, and add their values and their lines of the report to it.
+    """
+
+    table: Table  # the values of the robot file
     names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
     negated: list[bool] = field(default_factory=list[bool])  # for each joint: our angle is minus the URDF's
     changes: Notes = field(default_factory=Notes)  # values of the file that became others

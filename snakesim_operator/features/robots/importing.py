@@ -21,11 +21,11 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_operator.features.robots.body import put_body
 from snakesim_operator.features.robots.exporting import GEOMETRY, LOOK
-from snakesim_operator.features.robots.imported import Imported, ImportOptions
+from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
 from snakesim_operator.features.robots.joint_limits import put_limits
 from snakesim_operator.features.robots.unused_parts import report_unused
 from snakesim_operator.features.robots.urdf_sensors import gazebo_lines, put_sensors
-from snakesim_operator.features.robots.urdf_tree import read_row
+from snakesim_operator.features.robots.urdf_tree import read_body_chain
 from snakesim_operator.features.robots.xml_tree import Element, parse_xml
 
 SECTIONS = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
@@ -33,7 +33,7 @@ OF_ANOTHER_ROBOT = ("links", "joints", "checked")  # of `--like`: they do not de
 FROM_URDF = ("name", "about", "chain", "module")
 
 
-def import_urdf(file: Path, order: ImportOptions) -> Imported:
+def import_urdf(file: Path, order: ImportOptions) -> ImportResult:
     """Read a URDF as the values of a robot file.
 
     Args:
@@ -57,15 +57,15 @@ def import_urdf(file: Path, order: ImportOptions) -> Imported:
     urdf.read = True
     is_exported = urdf.first("snakesim") is not None  # SnakeSIM exported it, with the values that URDF cannot hold
     initial_values = _exported_values(urdf) if is_exported else _values_of_other(urdf, order)
-    imported = Imported(initial_values)
+    imported = ImportResult(initial_values)
 
     # Each step changes the values that are known so far, and reports what it changed.
-    row = read_row(imported, urdf, file, tail=order.tail)
-    frames = put_body(imported, row, order, urdf)
+    chain = read_body_chain(imported, urdf, file, tail=order.tail)
+    frames = put_body(imported, chain, order, urdf)
     _put_name(imported, urdf, file)
-    put_limits(imported, row.joints, str(file), is_exported=is_exported)
+    put_limits(imported, chain.joints, str(file), is_exported=is_exported)
     if not is_exported:
-        put_sensors(imported, urdf, row, frames, order.scale)
+        put_sensors(imported, urdf, chain, frames, order.scale)
         _report_values_of_other(imported, order)
     _sort_sections(imported.table)
     robot = imported.robot  # raises for numbers that no robot file may hold
@@ -86,7 +86,7 @@ def _sort_sections(table: Table) -> None:
     table.values = {name: table.values[name] for name in names}
 
 
-def _put_name(imported: Imported, urdf: Element, file: Path) -> None:
+def _put_name(imported: ImportResult, urdf: Element, file: Path) -> None:
     """Put the name of the robot; without one, that of the file."""
     name = urdf.optional("name")
     if name is None:
@@ -95,7 +95,7 @@ def _put_name(imported: Imported, urdf: Element, file: Path) -> None:
     imported.table.set_value("name", imported.plain_name(name, "robot", urdf), str(file))
 
 
-def _report_shipped_name(imported: Imported) -> None:
+def _report_shipped_name(imported: ImportResult) -> None:
     """Report a name that a shipped robot has too."""
     name = imported.table.values["name"]
     if name in list_shipped("robots"):
@@ -134,7 +134,7 @@ def _exported_values(urdf: Element) -> Table:
     return table
 
 
-def _report_values_of_other(imported: Imported, order: ImportOptions) -> None:
+def _report_values_of_other(imported: ImportResult, order: ImportOptions) -> None:
     """Report every value that was taken from the robot of `--like`."""
     for section, values in imported.table.values.items():
         if section in FROM_URDF:

@@ -12,7 +12,7 @@ from snakesim_hal.model.files import decode
 from snakesim_hal.model.joints import MAX_TURN_RAD
 from snakesim_hal.model.joints import Joint as BuiltJoint
 from snakesim_hal.model.robot import RobotFile
-from snakesim_operator.features.robots.imported import Imported
+from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.urdf_tree import UrdfJoint
 from snakesim_operator.features.robots.xml_tree import Element
 
@@ -54,7 +54,7 @@ class AngleRange:
     upper_rad: float
 
 
-def put_limits(imported: Imported, joints: list[UrdfJoint], source: str, *, is_exported: bool) -> None:
+def put_limits(imported: ImportResult, joints: list[UrdfJoint], source: str, *, is_exported: bool) -> None:
     """Put the angle limits, motor limits and friction of the joints into the values of a robot file.
 
     A number that most joints share goes into the section for all joints; the others become exceptions.
@@ -83,7 +83,7 @@ def put_limits(imported: Imported, joints: list[UrdfJoint], source: str, *, is_e
     _put_exceptions(imported, joints, ranges, columns, source)
 
 
-def _read_range(imported: Imported, joint: UrdfJoint, negated: bool) -> AngleRange:
+def _read_range(imported: ImportResult, joint: UrdfJoint, negated: bool) -> AngleRange:
     """Return the range of a joint, which is cut to half a revolution to either side.
 
     Args:
@@ -120,7 +120,7 @@ def _read_range(imported: Imported, joint: UrdfJoint, negated: bool) -> AngleRan
     return AngleRange(lower_rad, upper_rad)
 
 
-def _read_limit_rad(imported: Imported, joint: UrdfJoint, limit: Element, attribute: str) -> float:
+def _read_limit_rad(imported: ImportResult, joint: UrdfJoint, limit: Element, attribute: str) -> float:
     """Return one end of a joint's range in rad, cut to half a revolution.
 
     Args:
@@ -152,7 +152,7 @@ def _read_limit_rad(imported: Imported, joint: UrdfJoint, limit: Element, attrib
 
 
 def _complete_column(
-    imported: Imported,
+    imported: ImportResult,
     number: JointNumber,
     joints: Sequence[UrdfJoint],
     joints_so_far: Sequence[BuiltJoint],
@@ -214,7 +214,7 @@ def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exc
     )
 
 
-def _read_number(imported: Imported, number: JointNumber, joint: UrdfJoint) -> float | None:
+def _read_number(imported: ImportResult, number: JointNumber, joint: UrdfJoint) -> float | None:
     """Return a number of a joint, such as its torque limit, or None if the file gives none.
 
     Args:
@@ -243,7 +243,7 @@ def _read_number(imported: Imported, number: JointNumber, joint: UrdfJoint) -> f
     return value
 
 
-def _put_common_range(imported: Imported, ranges: list[AngleRange], source: str) -> None:
+def _put_common_range(imported: ImportResult, ranges: list[AngleRange], source: str) -> None:
     """Put the most common range: `angle_rad`, and the other side if the range is not symmetric."""
     table = imported.table
     common = Counter(ranges).most_common(1)[0][0]
@@ -258,7 +258,7 @@ def _put_common_range(imported: Imported, ranges: list[AngleRange], source: str)
 
 
 def _put_exceptions(
-    imported: Imported,
+    imported: ImportResult,
     joints: list[UrdfJoint],
     ranges: list[AngleRange],
     columns: dict[str, list[float]],

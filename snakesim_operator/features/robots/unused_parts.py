@@ -28,29 +28,47 @@ def _is_look(part: Unused) -> bool:
 def _report(omissions: Notes, unused: list[Unused]) -> None:
     """Add a note for each kind of unused element, then one for each kind of unused value, with their line numbers.
 
+    Parts of one kind have the same path in the file, such as `<link> <inertial> <mass value>`.
+
     Args:
         omissions: The notes, which are extended.
         unused: Elements, attributes and texts that the import did not read.
     """
-    element_lines: dict[str, list[int]] = {}  # by path of the element
-    value_lines: dict[str, dict[str, list[int]]] = {}  # by path of the attribute or text, then by its value
-    for part in unused:
-        if part.outermost and part.path != part.outermost:
-            lines = element_lines.setdefault(part.outermost, [])
-            if part.outermost_line not in lines:
-                lines.append(part.outermost_line)
-        if part.value is None:
-            element_lines.setdefault(part.path, []).append(part.line)
-        else:
-            lines_of_values = value_lines.setdefault(part.path, {})
-            lines_of_values.setdefault(part.value, []).append(part.line)
-    for path, lines in element_lines.items():
+    for path, lines in _lines_of_elements(unused).items():
         omissions.add(f"{shorten(path)} left out: {_join_lines(lines)}")
-    for path, lines_of_values in value_lines.items():
+    for path, lines_by_value in _lines_of_values(unused).items():
         texts: list[str] = []
-        for value, lines in lines_of_values.items():
+        for value, lines in lines_by_value.items():
             texts.append(f"{shorten(value, MAX_VALUE)!r} ({_join_lines(lines)})")
         omissions.add(f"{shorten(path)} left out: {', '.join(texts)}")
+
+
+def _lines_of_elements(unused: list[Unused]) -> dict[str, list[int]]:
+    """Return the line numbers of unused elements, by their path.
+
+    An attribute, a text or an element inside an unused element also counts for the outermost unused one around it.
+    """
+    lines_by_path: dict[str, list[int]] = {}
+    for part in unused:
+        is_inside_unused = part.outermost and part.path != part.outermost
+        if is_inside_unused:
+            lines = lines_by_path.setdefault(part.outermost, [])
+            if part.outermost_line not in lines:
+                lines.append(part.outermost_line)
+        is_element = part.value is None
+        if is_element:
+            lines_by_path.setdefault(part.path, []).append(part.line)
+    return lines_by_path
+
+
+def _lines_of_values(unused: list[Unused]) -> dict[str, dict[str, list[int]]]:
+    """Return the line numbers of unused attributes and texts, by their path, and then by their value."""
+    lines_by_path: dict[str, dict[str, list[int]]] = {}
+    for part in unused:
+        if part.value is not None:
+            lines_by_value = lines_by_path.setdefault(part.path, {})
+            lines_by_value.setdefault(part.value, []).append(part.line)
+    return lines_by_path
 
 
 def _join_lines(lines: list[int]) -> str:

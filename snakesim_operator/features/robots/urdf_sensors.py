@@ -14,8 +14,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import DepthCamera, RangeSensor
-from snakesim_operator.features.robots.imported import Imported
-from snakesim_operator.features.robots.urdf_tree import Row, rotation
+from snakesim_operator.features.robots.imported import ImportResult
+from snakesim_operator.features.robots.urdf_tree import BodyChain, rotation
 from snakesim_operator.features.robots.xml_tree import Element
 
 ON_EVERY_LINK = {"imu": "imu", "contact": "contacts"}  # Gazebo's type -> its section in [sensors]
@@ -26,20 +26,20 @@ POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms
 DEFAULT_RATE_HZ = {"imu": 100.0, "contacts": 100.0, "depth": 20.0, "range": 20.0}  # as in snakesim_hal.model.sensors
 
 
-def put_sensors(imported: Imported, urdf: Element, row: Row, frames: list[Floats], scale: float) -> None:
+def put_sensors(imported: ImportResult, urdf: Element, chain: BodyChain, frames: list[Floats], scale: float) -> None:
     """Put the sensors of a URDF into the values of a robot file.
 
     Args:
         imported: The import, whose values and report are extended.
         urdf: The root element of the URDF.
-        row: Bodies and joints of the URDF, tail to head.
+        chain: Bodies and joints of the URDF, tail to head.
         frames: link_from_root, (4, 4) with lengths in m, of every link.
         scale: Meters per unit of length of the file.
 
     Raises:
         ConfigError: A value of a sensor is wrong.
     """
-    link_indices = {name: i for i, body in enumerate(row.bodies) for name in body.links}
+    link_indices = {name: i for i, body in enumerate(chain.bodies) for name in body.links}
     for gazebo in urdf.all("gazebo"):
         reference = gazebo.attributes.get("reference", "")
         for sensor in gazebo.all("sensor"):
@@ -50,7 +50,7 @@ def put_sensors(imported: Imported, urdf: Element, row: Row, frames: list[Floats
             elif kind in (*DEPTH_TYPES, *RANGE_TYPES) and reference in link_indices:
                 gazebo.optional("reference")
                 link = link_indices[reference]
-                root_from_reference = _scale_lengths(row.bodies[link].frames[reference], scale)
+                root_from_reference = _scale_lengths(chain.bodies[link].frames[reference], scale)
                 link_from_reference = frames[link] @ root_from_reference
                 _put_on_one_link(imported, sensor, link, link_from_reference, scale)
             else:
@@ -58,7 +58,7 @@ def put_sensors(imported: Imported, urdf: Element, row: Row, frames: list[Floats
                 _report_other_sensor(imported, gazebo, sensor, kind, reference)
 
 
-def _report_other_sensor(imported: Imported, gazebo: Element, sensor: Element, kind: str, reference: str) -> None:
+def _report_other_sensor(imported: ImportResult, gazebo: Element, sensor: Element, kind: str, reference: str) -> None:
     known = ", ".join((*ON_EVERY_LINK, *DEPTH_TYPES, *RANGE_TYPES))
     imported.omissions.add(
         f"a sensor whose `type` is {shorten(kind)!r}, in an element whose `reference` is "
@@ -68,7 +68,7 @@ def _report_other_sensor(imported: Imported, gazebo: Element, sensor: Element, k
     )
 
 
-def _put_on_every_link(imported: Imported, sensor: Element, section: str, reference: str) -> None:
+def _put_on_every_link(imported: ImportResult, sensor: Element, section: str, reference: str) -> None:
     """Put an IMU or a contact sensor."""
     sensor.optional("type")
     name = sensor.optional("name") or ""
@@ -83,7 +83,9 @@ def _put_on_every_link(imported: Imported, sensor: Element, section: str, refere
     imported.table.set_value(f"sensors.{section}", existing | rate, sensor.source)
 
 
-def _put_on_one_link(imported: Imported, sensor: Element, link: int, link_from_reference: Floats, scale: float) -> None:
+def _put_on_one_link(
+    imported: ImportResult, sensor: Element, link: int, link_from_reference: Floats, scale: float
+) -> None:
     """Put a camera or a lidar at its place on a link."""
     kind = sensor.get("type")
     section = "depth" if kind in DEPTH_TYPES else "range"
@@ -101,7 +103,7 @@ def _put_on_one_link(imported: Imported, sensor: Element, link: int, link_from_r
     imported.table.set_value(f"sensors.{section}", [*existing, values], sensor.source)
 
 
-def _read_rate(imported: Imported, sensor: Element, section: str) -> dict[str, Any]:
+def _read_rate(imported: ImportResult, sensor: Element, section: str) -> dict[str, Any]:
     """Return `rate_hz` of a sensor; nothing if the file gives none or 0. Then the robot file's rate is reported."""
     element = sensor.first("update_rate")
     rate_hz = 0.0 if element is None else element.text_numbers(1)[0]
@@ -139,7 +141,7 @@ def _scale_lengths(frame: Floats, scale: float) -> Floats:
     return scaled
 
 
-def _convert_pose(imported: Imported, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
+def _convert_pose(imported: ImportResult, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
     """Return the pose of a sensor on its link as position, yaw and pitch, as a robot file has it.
 
     A roll is reported, because a robot file has none.
@@ -173,7 +175,7 @@ def _convert_pose(imported: Imported, link_from_sensor: Floats, sensor: Element)
     }
 
 
-def _read_camera(imported: Imported, sensor: Element) -> dict[str, Any]:
+def _read_camera(imported: ImportResult, sensor: Element) -> dict[str, Any]:
     """Return color, field of view, size, range and noise of a depth camera."""
     values: dict[str, Any] = {"color": sensor.attributes["type"] == "rgbd_camera"}
     camera = sensor.first("camera")
@@ -192,7 +194,7 @@ def _read_camera(imported: Imported, sensor: Element) -> dict[str, Any]:
     return values
 
 
-def _read_lidar(imported: Imported, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_lidar(imported: ImportResult, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
     """Return beams, field of view, range and noise of a lidar.
 
     A robot file's scan is symmetric about the viewing direction, so another scan also changes the sensor's yaw.
@@ -221,7 +223,7 @@ def _read_lidar(imported: Imported, sensor: Element, mounted_yaw_rad: float) -> 
     return values
 
 
-def _read_scan(imported: Imported, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_scan(imported: ImportResult, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
     """Return beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric.
 
     Args:
@@ -268,7 +270,7 @@ def _read_range(owner: Element, tag: str, min_tag: str, max_tag: str, default: s
     return {"range_min_m": element.text_number(min_tag, 0.1), "range_max_m": element.text_number(max_tag, 5.0)}
 
 
-def _read_noise(imported: Imported, element: Element) -> dict[str, Any]:
+def _read_noise(imported: ImportResult, element: Element) -> dict[str, Any]:
     """Return the standard deviation of a sensor's Gaussian noise in m, by the key of the robot file.
 
     Args:

@@ -1,4 +1,4 @@
-"""Reads the links and joints of a URDF as rigid bodies in a row.
+"""Reads the links and joints of a URDF as a chain of rigid bodies, from tail to head.
 
 Links that fixed joints connect are one body, with its mass and its outline. Everything is in the frame of the URDF's
 root link, with all joints at zero.
@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_operator.features.robots.imported import Imported
+from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.shapes import read_shape, sample_outline
 from snakesim_operator.features.robots.xml_tree import Element
 
@@ -29,15 +29,15 @@ class Body:
 
     # The links.
     links: list[str] = field(default_factory=list[str])
-    places: list[str] = field(default_factory=list[str])  # of these links in the file, for a report
+    link_places: list[str] = field(default_factory=list[str])  # name and line of each link in the file, for a report
     frames: dict[str, Floats] = field(default_factory=dict[str, Floats])  # root_from_link of each link, (4, 4)
 
     # Mass, summed over the links.
     mass_kg: float = 0.0
-    moment: Floats = field(default_factory=lambda: np.zeros(3))  # mass x center of mass
-    second: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # inertia about the root's origin
-    masses: list[Element] = field(default_factory=list[Element])
-    inertias: list[Element] = field(default_factory=list[Element])
+    first_moment: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) sum of mass times center of mass
+    inertia_about_root: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # (3, 3) about the root's origin
+    masses: list[Element] = field(default_factory=list[Element])  # the <mass> elements that were summed
+    inertias: list[Element] = field(default_factory=list[Element])  # the <inertia> elements that were summed
 
     # Outline.
     points: list[Floats] = field(default_factory=list[Floats])  # of each shape, (n, 3)
@@ -52,24 +52,24 @@ class Body:
             inertia: (3, 3) its inertia J about the center of mass.
         """
         self.mass_kg += mass_kg
-        self.moment += mass_kg * center
-        self.second += inertia + mass_kg * (center @ center * np.eye(3) - np.outer(center, center))
+        self.first_moment += mass_kg * center
+        self.inertia_about_root += inertia + mass_kg * (center @ center * np.eye(3) - np.outer(center, center))
 
     @property
     def center(self) -> Floats:
         """The center of mass, (3,)."""
-        return self.moment / self.mass_kg
+        return self.first_moment / self.mass_kg
 
     @property
     def inertia(self) -> Floats:
         """The inertia about the center of mass, (3, 3)."""
         c = self.center
-        return self.second - self.mass_kg * (c @ c * np.eye(3) - np.outer(c, c))
+        return self.inertia_about_root - self.mass_kg * (c @ c * np.eye(3) - np.outer(c, c))
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A rotary joint between two neighboring bodies of the row."""
+    """A rotary joint between two neighboring bodies of the chain."""
 
     element: Element
     name: str
@@ -87,8 +87,8 @@ class UrdfJoint:
 
 
 @dataclass(frozen=True)
-class Row:
-    """Bodies from tail to head, and the joints between them."""
+class BodyChain:
+    """The rigid bodies of a snake from tail to head, and the joints between neighbors."""
 
     bodies: list[Body]
     joints: list[UrdfJoint]
@@ -112,11 +112,13 @@ class _Tree:
     connections: list[_Connection] = field(default_factory=list[_Connection])
 
 
-def read_row(imported: Imported, urdf: Element, file: Path, *, tail: str | None) -> Row:
-    """Read bodies and joints, and order them from tail to head.
+def read_body_chain(result: ImportResult, urdf: Element, file: Path, *, tail: str | None) -> BodyChain:
+    """Read the bodies and rotary joints of a URDF, and order them from tail to head.
+
+    Links that fixed joints connect become one body, with the sum of their masses and all their outlines.
 
     Args:
-        imported: The import, whose report is extended.
+        result: The result of the import, whose report is extended.
         urdf: The root element of the URDF.
         file: Path of the URDF, from which its mesh files are looked for.
         tail: A link at the tail; None takes the root link.
@@ -126,16 +128,16 @@ def read_row(imported: Imported, urdf: Element, file: Path, *, tail: str | None)
     """
     links = _elements_by_name(urdf, "link")
     joints = _elements_by_name(urdf, "joint")
-    tree = _walk_tree(imported, urdf, links, joints)
-    bodies: dict[str, Body] = {}
+    tree = _walk_tree(result, urdf, links, joints)
+    bodies: dict[str, Body] = {}  # by the name of their first link
     for name, element in links.items():
-        frame = tree.frames[name]
+        root_from_link = tree.frames[name]
         body = bodies.setdefault(tree.body_of[name], Body())
         body.links.append(name)
-        body.places.append(element.place)
-        body.frames[name] = frame
-        _add_mass(imported, body, element, frame)
-        _add_shapes(imported, body, element, frame, file)
+        body.link_places.append(element.place)
+        body.frames[name] = root_from_link
+        _add_mass(result, body, element, root_from_link)
+        _add_shapes(result, body, element, root_from_link, file)
     return _order_bodies(bodies, tree, tail, urdf)
 
 
@@ -183,11 +185,11 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return about_z @ about_y @ about_x
 
 
-def _walk_tree(imported: Imported, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
+def _walk_tree(result: ImportResult, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
     """Follow the joints from the root link to every other link, and return the frames and joints on the way.
 
     Args:
-        imported: The import, whose report is extended.
+        result: The result of the import, whose report is extended.
         urdf: The root element of the URDF.
         links: <link> elements by name.
         joints: <joint> elements by name.
@@ -204,16 +206,18 @@ def _walk_tree(imported: Imported, urdf: Element, links: dict[str, Element], joi
             raise joint.error(f"and another joint both have the child {child!r}; a link has one parent")
         parent_of[child] = parent
         joints_below.setdefault(parent, []).append((child, joint))
+
+    # From the root link outwards, so that the frame of a parent is known before those of its children.
     root = _find_root(urdf, links, parent_of)
     tree = _Tree(frames={root: np.eye(4)}, body_of={root: root})
-    unvisited = [root]
-    while unvisited:
-        parent = unvisited.pop()
+    links_to_visit = [root]
+    while links_to_visit:
+        parent = links_to_visit.pop()
         children = joints_below.get(parent, [])
         alone_at_root = parent == root and len(children) == 1
         for child, element in children:
-            _add_joint(imported, tree, element, parent, child, alone_at_root=alone_at_root)
-            unvisited.append(child)
+            _add_joint(result, tree, element, parent, child, alone_at_root=alone_at_root)
+            links_to_visit.append(child)
     unreached = sorted(links.keys() - tree.frames.keys())
     if unreached:
         raise urdf.error(f"has joints in a circle: {', '.join(unreached[:8])}")
@@ -239,14 +243,14 @@ def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
 
 
 def _add_joint(
-    imported: Imported, tree: _Tree, element: Element, parent: str, child: str, *, alone_at_root: bool
+    result: ImportResult, tree: _Tree, element: Element, parent: str, child: str, *, alone_at_root: bool
 ) -> None:
     """Place the link behind a joint, and add the joint to the tree if it rotates.
 
     Links on both sides of a fixed joint become one body.
 
     Args:
-        imported: The import, whose report is extended.
+        result: The result of the import, whose report is extended.
         tree: The links and joints so far, which is extended.
         element: The <joint> element.
         parent: Name of the link ahead of the joint, towards the root.
@@ -258,7 +262,7 @@ def _add_joint(
     """
     kind = element.get("type")
     if kind in ("floating", "planar") and alone_at_root:
-        imported.omissions.add(
+        result.omissions.add(
             f"joint {shorten(element.get('name'))!r} ({kind}) left out: the base is always free to move", element.place
         )
         tree.frames[child] = np.eye(4)
@@ -268,30 +272,30 @@ def _add_joint(
     tree.frames[child] = frame
     if kind in ROTARY:
         tree.body_of[child] = child
-        tree.connections.append(_Connection(parent, child, _read_joint(imported, element, frame)))
+        tree.connections.append(_Connection(parent, child, _read_joint(result, element, frame)))
     elif kind == "fixed":
         tree.body_of[child] = tree.body_of[parent]
-        imported.changes.add("fixed joints: the links on both sides became one", element.place)
+        result.changes.add("fixed joints: the links on both sides became one", element.place)
     else:
         raise element.error(f"has the type {shorten(kind)!r}; a snake's joints are revolute, continuous or fixed")
 
 
-def _read_joint(imported: Imported, element: Element, frame: Floats) -> UrdfJoint:
+def _read_joint(result: ImportResult, element: Element, frame: Floats) -> UrdfJoint:
     """Read a rotary joint. Raises ConfigError for one that mimics another, and for an axis without direction.
 
     frame: root_from_joint, (4, 4).
     """
     if element.first("mimic") is not None:
         raise element.error("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
-    axis = _read_axis(imported, element)
+    axis = _read_axis(result, element)
     return UrdfJoint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis)
 
 
-def _read_axis(imported: Imported, joint: Element) -> Floats:
+def _read_axis(result: ImportResult, joint: Element) -> Floats:
     """Return the axis of a joint in the joint's frame, (3,), as a vector of length 1.
 
     Args:
-        imported: The import, whose report gets a change if the file's vector has another length.
+        result: The result of the import, whose report gets a change if the file's vector has another length.
         joint: The <joint> element.
 
     Raises:
@@ -309,18 +313,18 @@ def _read_axis(imported: Imported, joint: Element) -> Floats:
             f"a vector of length 1"
         )
     if abs(length - 1.0) > 1e-3:
-        imported.changes.add(
+        result.changes.add(
             f"<axis xyz> {axis_element.get('xyz')!r} has the length {length:.4g}; only its direction counts",
             f"{shorten(joint.get('name'))} (line {axis_element.line})",
         )
     return axis / length
 
 
-def _add_mass(imported: Imported, body: Body, link: Element, frame: Floats) -> None:
+def _add_mass(result: ImportResult, body: Body, link: Element, frame: Floats) -> None:
     """Add mass and inertia of a link to its body, which is all links that fixed joints connect.
 
     Args:
-        imported: The import, whose report gets an assumption for a link without mass.
+        result: The result of the import, whose report gets an assumption for a link without mass.
         body: The body, which is changed.
         link: The <link> element.
         frame: root_from_link, (4, 4), in the file's unit of length.
@@ -330,7 +334,7 @@ def _add_mass(imported: Imported, body: Body, link: Element, frame: Floats) -> N
     """
     inertial = link.first("inertial")
     if inertial is None:
-        imported.assumptions.add("<link> without <inertial>: 0 kg", link.place)
+        result.assumptions.add("<link> without <inertial>: 0 kg", link.place)
         return
     mass = inertial.first("mass")
     moments = inertial.first("inertia")
@@ -357,11 +361,11 @@ def _read_moment(moments: Element, name: str) -> float:
     return value
 
 
-def _add_shapes(imported: Imported, body: Body, link: Element, frame: Floats, file: Path) -> None:
+def _add_shapes(result: ImportResult, body: Body, link: Element, frame: Floats, file: Path) -> None:
     """Add the outline of a link to its body: that of <collision> or, without one, that of <visual>.
 
     Args:
-        imported: The import, whose report is extended.
+        result: The result of the import, whose report is extended.
         body: The body, whose points and shapes are extended.
         link: The <link> element.
         frame: root_from_link, (4, 4), in the file's unit of length.
@@ -373,14 +377,14 @@ def _add_shapes(imported: Imported, body: Body, link: Element, frame: Floats, fi
         _mark_repeated(visuals, collisions)
     elif visuals:
         link.all("visual")  # marks them as read
-        imported.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
+        result.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
     for element in collisions or visuals:
         geometry = element.first("geometry")
         if geometry is None or not geometry.children:
             raise element.error("has no shape in <geometry>")
         shape = geometry.children[0]
         shape.read = True
-        points = sample_outline(read_shape(shape), shape, file, imported.omissions)
+        points = sample_outline(read_shape(shape), shape, file, result.omissions)
         root_from_shape = frame @ transform(element)
         if points is not None:
             rotation = root_from_shape[:3, :3]
@@ -411,7 +415,7 @@ def _have_same_shape(visual: Element, collision: Element) -> bool:
     return True
 
 
-def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> Row:
+def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> BodyChain:
     """Return bodies and joints in their order from tail to head.
 
     Args:
@@ -444,7 +448,7 @@ def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: 
     return _follow_chain(bodies, neighbors, first)
 
 
-def _follow_chain(bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first: str) -> Row:
+def _follow_chain(bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first: str) -> BodyChain:
     """Return bodies and joints in their order from one end of a chain.
 
     Args:
@@ -458,7 +462,7 @@ def _follow_chain(bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, 
         visited = names[-2:]
         ahead = [(name, joint) for name, joint in neighbors[names[-1]] if name not in visited]
         if not ahead:
-            return Row([bodies[name] for name in names], joints)
+            return BodyChain([bodies[name] for name in names], joints)
         name, joint = ahead[0]
         names.append(name)
         joints.append(joint)

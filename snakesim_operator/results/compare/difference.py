@@ -97,15 +97,18 @@ class FirstDivergence:
 
 @dataclass(frozen=True)
 class HandOvers:
-    """Which joints propelled, in order, in either run."""
+    """Which joints propelled the robot, in order, in the runs A and B.
+
+    At any time one joint propels most. A hand-over is the time at which another joint takes that over.
+    """
 
     a: list[Propulsion]
     b: list[Propulsion]
     unknown: str = ""  # why they cannot be compared
 
     @property
-    def agreed(self) -> int:
-        """The number of hand-overs from the start that went to the same joint in both."""
+    def common_count(self) -> int:
+        """The number of hand-overs, from the start on, that went to the same joints in both runs."""
         count = 0
         for in_a, in_b in zip(self.a, self.b, strict=False):
             if in_a.joint != in_b.joint:
@@ -114,16 +117,16 @@ class HandOvers:
         return count
 
     @property
-    def later_s(self) -> list[float]:
-        """The time by which B was later, for each hand-over that agrees."""
-        agreed = self.agreed
-        pairs = zip(self.a[:agreed], self.b[:agreed], strict=True)
+    def delays_s(self) -> list[float]:
+        """The time in s by which B was later than A, for each hand-over that they have in common; below 0: earlier."""
+        common_count = self.common_count
+        pairs = zip(self.a[:common_count], self.b[:common_count], strict=True)
         return [in_b.start_s - in_a.start_s for in_a, in_b in pairs]
 
     @property
     def same_order(self) -> bool:
-        """Whether all of them agree."""
-        return self.agreed == len(self.a) == len(self.b)
+        """Whether the runs have all hand-overs in common."""
+        return self.common_count == len(self.a) == len(self.b)
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,7 @@ class Difference:
         """Whether all that was measured, commanded and reported is the same for all of the common time."""
         hand_overs = self.hand_overs
         if not hand_overs.unknown:
-            at_other_times = any(abs(later) > SAME_INSTANT_S for later in hand_overs.later_s)
+            at_other_times = any(abs(later) > SAME_INSTANT_S for later in hand_overs.delays_s)
             if not hand_overs.same_order or at_other_times:
                 return False
         if self.advance is not None and abs(self.advance.difference_m) >= STOOD_M:

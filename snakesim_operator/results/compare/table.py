@@ -155,10 +155,11 @@ def _distance(difference: Difference) -> list[str]:
 
 
 def _hand_overs(difference: Difference) -> list[str]:
-    """Return the rows of the table about the joints that propelled, in order of time.
+    """Return the rows about the order in which joints propelled the robot.
 
-    A row for each hand-over that both runs have in common gives its time in A, its time in B, and how much later it is
-    in B. If the order of the joints differs after these, two more rows name the joints that followed.
+    A hand-over is the time at which a joint begins to propel instead of the one before. For each hand-over to the same
+    joint in both runs, a row gives the joint, the time in A, the time in B, and the delay of B, which is negative if B
+    was earlier. If the order of the joints differs after these, two more rows name the joints that followed.
     """
     hand_overs = difference.hand_overs
     joint_names = difference.joints
@@ -168,17 +169,17 @@ def _hand_overs(difference: Difference) -> list[str]:
         return ["  no joint propelled in either"]
 
     lines = [_row("propulsion joints", f"{len(hand_overs.a)} in a row", f"{len(hand_overs.b)} in a row")]
-    for i, later_s in enumerate(hand_overs.later_s[:MAX_HAND_OVERS_SHOWN]):
+    for i, delay_s in enumerate(hand_overs.delays_s[:MAX_HAND_OVERS_SHOWN]):
         in_a = hand_overs.a[i]
         in_b = hand_overs.b[i]
         name = f"  {joint_names[in_a.joint]}"
-        lines.append(_row(name, f"{in_a.start_s:.2f} s", f"{in_b.start_s:.2f} s", f"{later_s:+.2f} s"))
-    hidden_count = hand_overs.agreed - MAX_HAND_OVERS_SHOWN
+        lines.append(_row(name, f"{in_a.start_s:.2f} s", f"{in_b.start_s:.2f} s", f"{delay_s:+.2f} s"))
+    hidden_count = hand_overs.common_count - MAX_HAND_OVERS_SHOWN
     if hidden_count > 0:
-        lines.append(f"    and {hidden_count} more that agree; the last is {hand_overs.later_s[-1]:+.2f} s")
+        lines.append(f"    and {hidden_count} more that agree; the last is {hand_overs.delays_s[-1]:+.2f} s")
     if not hand_overs.same_order:
-        rest_a = hand_overs.a[hand_overs.agreed :]
-        rest_b = hand_overs.b[hand_overs.agreed :]
+        rest_a = hand_overs.a[hand_overs.common_count :]
+        rest_b = hand_overs.b[hand_overs.common_count :]
         lines.append(f"    from there on A: {order_in_words(joint_names, rest_a)}")
         lines.append(f"    from there on B: {order_in_words(joint_names, rest_b)}")
     return lines

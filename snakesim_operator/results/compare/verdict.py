@@ -110,7 +110,7 @@ def who_propelled(difference: Difference) -> str:
         return f"which joints propelled in both is {hand_overs.unknown}"
     if hand_overs.same_order:
         return f"propulsion is handed over in the same order, {len(hand_overs.a)} joints one after another"
-    agreed = hand_overs.agreed
+    agreed = hand_overs.common_count
     next_joints: list[str] = []
     for run, periods in (("A", hand_overs.a), ("B", hand_overs.b)):
         if agreed < len(periods):

@@ -20,13 +20,13 @@ from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
 from snakesim_testing.hal.authority_model import (
     ALL,
-    ANGLE,
+    ANGLE_LIMIT_RAD,
     DERATE_FROM,
-    FAR,
     INF,
     JOINTS,
     KNOWN_FOR_NS,
     LONG_NS,
+    MAX_STEP_RAD,
     MIN_V,
     NAN,
     PERIOD_S,
@@ -157,7 +157,7 @@ class Everything(Model):
             if believed:
                 self.good[i] = angle[i], taken_s
                 measured[0][i], measured[1][i], measured[2][i] = angle[i], velocity[i], torque[i]
-            if i in self.aside:
+            if i in self.isolated:
                 continue
             unknown |= {i} if not sound else set()
             strayed |= {i} if sound and not believed else set()
@@ -200,7 +200,7 @@ class Everything(Model):
             if health.received_ns is not None and not health.known(self.now_ns):
                 self.silent.add(i)
         fresh = self.silent - quiet_before
-        if fresh and not (len(fresh) == 1 and fresh <= self.aside):
+        if fresh and not (len(fresh) == 1 and fresh <= self.isolated):
             self.note_fault()
         self.shares = [health.share(self.now_ns) for health in self.healths]
 
@@ -317,14 +317,16 @@ class Everything(Model):
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
         ready = self.state == "disarmed" and self.known and self.live and self.newest_command is not None
         wrong = {
-            (word, i) for word, i in self.wrong if word == "leak" or (word == "overheated" and i not in self.aside)
+            (word, i) for word, i in self.wrong if word == "leak" or (word == "overheated" and i not in self.isolated)
         }
         weak = any(health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths)
         ready = ready and not wrong and not weak and (self.reported or self.arm_session == 0)
         if ready and self.newest_command is not None:
             received_ns, asked = self.newest_command
             ready = self.now_ns - received_ns <= LEASE_NS and all(
-                i in self.aside or mode == Mode.PASSIVE or (mode == Mode.POSITION and abs(target - angle) <= FAR)
+                i in self.isolated
+                or mode == Mode.PASSIVE
+                or (mode == Mode.POSITION and abs(target - angle) <= MAX_STEP_RAD)
                 for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
             )
         assert (not self.authority.list_unmet_conditions(self.now_ns)) == ready
@@ -357,8 +359,8 @@ class Everything(Model):
             self.leave_for("disarmed")
         if ok and action == "reset":
             self.faults = 0
-            if self.aside:
-                self.aside, self.doubt = set(), None
+            if self.isolated:
+                self.isolated, self.doubt = set(), None
         self.check(answer, ok)
         if not ok:
             assert answer.refusal == "wrong_state"
@@ -405,7 +407,8 @@ class Everything(Model):
 
     def stay(self) -> None:
         """A good command to stay where the joints are."""
-        near, still = [within(angle, -ANGLE, ANGLE) for angle in self.measured[0]], [Mode.POSITION] * JOINTS
+        near = [within(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in self.measured[0]]
+        still = [Mode.POSITION] * JOINTS
         self.send_commands(near, still, None, False, set(), False, 0, 0, 1)
 
     @precondition(lambda self: self.state != "armed")
@@ -497,7 +500,7 @@ class Everything(Model):
         up_to = None if self.lag is None else self.tick - self.lag
         limited = self.authority.limited_counts.total()
         decision = self.authority.decide(up_to)
-        self.check_aside(decision)
+        self.check_isolated(decision)
         assert self.authority.limited_counts.total() == limited + len(decision.limited)
         if self.state != "armed":
             self.reported = True
@@ -505,7 +508,7 @@ class Everything(Model):
         else:
             assert self.live
             assert self.doubt is not None
-            assert self.doubt <= self.aside
+            assert self.doubt <= self.isolated
             for sent in self.since_arming[-KEPT:]:
                 self.counting = sent if up_to is None or sent.tick <= up_to else self.counting
             assert decision.sequence == (None if self.counting is None else self.counting.sequence)

@@ -108,7 +108,7 @@ def test_the_same_run_twice_differs_in_nothing() -> None:
     assert difference.advance is not None
     assert difference.advance.percent == 0
     assert difference.hand_overs.same_order
-    assert difference.hand_overs.later_s == [0, 0, 0]
+    assert difference.hand_overs.delays_s == [0, 0, 0]
     text, html = shown(difference)
     assert "The runs are the same, joint by joint, for all of their 200 common ticks." in text
     assert "No difference: every angle is the same at every time." in html
@@ -199,7 +199,7 @@ def test_runs_are_aligned_at_their_first_arming_whenever_that_was() -> None:
     difference = differ(made_up(start_s=0.5), made_up(start_s=7.25))
     assert difference.aligned.how == "tick by tick"
     assert difference.angle.rms == pytest.approx(0, abs=1e-12)
-    assert difference.hand_overs.later_s == pytest.approx([0, 0, 0])
+    assert difference.hand_overs.delays_s == pytest.approx([0, 0, 0])
 
 
 def test_compare_uses_only_the_common_time() -> None:
@@ -360,8 +360,8 @@ def test_compare_hand_overs_agree_until_first_difference() -> None:
     b = made_up(propelled=((0.0, 9), (0.7, 8), (1.1, 6), (1.5, 7)))
     difference = differ(made_up(), b)
     both = difference.hand_overs
-    assert both.agreed == 2
-    assert both.later_s == pytest.approx([0, 0.1])
+    assert both.common_count == 2
+    assert both.delays_s == pytest.approx([0, 0.1])
     assert not both.same_order
     said = "agrees for the first 2; then A continues with joint_8 at 1.20 s, B continues with joint_7 at 1.10 s"
     text, html = shown(difference)

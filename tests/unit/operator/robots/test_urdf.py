@@ -14,7 +14,7 @@ from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
 from snakesim_operator.cli import main
 from snakesim_operator.features.robots.command import export_robot, import_robot
 from snakesim_operator.features.robots.exporting import export_urdf
-from snakesim_operator.features.robots.imported import Imported, ImportOptions
+from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
 from snakesim_operator.features.robots.importing import import_urdf
 from snakesim_operator.features.robots.meshes import read_vertices
 from snakesim_operator.features.robots.toml_text import format_toml
@@ -54,7 +54,7 @@ def hinge_inertia(model: mujoco.MjModel) -> np.ndarray:
     return full[np.ix_(hinges, hinges)]
 
 
-def ours(found: Imported, tmp_path: Path) -> mujoco.MjModel:
+def ours(found: ImportResult, tmp_path: Path) -> mujoco.MjModel:
     (tmp_path / "robot.toml").write_text(format_toml(found.table.values, []))
     return simulated(tmp_path / "robot.toml")
 

@@ -23,7 +23,7 @@ from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.command import import_robot
 from snakesim_operator.features.robots.exporting import export_urdf
-from snakesim_operator.features.robots.imported import Imported, ImportOptions
+from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
 from snakesim_operator.features.robots.importing import import_urdf
 from snakesim_operator.features.robots.joint_limits import NUMBERS
 from snakesim_testing.messages import raises_error
@@ -137,10 +137,10 @@ class Tried:
     line: int
     value: str | None  # None: left out
     error: str = ""
-    found: Imported | None = None
+    found: ImportResult | None = None
 
 
-def _lines(found: Imported) -> list[str]:
+def _lines(found: ImportResult) -> list[str]:
     return [line for section in found.report.values() for line in section]
 
 
@@ -266,7 +266,7 @@ def _accounted(row: Row, tried: Tried, base: RobotFile) -> bool:
     return _is_reported(_lines(tried.found), tried.line, tried.value)
 
 
-def _imported(text: str, file: Path) -> Imported:
+def _imported(text: str, file: Path) -> ImportResult:
     return import_urdf(_written(ET.fromstring(text), file), ImportOptions())
 
 
@@ -324,7 +324,7 @@ def _line(text: str) -> int:
     return number
 
 
-def _edited(tmp_path: Path, *edits: tuple[str, str]) -> Imported:
+def _edited(tmp_path: Path, *edits: tuple[str, str]) -> ImportResult:
     text = SNAKE
     for old, new in edits:
         assert text.count(old) == 1, old
