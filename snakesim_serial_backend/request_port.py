@@ -168,13 +168,7 @@ class RequestPort(ABC, Generic[StatusT]):
     def _request_each(self, ids: Collection[int], request: bytes, size: int) -> list[StatusT]:
         """Send a sync read, and return the answers, of which each servo sends one.
 
-        <<<<<<< ours
-                A servo that seems to answer twice is left out. The caller then reads it alone and finds why.
-        ||||||| base
-                A servo that seems to answer twice is left out, so that the driver reads it alone, and finds why.
-        =======
-                A servo that seems to answer twice is left out, so that the driver reads it alone, and finds why.
-        >>>>>>> theirs
+        A servo that seems to answer twice is left out, so that the driver reads it alone, and finds why.
         """
         self._note_request(ids)
         doubled: set[int] = set()
