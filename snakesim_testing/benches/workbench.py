@@ -51,15 +51,18 @@ class DrivesWorkbench(Workbench):
         self.tripped = np.zeros(joints, dtype=bool)  # by the watchdog, until a reset
         self.reported = np.zeros(joints, dtype=bool)
         self.braked_s = 0.0
-        self.was: LifecycleState = "disarmed"
+        self.previous_lifecycle: LifecycleState = "disarmed"
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        was_latched, self.was = self.was in LATCHED_STATES, lifecycle
+        was_latched = self.previous_lifecycle in LATCHED_STATES
+        self.previous_lifecycle = lifecycle
         if was_latched and lifecycle not in LATCHED_STATES:
-            self.tripped[:] = self.reported[:] = False
+            self.tripped[:] = False
+            self.reported[:] = False
         match lifecycle:
             case "armed":
-                self.enabled, self.braked_s = self.may_be_enabled(), 0.0
+                self.enabled = self.may_be_enabled()
+                self.braked_s = 0.0
             case "fault":
                 self.enabled = self.still_brakes()
             case _:
@@ -126,22 +129,32 @@ class WorkbenchDrives:
 
 
 class BusWorkbench(DrivesWorkbench):
-    """As late, coarse and slow to wake as a robot on a bus may be, and at rest by itself when it is not armed."""
+    """A robot whose commands and measurements go over a simulated bus.
 
-    WAKES_AFTER = 4  # periods until joint 0 is armed; each further joint takes one more
-    KNOWN_AT_ONCE = True  # in lockstep time is paused until arming, and arming needs to know every joint
+    Setpoints are applied one period late, and odd joints report their measurements one period late. Numbers are rounded
+    as in frames. After an arming, the joints begin to follow one after another.
+    """
+
+    WAKE_UP_PERIODS = 4  # after an arming until joint 0 follows; each further joint takes one more
+    # Whether the first sample has values of the odd joints, too. In lockstep it must: time is paused until the arming,
+    # and the arming needs the state of every joint.
+    KNOWS_LATE_JOINTS_AT_FIRST = True
 
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)
         joints = len(self.angle)
-        self.on_its_way: SafeSetpoints | None = None
+        self.setpoints_on_bus: SafeSetpoints | None = None
         self.lifecycle: LifecycleState = "disarmed"
-        self.armed_for = 0
-        self.samples = 0
-        self.old = (np.zeros(joints), np.zeros(joints), np.zeros(joints))
+        self.armed_periods = 0
+        self.sample_count = 0
+        # Angles, velocities and torques of all joints, as they were measured one period ago.
+        self.previous_values = (np.zeros(joints), np.zeros(joints), np.zeros(joints))
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Apply the commands that are on the bus, then measure. Joints with an odd index report one period late.
+
+        A late joint has the value of the period before and a higher age. At the first sample there is no period before:
+        then the joint has its present value, or is not valid.
 
         Args:
             tick: Number of the control cycle.
@@ -155,17 +168,18 @@ class BusWorkbench(DrivesWorkbench):
             np.round(fresh.torque_nm, TORQUE_DECIMALS),
         )
         is_late = np.arange(len(self.angle)) % 2 == 1
-        is_first_sample = self.samples == 0
-        if is_first_sample and self.KNOWN_AT_ONCE:
-            self.old = measured
+        is_first_sample = self.sample_count == 0
+        if is_first_sample and self.KNOWS_LATE_JOINTS_AT_FIRST:
+            self.previous_values = measured
         angle_rad, velocity_rad_s, torque_nm = (
-            np.where(is_late, previous, present).tolist() for previous, present in zip(self.old, measured, strict=True)
+            np.where(is_late, previous, present).tolist()
+            for previous, present in zip(self.previous_values, measured, strict=True)
         )
-        self.old = measured
-        self.samples += 1
+        self.previous_values = measured
+        self.sample_count += 1
 
         delay_ns = self.description.period_ns * is_late
-        has_late_values = self.KNOWN_AT_ONCE or not is_first_sample
+        has_late_values = self.KNOWS_LATE_JOINTS_AT_FIRST or not is_first_sample
         joints = msgspec.structs.replace(
             fresh,
             angle_rad=angle_rad,
@@ -178,30 +192,31 @@ class BusWorkbench(DrivesWorkbench):
 
     def _apply_commands_on_bus(self) -> None:
         """Apply the newest setpoints; a joint that was armed only just now stays passive."""
-        if self.on_its_way is None:
+        if self.setpoints_on_bus is None:
             return
         if self.lifecycle == "armed":
-            self.armed_for += 1
+            self.armed_periods += 1
         else:
-            self.armed_for = 0
-        wakes_after = self.WAKES_AFTER + np.arange(len(self.angle))  # periods, of every joint
-        super().enact(self.on_its_way, self.lifecycle)
-        self.mode = np.where(self.armed_for < wakes_after, int(Mode.PASSIVE), self.mode)
+            self.armed_periods = 0
+        wake_up_periods = self.WAKE_UP_PERIODS + np.arange(len(self.angle))  # periods, of every joint
+        super().enact(self.setpoints_on_bus, self.lifecycle)
+        self.mode = np.where(self.armed_periods < wake_up_periods, int(Mode.PASSIVE), self.mode)
         self.limit = np.round(self.limit, TORQUE_LIMIT_DECIMALS)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """Put it on the bus."""
+        """Keep the setpoints on the bus until the next sample applies them."""
         if not self.open:
             super().enact(setpoints, lifecycle)
-        self.on_its_way, self.lifecycle = setpoints, lifecycle
+        self.setpoints_on_bus = setpoints
+        self.lifecycle = lifecycle
 
 
 class RealTimeWorkbench(BusWorkbench):
-    """And its time does not wait, nor does it know all joints at once."""
+    """A robot on a bus in real time: its time does not wait, and its first sample lacks the odd joints."""
 
-    KNOWN_AT_ONCE = False
+    KNOWS_LATE_JOINTS_AT_FIRST = False
 
     @classmethod
     def check(cls, config: Any, settings: Any) -> Any:
-        """As a real robot."""
+        """Return the clock modes that this backend has."""
         return ("realtime",)

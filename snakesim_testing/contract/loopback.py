@@ -87,16 +87,25 @@ class RecordingBackend(Backend):
 
 @dataclass
 class Controller:
-    """A control service that commands joints by a plan, which counts ticks from the arming."""
+    """A control service that commands joints by a plan, which counts ticks from the arming.
+
+    A host accepts commands only from the holder of its command lease, and only those that name the present lease epoch
+    and the present arm session. The epoch counts the leases, the arm session counts the armings. So a command from
+    before an arming never moves a joint after it.
+    """
 
     plan: Plan = stay
     last_sent_tick: int = -1
-    epoch: int = 0
-    arm_session: int = 0
+    epoch: int = 0  # lease epoch of the newest command that was sent
+    arm_session: int = 0  # arm session of the newest command that was sent
     stopped: threading.Event = field(default_factory=threading.Event)
 
     def run(self, link: Link) -> None:
         """Connect to the host and command it until stopped.
+
+        In every tick it acquires or renews the lease, and sends setpoints. Before an arming, these are the measured
+        positions, which the host requires for arming. From the first tick of an arm session, the setpoints are the
+        last measured positions with the changes of the plan.
 
         Args:
             link: to the host.
@@ -107,9 +116,9 @@ class Controller:
             joints = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
             client.announce()
-            arm_session = -1
-            armed_at = -1  # tick
-            held: RequestedSetpoints | None = None
+            arm_session = -1  # the session that `armed_tick` is about
+            armed_tick = -1  # first tick of that session
+            held_setpoints: RequestedSetpoints | None = None  # that hold the newest positions from before the arming
             for clock in client.ticks(silence_s=0.05):
                 if self.stopped.is_set():
                     return
@@ -119,12 +128,12 @@ class Controller:
                 if measured is None or not commander.ensure_lease(clock):
                     client.report_done(clock.tick)
                     continue
-                if clock.lifecycle != "armed" or held is None:
-                    held = commander.hold_position(measured)
+                if clock.lifecycle != "armed" or held_setpoints is None:
+                    held_setpoints = commander.hold_position(measured)
                 elif clock.arm_session != arm_session:
                     arm_session = clock.arm_session
-                    armed_at = clock.tick
-                setpoints = self._plan_setpoints(clock, held, clock.tick - armed_at)
+                    armed_tick = clock.tick
+                setpoints = self._plan_setpoints(clock, held_setpoints, clock.tick - armed_tick)
                 if setpoints is not None:
                     commander.send(clock, measured, setpoints)
                     self.last_sent_tick = clock.tick
@@ -132,17 +141,30 @@ class Controller:
                     self.arm_session = clock.arm_session
                     client.report_done(clock.tick)
 
-    def _plan_setpoints(self, clock: Clock, held: RequestedSetpoints, ticks: int) -> RequestedSetpoints | None:
-        """Return the setpoints of a tick: the held ones, changed by the plan. None: the plan sends nothing."""
-        targets = self.plan(ticks) if clock.lifecycle == "armed" else {}
+    def _plan_setpoints(
+        self, clock: Clock, held_setpoints: RequestedSetpoints, ticks: int
+    ) -> RequestedSetpoints | None:
+        """Return the setpoints of a tick: those that hold the position, changed by the plan while the robot is armed.
+
+        Args:
+            clock: the tick, and the lifecycle state in it.
+            held_setpoints: setpoints that hold all joints.
+            ticks: since the arming.
+
+        Returns:
+            The setpoints; None if the plan sends nothing in this tick.
+        """
+        targets: JointTargets | None = {}
+        if clock.lifecycle == "armed":
+            targets = self.plan(ticks)
         if targets is None:
             return None
-        mode = list(held.mode)
-        target = list(held.target)
+        mode = list(held_setpoints.mode)
+        target = list(held_setpoints.target)
         for joint, (joint_mode, joint_target) in targets.items():
             mode[joint] = joint_mode
             target[joint] = joint_target
-        return RequestedSetpoints(mode, target, held.torque_limit_nm)
+        return RequestedSetpoints(mode, target, held_setpoints.torque_limit_nm)
 
 
 class Hosted:
@@ -159,7 +181,7 @@ class Hosted:
         self.backend = RecordingBackend(backend)
         self.controller = Controller()
         self.config = config
-        self.armed_at = 0  # tick
+        self.armed_at = 0  # tick of the newest sample when the robot was armed last
         self._threads: list[threading.Thread] = []
         self._opened = contextlib.ExitStack()
         self._opened.callback(self.backend.close)
