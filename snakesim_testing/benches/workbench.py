@@ -212,7 +212,7 @@ class BusWorkbench(DrivesWorkbench):
 
 
 class RealTimeWorkbench(BusWorkbench):
-    """A robot on a bus in real time: its time does not wait, and its first sample lacks the odd joints."""
+    """A robot on a bus in real time: its time does not wait, and its first sample is without the odd joints."""
 
     KNOWS_LATE_JOINTS_AT_FIRST = False
 

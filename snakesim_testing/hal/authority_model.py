@@ -336,7 +336,7 @@ class Model(RuleBasedStateMachine):
     def check_commanded(self, decision: TickDecision, sent: JointCommand) -> None:
         """Check the setpoints of a tick in which a command counts: mode, torque limit and target of every joint.
 
-        Isolated joints are passive whatever the command says. A torque limit is at most that of the command and that of
+        Isolated joints are passive with every command. A torque limit is at most that of the command and that of
         the drive at its present temperature, and rises no faster than the limit of the torque's rate of change.
 
         Args:
