@@ -249,7 +249,7 @@ def test_drives_that_stop_while_driver_is_frozen_stay_off(opened: Opens, body: s
         return named == {f"joint_{i + 1}" for i in range(4)}
 
     wait_until(all_are_named, "a fault of every drive", 10.0)
-    wait_until(lambda: (robot.run(1, "disarmed") and False) or not robot.backend._following, "cleared", 10.0)
+    wait_until(lambda: (robot.run(1, "disarmed") and False) or not robot.backend._driven, "cleared", 10.0)
     robot.arm()
 
 
