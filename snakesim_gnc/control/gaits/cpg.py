@@ -33,9 +33,9 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds, find_travel_sign
-from snakesim_gnc.control.gaits.body_curve import PHASES, BodyCurve
+from snakesim_gnc.control.gaits.body_curve import BodyCurve
 from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
-from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, find_serpenoid_headings
+from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, check_serpenoid
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description, World
@@ -143,14 +143,7 @@ class Cpg(Gait[CpgParameters]):
     @classmethod
     def check(cls, robot: Description, parameters: CpgParameters) -> None:
         """Check that the joints can form the curve of the limit cycle. Raises ConfigError."""
-        curve = BodyCurve(robot, "yaw")
-        curve.check_wavelength(parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it")
-        alpha = parameters.winding_angle_rad
-        shapes_rad = [
-            curve.find_angles_rad(find_serpenoid_headings(curve.from_head, phase, alpha, parameters.wavelength))
-            for phase in PHASES
-        ]
-        curve.check_limits(np.array(shapes_rad), f"control.winding_angle_rad of {alpha:g} rad")
+        check_serpenoid(robot, parameters.winding_angle_rad, parameters.wavelength)
 
     def __init__(self, robot: Description, parameters: CpgParameters) -> None:
         super().__init__(robot, parameters)

@@ -68,6 +68,26 @@ def find_serpenoid_headings(from_head: Floats, phase_rad: float, winding_angle_r
     return winding_angle_rad * np.cos(phase_rad - math.tau * from_head / wavelength)
 
 
+def check_serpenoid(robot: Description, winding_angle_rad: float, wavelength: float) -> None:
+    """Check that the yaw joints of a robot can form the serpenoid curve at every phase.
+
+    Args:
+        robot: the robot.
+        winding_angle_rad: alpha, the parameter `winding_angle_rad` of the controller.
+        wavelength: lambda, the parameter `wavelength` of the controller.
+
+    Raises:
+        ConfigError: the waves are too short for the joints, or the bends exceed their limits.
+    """
+    curve = BodyCurve(robot, "yaw")
+    curve.check_wavelength(wavelength, f"control.wavelength of {wavelength:g}", "increase it")
+    shapes_rad = [
+        curve.find_angles_rad(find_serpenoid_headings(curve.from_head, phase_rad, winding_angle_rad, wavelength))
+        for phase_rad in PHASES
+    ]
+    curve.check_limits(np.array(shapes_rad), f"control.winding_angle_rad of {winding_angle_rad:g} rad")
+
+
 class Serpenoid(Gait[SerpenoidParameters]):
     """Moves forward on ground on which links slide more easily along the body than sideways, and among push-points."""
 
@@ -77,14 +97,7 @@ class Serpenoid(Gait[SerpenoidParameters]):
     @classmethod
     def check(cls, robot: Description, parameters: SerpenoidParameters) -> None:
         """Check that the joints can form the curve. Raises ConfigError."""
-        curve = BodyCurve(robot, "yaw")
-        curve.check_wavelength(parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it")
-        alpha = parameters.winding_angle_rad
-        shapes_rad = [
-            curve.find_angles_rad(find_serpenoid_headings(curve.from_head, phase, alpha, parameters.wavelength))
-            for phase in PHASES
-        ]
-        curve.check_limits(np.array(shapes_rad), f"control.winding_angle_rad of {alpha:g} rad")
+        check_serpenoid(robot, parameters.winding_angle_rad, parameters.wavelength)
 
     def __init__(self, robot: Description, parameters: SerpenoidParameters) -> None:
         super().__init__(robot, parameters)
