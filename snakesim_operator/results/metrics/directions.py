@@ -38,14 +38,13 @@ class HeadingEffort:
         """
         if advance is None or known_s <= 0:
             return HeadingEffort()
-        used_j = energy_j(record) if has_power else None
         distance_m = float(advance.along_heading_m[-1])
-        j_per_m = _divide_energy(used_j, distance_m)
+        cost = _measure_cost(record, distance_m, has_power=has_power)
         return HeadingEffort(
             heading_advance_m=distance_m,
-            heading_energy_j_per_m=j_per_m,
+            heading_energy_j_per_m=cost.energy_j_per_m,
             heading_body_lengths_s=distance_m / known_s / body_length_m(record),
-            heading_cost_of_transport=None if j_per_m is None else j_per_m / weight_n(record),
+            heading_cost_of_transport=cost.of_transport,
         )
 
 
@@ -79,17 +78,15 @@ class Displacement:
             return Displacement()
         displacement_w = advance.center_w[-1] - advance.center_w[0]
         distance_m = float(np.linalg.norm(displacement_w))
-        used_j = energy_j(record) if has_power else None
-        j_per_m = _divide_energy(used_j, distance_m)
-        cost_of_transport = None if j_per_m is None else j_per_m / weight_n(record)
+        cost = _measure_cost(record, distance_m, has_power=has_power)
         slip = measure_slip(record, distance_m)
         return Displacement(
             displacement_m_s=distance_m / known_s,
             displacement_bearing_rad=_find_bearing_rad(advance, displacement_w),
-            displacement_energy_j_per_m=j_per_m,
+            displacement_energy_j_per_m=cost.energy_j_per_m,
             displacement_body_lengths_s=distance_m / known_s / body_length_m(record),
-            displacement_cost_of_transport=cost_of_transport,
-            displacement_efficiency=propulsive_efficiency(record, cost_of_transport),
+            displacement_cost_of_transport=cost.of_transport,
+            displacement_efficiency=propulsive_efficiency(record, cost.of_transport),
             displacement_slip=slip.along_path,
             lateral_slip=slip.lateral,
         )
@@ -143,11 +140,20 @@ def _find_bearing_rad(advance: Advance, displacement_w: Floats) -> float | None:
     return float(np.arctan2(_cross(forward_w, displacement_w), np.dot(forward_w, displacement_w)))
 
 
-def _divide_energy(used_j: float | None, distance_m: float) -> float | None:
-    """Return energy per meter, or None if the energy is unknown or the distance too short."""
-    if used_j is None or distance_m < MIN_DISTANCE_M:
-        return None
-    return used_j / distance_m
+@dataclass(frozen=True)
+class _Cost:
+    """What a distance costs. None: the energy is unknown, or the distance is shorter than MIN_DISTANCE_M."""
+
+    energy_j_per_m: float | None = None
+    of_transport: float | None = None  # energy over weight times distance
+
+
+def _measure_cost(record: RunRecord, distance_m: float, *, has_power: bool) -> _Cost:
+    """Divide the energy of the whole run by a distance. has_power: whether the energy can be computed."""
+    if not has_power or distance_m < MIN_DISTANCE_M:
+        return _Cost()
+    j_per_m = energy_j(record) / distance_m
+    return _Cost(j_per_m, j_per_m / weight_n(record))
 
 
 def _make_unit(vectors: Floats) -> Floats:
