@@ -6,49 +6,28 @@ What `snakesim drive emulate` and `snakesim drive load` do for every protocol of
 import argparse
 import contextlib
 import select
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
 from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import die_with_parent
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
+from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_hal.programs.preflight import backend_settings, with_backend_modes
+from snakesim_serial_backend.port_load import PortLoad
+from snakesim_serial_backend.servo_backend import ServoBackend
 from snakesim_serial_backend.wire import Pty
 
 TABLE_SERVOS = (1, 4, 8, 13, 18, 24)  # numbers of servos on a port in the load table
 
 
-class MakeEmulator(Protocol):
-    """Makes the emulated servos of a whole robot."""
-
-    def __call__(
-        self, config: RunConfig, settings: Any, ptys: list[Pty], clock: DriverClock, pose: str | None, /
-    ) -> Callable[[], object]:
-        """Return them, at the other end of these pseudo terminals. pose: HOST:PORT that gets poses, or None."""
-        ...
-
-
-@dataclass(frozen=True)
-class PortLoad:
-    """Bytes, time and rate of a cycle on a port."""
-
-    rates: Sequence[int]  # baud rates in bit/s
-    cycle_bytes: Callable[[int], int]  # from the number of servos
-    cycle_s: Callable[[int, int], float]  # from the number of servos and the baud rate
-    fits_hz: Callable[[int, int], int]
-    note: str  # what a cycle is
-
-
-def emulate_servos(arguments: argparse.Namespace, backend: type[DriverTypeBackend], make_emulator: MakeEmulator) -> int:
+def emulate_servos(arguments: argparse.Namespace, backend: type[ServoBackend[Any]]) -> int:
     """Emulate the servos until a stop signal. Returns 0; raises SnakesimError."""
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
@@ -59,7 +38,7 @@ def emulate_servos(arguments: argparse.Namespace, backend: type[DriverTypeBacken
     settings = backend_settings(config, backend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
     with named(links) as ptys:
-        emulator = make_emulator(config, settings, ptys, DriverClock(config), arguments.pose)
+        emulator = backend.make_robot_emulator(config, settings, ptys, DriverClock(config), arguments.pose)
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
         ready = f"servos ready: {len(config.robot.joint_table)} on {ends}"
         serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []))

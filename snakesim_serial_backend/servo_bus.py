@@ -1,4 +1,4 @@
-"""The servos of one half-duplex serial bus, for any protocol: who is read when, silence, second servos, and faults.
+"""The servos of one half-duplex serial bus, for any protocol: reading, silence, duplicate ids and faults.
 
 A driver type derives from `SerialServos`, and adds what its registers mean.
 """

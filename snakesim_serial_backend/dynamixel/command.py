@@ -2,22 +2,15 @@
 
 import argparse
 
-from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, emulator_on
-from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
-from snakesim_serial_backend.dynamixel.registers import RATE
-from snakesim_serial_backend.emulation import PortLoad, emulate_servos, print_port_load
-
-NOTE = (
-    f"A cycle on one port: fast sync read, health of one, sync write; an adapter's latency of 1 ms for each of two "
-    f"questions; the fastest rate at which it takes {MAX_LOAD:.0%} of a period"
-)
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
+from snakesim_serial_backend.emulation import emulate_servos, print_port_load
 
 
 def emulate(arguments: argparse.Namespace) -> int:
     """Emulate the servos until a stop signal. Returns 0; raises SnakesimError."""
-    return emulate_servos(arguments, DynamixelBackend, emulator_on)
+    return emulate_servos(arguments, DynamixelBackend)
 
 
 def print_load(arguments: argparse.Namespace) -> int:
     """Print bytes, time and rate of a cycle for every baud rate. Returns 0."""
-    return print_port_load(arguments, PortLoad(list(RATE), cycle_bytes, cycle_s, fits_hz, NOTE))
+    return print_port_load(arguments, DynamixelBackend.port_load)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
@@ -24,6 +23,7 @@ from snakesim_serial_backend.dynamixel.packets import (
     encoded,
     fast_status,
 )
+from snakesim_serial_backend.servo_backend import ServoEmulator
 from snakesim_serial_backend.wire import Pty
 
 MODEL = 1120  # XM540-W270, if the settings name no model
@@ -84,7 +84,7 @@ class EmulatedServo:
         return self.table[at.TORQUE_ENABLE] == 1
 
 
-class EmulatedDynamixel(DriveEmulator[Pty]):
+class EmulatedDynamixel(ServoEmulator):
     """All servos of a robot, at the other end of their ports."""
 
     def __init__(
@@ -135,7 +135,6 @@ class EmulatedDynamixel(DriveEmulator[Pty]):
         servo.table[SHUTDOWN] = SHUTDOWN_ERRORS
 
     def __call__(self) -> None:
-        """Handle what has arrived, and let time pass up to now."""
         received = [port.receive() for port in self._bus_ends]  # may wait for the kernel, so it comes before the lock
         with self.body.lock:
             self.catch_up()

@@ -5,91 +5,66 @@ from collections.abc import Collection, Sequence
 from typing import ClassVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, joint_label, make_body
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
-from snakesim_drivers.kit.readings import DriveReadings
+from snakesim_drivers.kit.drive_settings import joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, Measurement
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.feetech import registers as at
 from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
-from snakesim_serial_backend.feetech.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
+from snakesim_serial_backend.feetech.load import PORT_LOAD
 from snakesim_serial_backend.feetech.packets import LAST_ID
 from snakesim_serial_backend.feetech.port import Port
 from snakesim_serial_backend.feetech.servo import Servo
 from snakesim_serial_backend.feetech.servos import Servos, ServosContext
 from snakesim_serial_backend.feetech.settings import NAME, FeetechSettings
-from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated, open_log
-
-# A silence of this length ends an answer, whichever is longer.
-MIN_GAP_S = 0.002
-GAP_PER_PERIOD = 0.2
-EMULATED_GAP_PER_PERIOD = 0.5  # of servos in another process, which a busy computer delays
+from snakesim_serial_backend.port_load import PortLoad
+from snakesim_serial_backend.servo_backend import OpenedPort, ServoBackend, find_travel_rad
+from snakesim_serial_backend.wire import Pty, is_emulated
 
 
-class FeetechBackend(DriverTypeBackend):
+class FeetechBackend(ServoBackend[EmulatedFeetech]):
     """The backend on Feetech STS servos, real or emulated."""
 
     Settings = FeetechSettings
     name = NAME
+    port_load: ClassVar[PortLoad] = PORT_LOAD
     supported_modes = ("position",)  # servos have no other mode that the driver uses, even if the robot file lists one
     unmeasured: ClassVar[Collection[Measurement]] = ("torque",)
     has_watchdog: ClassVar[bool] = False
-
-    @classmethod
-    def list_ports(cls, settings: FeetechSettings) -> Sequence[str]:
-        return settings.ports
-
-    @classmethod
-    def list_bus_faults(cls, settings: FeetechSettings) -> Collection[str]:
-        if settings.ports:
-            return set()
-        return {"cut"}
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: FeetechSettings, joints: Sequence[Joint]) -> None:
         if not all(is_emulated(port) for port in settings.ports):
             check_real_servos(settings)
         check_joints(config, joints)
-        check_load(config.rate_hz / settings.decimation, settings, joints)
+        cls.check_port_load(config, settings, joints)
 
     @classmethod
-    def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-        config = context.config
-        settings: FeetechSettings = context.settings
-        joints = context.joints
-        clock = context.clock
-        body = context.body
-        log = open_log(settings.log, "backends.feetech.log")
+    def open_servos(cls, opened: OpenedPort[EmulatedFeetech]) -> Servos:
+        port = Port(opened.wire, opened.gap_s)
+        context = ServosContext(
+            servos=[servo_of(joint, port, opened.settings) for joint in opened.joints],
+            port=port,
+            readings=opened.readings,
+            settings=opened.settings,
+            emulator=opened.emulator,
+            answer_s=opened.answer_s,
+            clock_ns=opened.clock_ns,
+        )
+        return Servos(context)
 
-        def open_servos(port_name: str, numbers: Sequence[int], readings: DriveReadings) -> Servos:
-            """Open a port with the servos of these joints; emulated servos are on a pseudo terminal."""
-            emulator = None
-            if body is None:
-                wire = SerialWire(port_name, settings.baud, log)
-            else:
-                pty = Pty()
-                emulator = emulator_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
-                wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
-            gap_per_period = EMULATED_GAP_PER_PERIOD if is_emulated(wire.port) else GAP_PER_PERIOD
-            port = Port(wire, max(MIN_GAP_S, gap_per_period * config.period_ns * 1e-9))
-            servos_context = ServosContext(
-                servos=[servo_of(joints[number], port, settings) for number in numbers],
-                port=port,
-                readings=readings,
-                settings=settings,
-                emulator=emulator,
-                answer_s=answer_limit_s(config, settings.decimation),
-                clock_ns=clock.now_ns,
-            )
-            return Servos(servos_context)
-
-        ports = settings.ports
-        if body is not None:
-            ports = [NAME]
-        return group_by_port(joints, settings, ports, open_servos)
+    @classmethod
+    def make_emulator(
+        cls,
+        joints: Sequence[Joint],
+        settings: FeetechSettings,
+        body: EmulatedBody,
+        ptys: Sequence[Pty],
+        clock: DriverClock,
+    ) -> EmulatedFeetech:
+        stall_torques_nm = [stall_torque_of(joint, settings) for joint in joints]
+        return EmulatedFeetech(body, ptys, stall_torques_nm, settings.baud, settings.speed_unit_counts_s, clock.now_ns)
 
 
 def servo_of(joint: Joint, port: Port, settings: FeetechSettings) -> Servo:
@@ -114,14 +89,6 @@ def stall_torque_of(joint: Joint, settings: FeetechSettings) -> float:
     It is a little more than the joint demands, because the torque limit is rounded down.
     """
     return settings.stall_torque_nm or 1.01 * joint.limits.torque_nm / joint.drive.gear
-
-
-def find_travel_rad(joint: Joint) -> tuple[float, float]:
-    """Return the smallest and the largest angle of a joint's servo."""
-    ratio = joint.drive.sign * joint.drive.gear  # rotation of the horn for one of the joint
-    end_a_rad = joint.drive.zero_rad + ratio * joint.limits.lower_rad
-    end_b_rad = joint.drive.zero_rad + ratio * joint.limits.upper_rad
-    return min(end_a_rad, end_b_rad), max(end_a_rad, end_b_rad)
 
 
 def check_real_servos(settings: FeetechSettings) -> None:
@@ -160,44 +127,3 @@ def check_joints(config: RunConfig, joints: Sequence[Joint]) -> None:
                 "the middle of the travel is at position 2048, and correct `zero_rad`; or narrow the limits or `gear`",
                 code="drive/unsupported-setting",
             )
-
-
-def check_load(rate_hz: float, settings: FeetechSettings, joints: Sequence[Joint]) -> None:
-    """Raise ConfigError when a port cannot carry its servos."""
-    bus_of_joint = assign_ports(joints, settings.ports)
-    fullest = max(bus_of_joint.count(bus) for bus in set(bus_of_joint))
-    busy_s = cycle_s(fullest, settings.baud)
-    if busy_s * rate_hz > MAX_LOAD:
-        raise ConfigError(
-            f"{fullest} servos at {rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
-            f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
-            f"most {MAX_LOAD:.0%}: use rate_hz = {fits_hz(fullest, settings.baud)}, a higher "
-            f"`backends.feetech.baud`, or more `backends.feetech.ports`",
-            code="bus/overloaded",
-        )
-
-
-def emulator_on(
-    config: RunConfig, settings: FeetechSettings, ptys: list[Pty], clock: DriverClock, pose: str | None
-) -> EmulatedFeetech:
-    """Make emulated servos for a whole robot.
-
-    Args:
-        config: configuration of the run, with the robot and the settings of its backend.
-        settings: the scenario's section of this driver type.
-        ptys: a pseudo terminal for each of its ports.
-        clock: the time of the servos.
-        pose: where motion capture sends poses, HOST:PORT; None: nowhere.
-    """
-    joints = config.robot.joint_table
-    body = make_body(config, settings, NAME, pose)
-    pty_of_joint = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
-    return emulator_of(joints, settings, body, pty_of_joint, clock)
-
-
-def emulator_of(
-    joints: Sequence[Joint], settings: FeetechSettings, body: EmulatedBody, ptys: Sequence[Pty], clock: DriverClock
-) -> EmulatedFeetech:
-    """Make emulated servos for joints. ptys: the pseudo terminal of every joint's servo."""
-    stall_torques_nm = [stall_torque_of(joint, settings) for joint in joints]
-    return EmulatedFeetech(body, ptys, stall_torques_nm, settings.baud, settings.speed_unit_counts_s, clock.now_ns)

@@ -8,7 +8,6 @@ robot file. A goal switches the torque on, which real servos may do.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.feetech import registers as at
@@ -24,6 +23,7 @@ from snakesim_serial_backend.feetech.packets import (
     from_signed,
     to_signed,
 )
+from snakesim_serial_backend.servo_backend import ServoEmulator
 from snakesim_serial_backend.wire import Pty
 
 MODEL = 777  # STS3215
@@ -60,7 +60,7 @@ class EmulatedServo:
         return self.table[at.TORQUE_ENABLE] == 1
 
 
-class EmulatedFeetech(DriveEmulator[Pty]):
+class EmulatedFeetech(ServoEmulator):
     """All servos of a robot, at the other end of their ports."""
 
     def __init__(
@@ -97,7 +97,6 @@ class EmulatedFeetech(DriveEmulator[Pty]):
             self.restart(i)
 
     def __call__(self) -> None:
-        """Handle what has arrived, and let time pass up to now."""
         received = [port.receive() for port in self._bus_ends]  # may wait for the kernel, so it comes before the lock
         with self.body.lock:
             self.catch_up()

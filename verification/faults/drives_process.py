@@ -33,8 +33,8 @@ from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig, load
 from snakesim_hal.programs.preflight import backend_settings
-from snakesim_serial_backend.dynamixel.backend import emulator_of
 from snakesim_serial_backend.emulation import named
+from snakesim_serial_backend.servo_backend import ServoBackend
 from snakesim_serial_backend.wire import Pty
 from snakesim_testing.benches.emulated_drives import enabled_drives
 
@@ -109,8 +109,9 @@ def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, open
         wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
         context = CanEmulatorContext(joints, part.settings, body, [wire] * len(joints), clock.now_ns)
         return opened.enter_context(closing(driver_type.emulator_class(context)))
+    assert issubclass(driver_type, ServoBackend), f"no emulator of {driver_type.name} as a process"
     ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
-    return emulator_of(joints, part.settings, body, ptys * len(joints), clock)
+    return driver_type.make_emulator(joints, part.settings, body, ptys * len(joints), clock)
 
 
 def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> Drives:

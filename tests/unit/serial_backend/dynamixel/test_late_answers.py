@@ -11,7 +11,7 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.backend import emulator_on, servo_of
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, servo_of
 from snakesim_serial_backend.dynamixel.bring_up import bring_up
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
@@ -54,7 +54,9 @@ class SlowBench:
     def __init__(self) -> None:
         self._config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=50, clock_mode="realtime")
         self.pty = SlowPty()
-        self.emulator = emulator_on(self._config, SETTINGS, [self.pty], DriverClock(self._config), None)
+        self.emulator = DynamixelBackend.make_robot_emulator(
+            self._config, SETTINGS, [self.pty], DriverClock(self._config), None
+        )
         self._wire = SerialWire(self.pty.path, 1_000_000)
         self.port = Port(self._wire, GAP_S)
         self.servos = [servo_of(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table]

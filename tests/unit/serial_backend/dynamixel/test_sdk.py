@@ -15,7 +15,7 @@ from dynamixel_sdk import (
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.backend import emulator_on
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.emulator import FIRMWARE, MODEL, EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
@@ -60,7 +60,7 @@ class Bench:
     def __init__(self) -> None:
         config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
         self.clock, self.pty = DriverClock(config), Pty()
-        self.emulator: EmulatedDynamixel = emulator_on(
+        self.emulator: EmulatedDynamixel = DynamixelBackend.make_robot_emulator(
             config, DynamixelSettings(physics_model="inertia"), [self.pty], self.clock, None
         )
         self.port = Port(self.pty, self.emulator)

@@ -11,7 +11,7 @@ import pytest
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.feetech import registers as at
-from snakesim_serial_backend.feetech.backend import emulator_on
+from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_serial_backend.feetech.emulator import MODEL
 from snakesim_serial_backend.feetech.packets import ServoError
 from snakesim_serial_backend.feetech.settings import FeetechSettings
@@ -31,7 +31,7 @@ class Bench:
         self.clock = DriverClock(config)
         self.pty = Pty()
         settings = FeetechSettings(physics_model="inertia")
-        self.emulator = emulator_on(config, settings, [self.pty], self.clock, None)
+        self.emulator = FeetechBackend.make_robot_emulator(config, settings, [self.pty], self.clock, None)
         self.port = self._make_port()
         self.packets = sdk.PacketHandler(0)  # little-endian words, as STS servos have them
 

@@ -1,0 +1,57 @@
+"""How long the servos of a serial port occupy it in a control cycle, at worst, for any protocol. Pure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_serial_backend.wire import BITS_A_BYTE, USB_LATENCY_S
+
+MAX_LOAD = 0.8  # of a period
+REQUESTS = 2  # in a cycle that are answered; each waits once for the adapter
+
+
+@dataclass(frozen=True)
+class PortLoad:
+    """Bytes, time and rate of a cycle on a port, by one protocol."""
+
+    rates: Sequence[int]  # possible baud rates in bit/s
+    cycle_bytes: Callable[[int], int]  # on the wire, in both directions, from the number of servos
+    cycle: str  # the requests of a cycle, in words
+
+    @property
+    def note(self) -> str:
+        """What the numbers of the load table are."""
+        return (
+            f"A cycle on one port: {self.cycle}; an adapter's latency of 1 ms for each of two questions; the fastest "
+            f"rate at which it takes {MAX_LOAD:.0%} of a period"
+        )
+
+    def cycle_s(self, servos: int, baud: int) -> float:
+        """Return how long a port is busy, or waits, in a cycle."""
+        return self.cycle_bytes(servos) * BITS_A_BYTE / baud + REQUESTS * USB_LATENCY_S
+
+    def fits_hz(self, servos: int, baud: int) -> int:
+        """Return the fastest possible control rate, in whole Hz."""
+        return int(MAX_LOAD / self.cycle_s(servos, baud))
+
+    def check(self, servos: int, rate_hz: float, baud: int, section: str) -> None:
+        """Check that a port can carry its servos.
+
+        Args:
+            servos: their number on the port.
+            rate_hz: rate of the control cycle.
+            baud: of the port, in bit/s.
+            section: where its settings are in the scenario.
+
+        Raises:
+            ConfigError: a cycle takes too much of a period.
+        """
+        busy_s = self.cycle_s(servos, baud)
+        if busy_s * rate_hz > MAX_LOAD:
+            raise ConfigError(
+                f"{servos} servos at {rate_hz:g} Hz: a cycle of {self.cycle_bytes(servos)} bytes takes "
+                f"{busy_s * 1e3:.1f} ms at {baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
+                f"most {MAX_LOAD:.0%}: use rate_hz = {self.fits_hz(servos, baud)}, a higher `{section}.baud`, or more "
+                f"`{section}.ports`",
+                code="bus/overloaded",
+            )
