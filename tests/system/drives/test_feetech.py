@@ -14,46 +14,18 @@ from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snake
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
+from snakesim_testing.runs.servo_row import write_servo_row
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
 UNGUARDED = "no joint has a watchdog: it holds its last angle if the host dies"
-ROBOT = """
-extends = "planar13"
-name = "row"
-
-[chain]
-modules = 4
-axes = ["yaw"]
-"""
-SCENARIO = """
-title = "A row of servos without a watchdog, as separate programs"
-robot = "./row_robot.toml"
-scene = "flat"
-controller = "hold"
-clock_mode = "realtime"
-rate_hz = 25
-duration_s = 60
-seed = 1
-
-[start]
-on_route = false
-
-[services.control]
-latency_ticks = 2
-
-[backends.feetech]
-ports = ["servos"]
-watchdog_s = 0.5
-"""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Where everything runs, with servos on `./servos`."""
     folder = tmp_path_factory.mktemp("servos")
-    (folder / "row_robot.toml").write_text(ROBOT)
-    (folder / "row.toml").write_text(SCENARIO)
+    write_servo_row(folder, "feetech", "servos")
     first = HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
     printed = folder / "servos.log"
     with printed.open("wb") as file:

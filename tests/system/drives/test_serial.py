@@ -15,6 +15,7 @@ from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snake
 from snakesim_testing.harness.endpoint import free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
+from snakesim_testing.runs.servo_row import write_servo_row
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
@@ -79,40 +80,9 @@ def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path)
     assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"
 
 
-ROW_ROBOT = """
-extends = "planar13"
-name = "row"
-
-[chain]
-modules = 4
-axes = ["yaw"]
-"""
-ROW = """
-title = "A row of servos, as separate programs"
-robot = "./row_robot.toml"
-scene = "flat"
-controller = "hold"
-clock_mode = "realtime"
-rate_hz = 25
-duration_s = 60
-seed = 1
-
-[start]
-on_route = false
-
-[services.control]
-latency_ticks = 2
-
-[backends.dynamixel]
-ports = ["row"]
-watchdog_s = 0.5
-"""
-
-
 def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_path: Path) -> None:
     """Servos have no velocity mode, which the robot file lists: the host leaves it out, and the service does not."""
-    (tmp_path / "row_robot.toml").write_text(ROW_ROBOT)
-    (tmp_path / "row.toml").write_text(ROW)
+    write_servo_row(tmp_path, "dynamixel", "row")
     network = ("--endpoint", free_endpoint())
 
     def start(stack: contextlib.ExitStack, log: str, *arguments: str) -> Path:
