@@ -42,7 +42,7 @@ EXTRAS = ("", "can", "sim", "record", "report", "console", "train", "all")
 LISTED_PACKAGES = 6  # the largest ones of each installation
 
 # Goals.
-MAX_LAWS_RATIO = 1.3  # a user who wants our friction should not pay a second simulation for it
+MAX_LAWS_RATIO = 1.3  # a user who wants our friction should pay less for it than for a second simulation
 MAX_PHYSICS_RATIO = 1.0  # with our laws a chain should cost no more than with MuJoCo's own contacts
 MAX_ENVIRONMENT_RATIO = 1.1  # learning should not be slower than with an environment of one's own
 MAX_BATCH_RATIO = 1 / 0.7

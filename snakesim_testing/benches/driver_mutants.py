@@ -186,7 +186,7 @@ class ForgetsTheSecondDrive(MinimalDrives):
 
 @breaks(BUS_LOST)
 class EnablesWhatTheBusHasLost(MinimalDrives):
-    """After the bus is back, the driver clears errors and goes on, whatever the robot's state."""
+    """After the bus is back, the driver clears errors and continues, whatever the robot's state."""
 
     was_cut = False
 

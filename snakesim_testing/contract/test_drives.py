@@ -21,7 +21,7 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
 ) -> None:
     """A host that does nothing for 1 s while a joint moves: every drive stops by its own watchdog.
 
-    Once the host goes on, the backend reports each of those stops as a fault of its joint, whatever the operator asks
+    Once the host resumes, the backend reports each of those stops as a fault of its joint, whatever the operator asks
     for first. No drive is enabled again before the fault is reset and the robot armed.
     """
     unguarded = rig.joints_without_watchdog
@@ -51,7 +51,7 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
 def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: Rig, drives: EmulatedDrives) -> None:
     """Drives that are described without a watchdog hold while the host does nothing.
 
-    Once it goes on, the backend switches each of them off at once, reports it as a fault of its joint, and enables none
+    Once it resumes, the backend switches each of them off at once, reports it as a fault of its joint, and enables none
     before the fault is reset and the robot armed.
     """
     unguarded = rig.joints_without_watchdog

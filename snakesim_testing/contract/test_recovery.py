@@ -81,7 +81,7 @@ def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: Rig, drives: Emul
     began_s = drives.now_s()
     inject_or_skip(rig, "cut:bus_1@0-9")
     rig.drive(GO, rig.count_periods(t.FROZEN_S))
-    assert rig.authority.state == "fault", "the bus is lost, and the robot goes on"
+    assert rig.authority.state == "fault", "the bus is lost, and the robot continues"
     assert rig.record_since(began).faults
     if (
         not unguarded and drives.now_s() > began_s + t.WATCHDOG_OFF_S
@@ -94,8 +94,8 @@ def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: Rig, drives: Emul
 
 
 def assert_fault_names_joint(rig: Rig, since_tick: int, joint: int) -> None:
-    """Fail if the robot goes on, or no fault names the joint."""
-    assert rig.authority.state == "fault", f"the robot goes on: {rig.authority.state}"
+    """Fail if the robot continues, or no fault names the joint."""
+    assert rig.authority.state == "fault", f"the robot continues: {rig.authority.state}"
     faults = rig.record_since(since_tick).faults
     name = rig.robot.joints[joint].name
     assert name in {fault.joint for fault in faults}, f"no fault of {name}: {faults}"
