@@ -63,7 +63,7 @@ class Samples:
 
     joints: JointState  # in every tick
     others: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
-    encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # `others`, filled in by the host
+    encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # of `others` (filled in by the host)
 
 
 class Backend(ABC):
@@ -72,7 +72,7 @@ class Backend(ABC):
     The members above the constructor belong to the class: they are used before a run, when no backend is open.
     """
 
-    Settings: ClassVar[type[msgspec.Struct]]  # the scenario's `[backends.<name>]` section, may be an empty Struct
+    Settings: ClassVar[type[msgspec.Struct]]  # the scenario's `[backends.<name>]` section (may be an empty Struct)
     supported_modes: ClassVar[Collection[DriveMode] | None] = None  # of every joint (None: those of the robot file)
 
     @classmethod

@@ -50,7 +50,7 @@ class SensorSamples:
     """Samples as the sensors published them, and the task. Only for controllers with `uses_sensors = True`."""
 
     newest: Mapping[str, Message]  # newest sample of `sensor/pose` and `sensor/contacts`, by key (absent: none yet)
-    late: Mapping[str, str]  # key -> why its newest sample is too old to be used, fresh ones are left out
+    late: Mapping[str, str]  # key -> why its newest sample is too old to be used (fresh ones are left out)
     task: Task  # where the robot started, and its goal
 
 
@@ -59,7 +59,7 @@ class Observation:
     """The inputs of a controller at one tick. All times are times of the robot, not of the computer."""
 
     tick: int  # number of the control cycle
-    time_s: float  # since arming, it continues when new parameters replace the controller during an arm session
+    time_s: float  # since arming (also across new parameters, which replace the controller in an arm session)
     period_s: float  # of the control cycle
     joints: JointState  # angles, velocities and torques, tail to head, always fresh
     world: World | None  # pose, contacts and obstacles (None: there is none yet, or it is too old)

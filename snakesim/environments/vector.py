@@ -98,7 +98,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         """Reset all environments, or some of them.
 
         Args:
-            seed: Seed of the first environment, the next ones count up. Or one seed for each environment.
+            seed: Seed of the first environment, from which the next ones count up, or one for each.
             options: `reset_mask`: (num_envs,), the environments that are reset. Without it all are. Nothing else is
                 read.
 
@@ -126,10 +126,10 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             actions: (num_envs, joints) actions, a row for each environment.
 
         Returns:
-            Stacked observations. Rewards, terminated and truncated, each (num_envs,). And merged info dicts.
+            Stacked observations, then rewards, terminated and truncated, each (num_envs,), and merged info dicts.
 
         Raises:
-            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example. Or
+            gymnasium.error.ResetNeeded: The step or reset before this one did not finish, by Ctrl-C for example, or
                 an episode is over, and the autoreset mode is "Disabled".
             ValueError: The number of rows is wrong, or a row is no action. No environment has taken a step then.
         """

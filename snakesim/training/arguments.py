@@ -133,8 +133,8 @@ COMMANDS: Commands = (
         add=_add_train,
         run=_train,
         details="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers "
-        "give the same policy for any --workers. Exit code: 0, 2 wrong input, 130 stopped by Ctrl-C. Continue with "
-        "--resume.",
+        "give the same policy for any --workers. Exit code 0: done. 2: wrong input. 130: stopped by Ctrl-C, continue "
+        "with --resume.",
         examples=(
             "policy train surveyed_clutter --out runs/policy",
             "policy train surveyed_clutter --form wave --generations 50 --workers 4 --out runs/policy",

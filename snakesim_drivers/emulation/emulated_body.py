@@ -155,7 +155,7 @@ class EmulatedBody:
             begins: True to begin it, False to end it.
 
         Returns:
-            The index of the drive if it restarts now. Otherwise None.
+            The index of the drive if it restarts now, or None.
 
         Raises:
             ConfigError: There is no such fault, or no such joint.

@@ -47,9 +47,9 @@ from snakesim_hal.wire.messages import Mode
 class BusCommand(NamedTuple):
     """What all drives of a bus are to do until the next command."""
 
-    following: frozenset[int]  # the drives that get setpoints, all others are switched off
+    following: frozenset[int]  # the drives that get setpoints (all others are switched off)
     modes: list[Mode]  # of every drive
-    targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive, 0 for passive drives
+    targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive (0 for passive drives)
     limits_nm: Floats  # (n_drives,) torque limits, not negative
     may_enable: bool  # True: the robot is armed (False: a drive that is off stays off)
     emergency: bool  # True: drives stop by their own emergency stop, where they have one
@@ -58,7 +58,7 @@ class BusCommand(NamedTuple):
 class Drives(ABC):
     """The drives of one driver type on one bus. Derive from it, and implement the abstract methods."""
 
-    emulated: bool = False  # True: no real motor moves, set by the constructor
+    emulated: bool = False  # whether no real motor moves (set by the constructor)
     start_up: StartUp | None = None  # steps that take seconds, made by the constructor; None: bring-up is enough
 
     @abstractmethod

@@ -160,7 +160,7 @@ ERROR_CODES = {
     "injection/unknown-fault": ErrorCode(
         "A fault to inject is written wrongly, or does not exist.",
         "The kind is misspelled, the target cannot have this fault, or its amount is outside the range.",
-        "Write it as the message shows. Docs/how-to/inject-faults.md lists all kinds.",
+        "Write it as the message shows. All kinds are in docs/how-to/inject-faults.md.",
     ),
     "injection/unknown-target": ErrorCode(
         "The target of a fault does not exist in this run.",
@@ -346,7 +346,7 @@ ERROR_CODES = {
     "network/session-file": ErrorCode(
         "A session or router file is not usable.",
         "A setting is missing, or makes the session something else than a client.",
-        "Set the key that the message names. Docs/how-to/lab.md shows how to generate correct files.",
+        "Set the key that the message names. How to generate correct files is in docs/how-to/lab.md.",
     ),
     "network/unknown-key": ErrorCode(
         "There is no such key on the network.",

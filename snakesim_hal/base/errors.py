@@ -34,7 +34,7 @@ class ConfigError(SnakesimError, ValueError):
 class WireError(SnakesimError, ValueError):
     """A sample from the network is rejected: malformed, out of bounds, or of an unknown version.
 
-    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`. Or, if the sample does not
+    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`, or, if the sample does not
     fit the robot, `wrong_length`, `no_rotation`, `no_path`. `detail` has the values.
     """
 

@@ -181,7 +181,7 @@ class DepthCamera(DistanceSensor, frozen=True, kw_only=True):
 
 
 class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
-    """Distances along beams in a plane: a 2-D lidar. Or with one beam a range finder."""
+    """Distances along beams in a plane: a 2-D lidar, or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
     """Number of beams, evenly distributed over the field of view."""

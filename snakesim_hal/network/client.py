@@ -109,7 +109,7 @@ class Client:
         return robot
 
     def new_description(self) -> Description | None:
-        """Return the robot's description if another HAL host may drive it than at the last call. Else None.
+        """Return the robot's description if another HAL host may drive it than at the last call, or None.
 
         Robot time that starts over is a sign of another host. So is the lost liveliness token of the old one, if this
         service was disconnected while the host was replaced.
@@ -239,7 +239,7 @@ class Client:
         return feed
 
     def read(self, feed: Feed[MessageT]) -> MessageT | None:
-        """Return the sample of a feed that is valid at this tick. None if there is none (yet).
+        """Return the sample of a feed that is valid at this tick, or None if there is none (yet).
 
         In real time this is the newest sample. In lockstep it is exactly the sample that the clock names, and an armed
         robot waits for it: a run must not depend on which process was faster.

@@ -87,7 +87,7 @@ class CommandingClient:
         return self._client.new_description() is not None
 
     def read(self, key: str) -> Message | None:
-        """Return the sample of a key in READ that is valid at this tick. None if there is none."""
+        """Return the sample of a key in READ that is valid at this tick, or None if there is none."""
         return self._client.read(self._feeds[key])
 
     @property

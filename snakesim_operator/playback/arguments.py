@@ -239,8 +239,8 @@ COMMANDS: Commands = (
         help="Play a recording on Zenoh, or its sensors into guidance, navigation and control.",
         add=_add_replay,
         run=_replay,
-        details="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed, 1 "
-        "otherwise, 3 done, but something is missing in the recording.",
+        details="Exit code of --control 0: the commands are the same to the bit, or a setting was changed. 1: "
+        "otherwise. 3: done, but something is missing in the recording.",
         examples=(
             "replay runs/demo --speed 0.5",
             "replay runs/demo --control --set control.speed_kp_s=0.3 --out runs/again",

@@ -138,8 +138,9 @@ COMMANDS: Commands = (
         help="Run a scenario: backend, guidance, navigation and control.",
         add=_add_run,
         run=_run,
-        details="Exit code: 0 complete, armed for all of the requested time, 1 a fault, or ended before that, 2 wrong "
-        "input, nothing was started, 3 complete, but the record has gaps, 130 interrupted. 1 and 130 take precedence.",
+        details="Exit code 0: complete, armed for all of the requested time. 1: a fault, or ended before that. 2: "
+        "wrong input, nothing was started. 3: complete, but the record has gaps. 130: interrupted. 1 and 130 take "
+        "precedence.",
         examples=(
             "run triplet --console",
             "run peg_row --controller obstacle_aided --duration 10 --out runs/demo",

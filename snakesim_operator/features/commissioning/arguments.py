@@ -189,8 +189,8 @@ COMMANDS: Commands = (
         help="Judge a run of `snakesim run joint_check`: signs, gears, backlash, ids, zeros, dead joints.",
         add=_add_check,
         run=_check,
-        details="Exit code: 0 sign, order, zero and gear of every joint were confirmed, 1 one is wrong or unknown, "
-        "2 wrong input.",
+        details="Exit code 0: sign, order, zero and gear of every joint were confirmed. 1: one is wrong or unknown. "
+        "2: wrong input.",
         examples=("robot check runs/check --straight", "robot check runs/check --straight --write snake.toml"),
     ),
     Command(
@@ -198,7 +198,8 @@ COMMANDS: Commands = (
         help="Identify friction, rotor inertia, torque constant and response of joints from `snakesim run identify`.",
         add=_add_identify,
         run=_identify,
-        details="Exit code: 0 every joint was identified, 1 one was not, or does not move as it should, 2 wrong input.",
+        details="Exit code 0: every joint was identified. 1: one was not, or does not move as it should. 2: wrong "
+        "input.",
         examples=("robot identify runs/identify", "robot identify runs/identify --write snake.toml"),
     ),
 )

@@ -46,7 +46,7 @@ COMMANDS: Commands = (
     Command(
         name="console",
         heading="daily work",
-        help="Show a running robot in the browser, and command it from there. Or show a recorded run.",
+        help="Show a running robot in the browser, and command it from there, or show a recorded run.",
         add=_add_arguments,
         run=_run_console,
         examples=("console", "console runs/demo --at 5"),

@@ -269,8 +269,8 @@ COMMANDS: Commands = (
         help="Run controllers on many fields. Writes a table with confidence intervals, and a page.",
         add=_add_evaluate,
         run=_evaluate,
-        details="Exit code: 0 all cases ran, also if their runs failed, 1 some could not, 2 wrong input, nothing was "
-        "run, 130 stopped by Ctrl-C. Continue with --resume.",
+        details="Exit code 0: all cases ran, also if their runs failed. 1: some could not. 2: wrong input, nothing was "
+        "run. 130: stopped by Ctrl-C, continue with --resume.",
         examples=(
             "study evaluate clutter --controllers obstacle_aided,hold --fields 20",
             "study evaluate ./suite.toml --out runs/suite --resume",

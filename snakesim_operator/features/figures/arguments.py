@@ -67,8 +67,8 @@ COMMANDS: Commands = (
         add=_add_plot,
         run=_plot,
         details="Signals are named as in `snakesim recording export`. A comma puts several of one unit on one pair of "
-        "axes: angle_rad.joint_7,target.joint_7. Several runs are overlaid, each in its color. Exit code: 0, 2 wrong "
-        "input, 3 made, but something is missing in a recording.",
+        "axes: angle_rad.joint_7,target.joint_7. Several runs are overlaid, each in its color. Exit code 0: made. 2: "
+        "wrong input. 3: made, but something is missing in a recording.",
         examples=(
             "recording plot runs/demo angle_rad.joint_7,target.joint_7 torque_nm --from 2 --to 6",
             "recording plot runs/a runs/b runs/c velocity_b_m_s.x --mean --out speed.png",

@@ -40,7 +40,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stamps",
         choices=["robot", "wall"],
-        help="robot: robot time, with /clock, wall: wall-clock time (default: robot if nothing real moves, else wall)",
+        help="robot: robot time with /clock, or wall: wall-clock time (default: robot if nothing real moves, "
+        "else wall)",
     )
     add_network(parser)
 
@@ -110,7 +111,8 @@ COMMANDS: Commands = (
         add=_add_rosbag,
         run=_run_rosbag,
         details="Writes joint states, transforms, contact forces, IMUs, the robot's URDF, diagnostics and /clock, with "
-        "the topics of the bridge. Exit code: 0; 2 wrong input; 3 written, but something is missing in the recording.",
+        "the topics of the bridge. Exit code 0: written. 2: wrong input. 3: written, but something is missing in the "
+        "recording.",
         examples=(
             "recording rosbag runs/demo --out demo-bag",
             "recording rosbag test.mcap --stamps wall",
