@@ -19,7 +19,7 @@ from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.programs.preflight import backend_settings
-from snakesim_serial_backend.dynamixel import backend as dynamixel
+from snakesim_serial_backend import servo_backend
 from snakesim_testing.hal.small_robots import run_config
 from snakesim_testing.runs.in_process_command import run_to_summary
 
@@ -77,7 +77,7 @@ def test_emulation_is_stated_only_without_real_drives(
     monkeypatch: pytest.MonkeyPatch, backend: str, buses: dict[str, list[str]], emulated: bool
 ) -> None:
     monkeypatch.setattr(can_family, "open_wire", lambda channel, *_rates: SimpleNamespace(channel=channel))
-    monkeypatch.setattr(dynamixel, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0))
+    monkeypatch.setattr(servo_backend, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0))
     sections = {name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()}
     config = configured(backend, **sections)
     factory = find_plugin(BACKENDS, backend)
