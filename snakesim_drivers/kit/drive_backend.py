@@ -103,9 +103,8 @@ class DriveBackend(Backend):
         self._reported = ReportedFindings()
         # Isolated joints have failed, and the robot continues without them until a reset.
         self._isolated = NO_DRIVES
-        self._awaiting_isolation = (
-            NO_DRIVES  # reported as failed since the newest setpoints: the HAL should isolate them
-        )
+        # Reported as failed since the newest setpoints: the HAL should isolate them.
+        self._awaiting_isolation = NO_DRIVES
         self._grace_cycles = 0  # left, in which drives may report errors from before a reset
         try:
             self._drives = parts.open_drives(self._readings)
