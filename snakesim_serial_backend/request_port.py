@@ -19,6 +19,7 @@ PATIENT_GAP_S = 0.25  # silence that ends the wait for an answer before the cont
 SECOND_ANSWER_GAP_S = 0.02  # silence that ends the wait for a second answer: a return delay is 0.5 ms at most
 IDLE_S = 0.05  # silence after which the line is idle
 MAX_DRAIN_S = 1.0  # for a line that never becomes idle
+ATTEMPTS = 3  # to read or write registers before the control cycle runs
 LATE_S = 2.0  # after which an answer does not arrive any more
 
 
@@ -106,6 +107,14 @@ class RequestPort(ABC, Generic[StatusT]):
 
         data_of_ids: id and data of each servo, all equally long.
         """
+
+    def try_to_read(self, id_: int, address: int, size: int) -> StatusT | None:
+        """Read registers of a servo, several times if need be; None without an answer."""
+        for _ in range(ATTEMPTS):
+            status = self.read(id_, address, size)
+            if status is not None:
+                return status
+        return None
 
     @contextlib.contextmanager
     def wait_patiently(self) -> Iterator[None]:

@@ -14,18 +14,17 @@ from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.servo_bus import ANSWERS_TWICE, GARBLED
+from snakesim_serial_backend.request_port import ATTEMPTS
+from snakesim_serial_backend.servo_bus import GARBLED, Registers
+from snakesim_serial_backend.servo_checks import NO_ANSWER, find_shared_id
 
 # Registers that are written at every start.
 STARTUP_REGISTERS = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
 # Registers that are written only where they differ, as each write wears out their memory.
 EEPROM_VALUES = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}
 TORQUE_AT_START = 0x01  # bit of the startup configuration
-MEASURED_SIZE = at.TEMPERATURE + 1 - at.PRESENT  # registers in which two servos differ: position, voltage, temperature
-READS = 3  # to distinguish a second servo from a single disturbance
-ATTEMPTS = 3  # to read or write registers
-MIN_DOUBLED = 2  # reads with an answer too many that show a second servo
-NO_ANSWER = "does not answer: it is off, or has another id or baud rate"
+# Registers in which two servos differ: position, voltage, temperature.
+MEASURED = Registers(at.PRESENT, at.TEMPERATURE + 1 - at.PRESENT)
 
 _log = logging.getLogger("snakesim.dynamixel")
 
@@ -66,10 +65,10 @@ def _check_servo(servo: Servo, ping: Packet | None, settings: DynamixelSettings)
     """Return why a servo cannot be used; empty if it can. ping: its answer to a ping, None without one."""
     if ping is None:
         return NO_ANSWER
-    shared_id = _check_shared_id(servo)
+    shared_id = find_shared_id(servo, MEASURED)
     if shared_id:
         return shared_id
-    eeprom = _try_to_read(servo, 0, at.EEPROM_SIZE)
+    eeprom = servo.port.try_to_read(servo.id, 0, at.EEPROM_SIZE)
     if eeprom is None:
         return NO_ANSWER
     number, firmware = struct.unpack("<HB", ping.data[:3])
@@ -102,29 +101,6 @@ def _find_servos(servos: Sequence[Servo], limit_s: float) -> tuple[dict[str, Pac
                 objections[servo.name] = f"sends garbled bytes in answer to a ping: {GARBLED}"
         if len(found) == len(servos) or time.monotonic() > end_s:
             return found, objections
-
-
-def _check_shared_id(servo: Servo) -> str:
-    """Return why another servo seems to have the same id; empty if only one answers.
-
-    A ping does not show it: two servos of one model answer it with the same bytes at the same time. Late answers to
-    earlier requests do not show it, either: the port assigns them to those requests.
-    """
-    doubled = 0
-    garbled = 0
-    for _ in range(READS):
-        answers = servo.port.read_alone(servo.id, at.PRESENT, MEASURED_SIZE)
-        if answers.surplus:
-            doubled += 1
-        elif answers.statuses:
-            return ""
-        garbled += answers.garbled
-        servo.port.wait_until_idle()
-    if doubled >= MIN_DOUBLED:
-        return ANSWERS_TWICE
-    if garbled:
-        return f"sends garbled bytes, in {garbled} of {READS} answers: {GARBLED}"
-    return ""
 
 
 def _check_model(servo: Servo, number: int, settings: DynamixelSettings) -> str:
@@ -240,19 +216,10 @@ def _read_present(servo: Servo) -> Packet:
 
 def _read_registers(servo: Servo, address: int, size: int) -> Packet:
     """Read registers of a servo. Raises BackendError without an answer."""
-    status = _try_to_read(servo, address, size)
+    status = servo.port.try_to_read(servo.id, address, size)
     if status is None:
         raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent")
     return status
-
-
-def _try_to_read(servo: Servo, address: int, size: int) -> Packet | None:
-    """Read registers of a servo, several times if need be; None without an answer."""
-    for _ in range(ATTEMPTS):
-        status = servo.port.read(servo.id, address, size)
-        if status is not None:
-            return status
-    return None
 
 
 def _try_to_write(servo: Servo, address: int, value: int) -> Packet | None:

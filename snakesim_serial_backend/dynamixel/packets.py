@@ -11,6 +11,9 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import ClassVar
+
+from snakesim_serial_backend.stream_decoder import StreamDecoder
 
 HEADER = b"\xff\xff\xfd\x00"
 PLAIN = b"\xff\xff\xfd"  # the begin of a header, which must not occur among the parameters
@@ -143,58 +146,19 @@ def fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) -> byte
     return packet
 
 
-class Decoder:
+class Decoder(StreamDecoder[Packet]):
     """Finds packets in a stream of bytes; noise, and packets with a wrong CRC, are skipped."""
 
-    def __init__(self) -> None:
-        self._bytes = bytearray()
-        self.skipped = 0  # bytes
+    header: ClassVar[bytes] = HEADER
+    bytes_before: ClassVar[int] = BYTES_BEFORE
 
-    def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take in bytes, and yield the packets that are complete now."""
-        self._bytes += data
-        while True:
-            self._skip_to_header()
-            length = self._find_length()
-            if length is None or len(self._bytes) < length:
-                return
-            packet = self._decode(bytes(self._bytes[:length]))
-            if packet is None:
-                self._skip(1)
-            else:
-                del self._bytes[:length]
-                yield packet
+    def read_length(self, start: bytes) -> int | None:
+        length = BYTES_BEFORE + struct.unpack_from("<H", start, 5)[0]
+        if not BYTES_BEFORE + 1 + BYTES_AFTER <= length <= MAX_PACKET_BYTES:
+            return None
+        return length
 
-    def feed_statuses(self, data: bytes) -> Iterator[Packet]:
-        """Take in bytes, and yield the statuses that are complete now."""
-        return (packet for packet in self.feed(data) if packet.instruction == Instruction.STATUS)
-
-    @property
-    def garbled(self) -> bool:
-        """Whether bytes have arrived that are no packet."""
-        return self.skipped > 0 or len(self._bytes) > 0
-
-    def _skip_to_header(self) -> None:
-        """Skip bytes up to the next header, or up to bytes that may be the begin of one."""
-        start = self._bytes.find(HEADER)
-        if start < 0:
-            start = max(len(self._bytes) - len(HEADER) + 1, 0)
-        self._skip(start)
-
-    def _find_length(self) -> int | None:
-        """Return the length of the packet at the begin of the bytes; None if more bytes are needed to know it.
-
-        A header that is followed by an impossible length is skipped.
-        """
-        while len(self._bytes) >= BYTES_BEFORE and self._bytes.startswith(HEADER):
-            length = BYTES_BEFORE + struct.unpack_from("<H", self._bytes, 5)[0]
-            if BYTES_BEFORE + 1 + BYTES_AFTER <= length <= MAX_PACKET_BYTES:
-                return length
-            self._skip(1)
-            self._skip_to_header()
-        return None
-
-    def _decode(self, data: bytes) -> Packet | None:
+    def decode(self, data: bytes) -> Packet | None:
         """Return the packet that these bytes are; None for a wrong CRC, or a status without an error."""
         (crc,) = struct.unpack("<H", data[-BYTES_AFTER:])
         if crc16(data[:-BYTES_AFTER]) != crc:
@@ -209,9 +173,9 @@ class Decoder:
             return None
         return Packet(id_, inside[0], inside[1:])
 
-    def _skip(self, count: int) -> None:
-        self.skipped += count
-        del self._bytes[:count]
+    def feed_statuses(self, data: bytes) -> Iterator[Packet]:
+        """Take in bytes, and yield the statuses that are complete now."""
+        return (packet for packet in self.feed(data) if packet.instruction == Instruction.STATUS)
 
 
 def fast_parts(packet: Packet, size: int) -> list[Packet]:

@@ -12,16 +12,14 @@ from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, P
 from snakesim_serial_backend.feetech.port import Port
 from snakesim_serial_backend.feetech.servo import SLACK_RAD, Servo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
-from snakesim_serial_backend.request_port import RequestPort
-from snakesim_serial_backend.servo_bus import ANSWERS_TWICE, GARBLED
+from snakesim_serial_backend.request_port import ATTEMPTS, RequestPort
+from snakesim_serial_backend.servo_bus import Registers
+from snakesim_serial_backend.servo_checks import NO_ANSWER, find_shared_id
 
 EEPROM_VALUES = {at.DELAY: 0, at.STATUS_LEVEL: 1, at.OPERATING_MODE: at.POSITION_MODE}  # written where they differ
 PROTECTIONS = ServoError.OVERHEATING | ServoError.OVERLOAD  # that must switch the torque off
+MEASURED = Registers(at.PRESENT, at.present_form.size)  # in which two servos differ
 MAX_TEMPERATURE_C = 80  # that a servo may allow itself; the maker delivers 70
-READS = 3  # to distinguish a second servo from a single disturbance
-ATTEMPTS = 3  # to read or write registers
-MIN_DOUBLED = 2  # reads with an answer too many that show a second servo
-NO_ANSWER = "does not answer: it is off, or has another id or baud rate"
 
 
 def bring_up(
@@ -48,7 +46,7 @@ def bring_up(
             raise BackendError("the robot is not complete; nothing was enabled:", *flaws, code="drive/not-complete")
         for servo in servos:
             _write_registers(servo)
-        return [(_read_present(servo), _read(servo, at.TORQUE_ENABLE, at.STATE_SIZE)) for servo in servos]
+        return [(_read_present(servo), _read_registers(servo, at.TORQUE_ENABLE, at.STATE_SIZE)) for servo in servos]
 
 
 def _find_servos(servos: Sequence[Servo], limit_s: float) -> set[str]:
@@ -70,10 +68,10 @@ def _find_servos(servos: Sequence[Servo], limit_s: float) -> set[str]:
 
 def _check_servo(servo: Servo, settings: FeetechSettings) -> str:
     """Return why a servo cannot be used; empty if it can."""
-    shared_id = _check_shared_id(servo)
+    shared_id = find_shared_id(servo, MEASURED)
     if shared_id:
         return shared_id
-    status = _try_to_read(servo, 0, at.EEPROM_SIZE)
+    status = servo.port.try_to_read(servo.id, 0, at.EEPROM_SIZE)
     if status is None:
         return NO_ANSWER
     eeprom = status.data
@@ -84,28 +82,6 @@ def _check_servo(servo: Servo, settings: FeetechSettings) -> str:
         or _check_protections(servo, eeprom)
         or _check_torque_limit(servo, eeprom)
     )
-
-
-def _check_shared_id(servo: Servo) -> str:
-    """Return why another servo seems to have the same id; empty if only one answers.
-
-    A ping does not show it: two servos answer it with the same bytes.
-    """
-    doubled = 0
-    garbled = 0
-    for _ in range(READS):
-        answers = servo.port.read_alone(servo.id, at.PRESENT, at.present_form.size)
-        if answers.surplus:
-            doubled += 1
-        elif answers.statuses:
-            return ""
-        garbled += answers.garbled
-        servo.port.wait_until_idle()
-    if doubled >= MIN_DOUBLED:
-        return ANSWERS_TWICE
-    if garbled:
-        return f"sends garbled bytes, in {garbled} of {READS} answers: {GARBLED}"
-    return ""
 
 
 def _check_model(eeprom: bytes, settings: FeetechSettings) -> str:
@@ -206,7 +182,7 @@ def _describe_unknown_servos(servos: Sequence[Servo]) -> Iterator[str]:
 def _write_registers(servo: Servo) -> None:
     """Switch the torque off, and write the registers that the driver needs. Raises BackendError."""
     _write(servo, at.TORQUE_ENABLE, 0)
-    eeprom = _read(servo, 0, at.EEPROM_SIZE).data
+    eeprom = _read_registers(servo, 0, at.EEPROM_SIZE).data
     values = {address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value}
     if eeprom[at.PHASE] & at.MULTI_TURN_FEEDBACK:
         values[at.PHASE] = eeprom[at.PHASE] & ~at.MULTI_TURN_FEEDBACK
@@ -233,7 +209,7 @@ def _write(servo: Servo, address: int, value: int) -> None:
 
 def _read_present(servo: Servo) -> Packet:
     """Read what a servo measures. Raises BackendError for an angle outside the travel of its joint."""
-    status = _read(servo, at.PRESENT, at.present_form.size)
+    status = _read_registers(servo, at.PRESENT, at.present_form.size)
     position = to_signed(_word(status.data, 0), SIGN_BIT)
     angle_rad = at.to_angle_rad(position)
     if not servo.lower_rad - SLACK_RAD <= angle_rad <= servo.upper_rad + SLACK_RAD:
@@ -246,21 +222,12 @@ def _read_present(servo: Servo) -> Packet:
     return status
 
 
-def _read(servo: Servo, address: int, size: int) -> Packet:
+def _read_registers(servo: Servo, address: int, size: int) -> Packet:
     """Read registers of a servo. Raises BackendError without an answer."""
-    status = _try_to_read(servo, address, size)
+    status = servo.port.try_to_read(servo.id, address, size)
     if status is None:
         raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent")
     return status
-
-
-def _try_to_read(servo: Servo, address: int, size: int) -> Packet | None:
-    """Read registers of a servo, several times if need be; None without an answer."""
-    for _ in range(ATTEMPTS):
-        status = servo.port.read(servo.id, address, size)
-        if status is not None:
-            return status
-    return None
 
 
 def _word(data: bytes, address: int) -> int:

@@ -9,6 +9,9 @@ Words are little-endian. An instruction and a status have the same form, so a de
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from typing import ClassVar
+
+from snakesim_serial_backend.stream_decoder import StreamDecoder
 
 HEADER = b"\xff\xff"
 BYTES_BEFORE = 4  # instruction and parameters: header, id, length
@@ -107,55 +110,23 @@ def from_signed(value: int, sign_bit: int) -> int:
     return value
 
 
-class Decoder:
+class Decoder(StreamDecoder[Packet]):
     """Finds packets in a stream of bytes; noise, and packets with a wrong checksum, are skipped."""
 
-    def __init__(self) -> None:
-        self._bytes = bytearray()
-        self.skipped = 0  # bytes
+    header: ClassVar[bytes] = HEADER
+    bytes_before: ClassVar[int] = BYTES_BEFORE
 
-    def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take in bytes, and yield the packets that are complete now."""
-        self._bytes += data
-        while True:
-            self._skip_to_header()
-            length = self._find_length()
-            if length is None or len(self._bytes) < length:
-                return
-            packet = bytes(self._bytes[:length])
-            if checksum(packet[2:-1]) != packet[-1]:
-                self._skip(1)
-                continue
-            del self._bytes[:length]
-            yield Packet(packet[2], packet[4], packet[5:-1])
+    def read_length(self, start: bytes) -> int | None:
+        length = start[3]
+        if start[2] > EVERYBODY or not MIN_LENGTH <= length <= MAX_LENGTH:
+            return None
+        return BYTES_BEFORE + length
 
-    feed_statuses = feed
+    def decode(self, data: bytes) -> Packet | None:
+        if checksum(data[2:-1]) != data[-1]:
+            return None
+        return Packet(data[2], data[4], data[5:-1])
 
-    @property
-    def garbled(self) -> bool:
-        """Whether bytes have arrived that are no packet."""
-        return self.skipped > 0 or len(self._bytes) > 0
-
-    def _skip_to_header(self) -> None:
-        """Skip bytes up to the next header, or up to a byte that may be the begin of one."""
-        start = self._bytes.find(HEADER)
-        if start < 0:
-            start = len(self._bytes) - (1 if self._bytes.endswith(HEADER[:1]) else 0)
-        self._skip(start)
-
-    def _find_length(self) -> int | None:
-        """Return the length of the packet at the begin of the bytes; None if more bytes are needed to know it.
-
-        A header that is followed by an impossible id or length is skipped.
-        """
-        while len(self._bytes) >= BYTES_BEFORE and self._bytes.startswith(HEADER):
-            length = self._bytes[3]
-            if self._bytes[2] <= EVERYBODY and MIN_LENGTH <= length <= MAX_LENGTH:
-                return BYTES_BEFORE + length
-            self._skip(1)
-            self._skip_to_header()
-        return None
-
-    def _skip(self, count: int) -> None:
-        self.skipped += count
-        del self._bytes[:count]
+    def feed_statuses(self, data: bytes) -> Iterator[Packet]:
+        """Take in bytes, and yield the statuses that are complete now: all packets in the direction of the driver."""
+        return self.feed(data)
